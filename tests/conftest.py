@@ -1,4 +1,4 @@
-"""What holds for all tests: which Blender there is, and Hypothesis without deadlines (first calls compile)."""
+"""Set up all tests: report the available Blender, and run Hypothesis without deadlines (first calls compile)."""
 
 from __future__ import annotations
 

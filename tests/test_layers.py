@@ -236,7 +236,7 @@ def late_imports(sources: Mapping[str, tuple[str, str]]) -> dict[str, set[str]]:
 
 
 def core_problems(source: str, package: str, own: str) -> list[str]:
-    """What a module of a room imports against the directions."""
+    """Imports of a module of a room that go against the directions."""
     problems = []
     for item in imports_of(source, package):
         top, other = item.target.split(".")[0], room(item.target)
@@ -252,7 +252,7 @@ def core_problems(source: str, package: str, own: str) -> list[str]:
 
 
 def addon_problems(source: str, package: str) -> list[str]:
-    """What a module of the extension imports against the directions."""
+    """Imports of a module of the extension that go against the directions."""
     problems = []
     for item in imports_of(source, package):
         top = item.target.split(".")[0]

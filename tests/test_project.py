@@ -1,4 +1,4 @@
-"""What the project's files say about each other: versions, licence, pins, commands, links."""
+"""Consistency of the project's files: versions, licence, pins, commands, links."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ def previews(collection, times: list[float]) -> np.ndarray:
 
 
 def renders(collection, times: list[float]) -> np.ndarray:
-    """What the engine R5DGS renders and Blender saves at each time, top row first. [T, H, W, 3]"""
+    """Images that the engine R5DGS renders and Blender saves at each time, top row first. [T, H, W, 3]"""
     bpy.ops.r5dgs.use_engine()
     bpy.ops.r5dgs.show_colors_as_trained()
     settings, pictures = bpy.context.scene.render, []

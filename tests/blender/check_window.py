@@ -39,7 +39,7 @@ def load(path: Path) -> None:
 
 
 def nothing_runs() -> bool:
-    """Whether no operator waits for events, and no job for the worker."""
+    """Return True if no operator waits for events and no job waits for the worker."""
     return not w.main_window().modal_operators and not w.service("worker.jobs").busy()
 
 
@@ -259,7 +259,7 @@ def render_by_key():
 
 
 def saved_pictures(scene: bpy.types.Scene, stem: Path) -> list[np.ndarray]:
-    """What Blender saves of the last render, a picture for each view. [H, W, 3] each"""
+    """Images that Blender saves of the last render, one for each view. [H, W, 3] each"""
     settings = scene.render.image_settings
     settings.file_format, settings.views_format = "PNG", "INDIVIDUAL"
     with contextlib.suppress(RuntimeError):  # 4.3 misses the file without a view's name

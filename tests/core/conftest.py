@@ -1,4 +1,4 @@
-"""What is made once for all tests that look at it: the tiny data set, one training of it, a scene and its pictures."""
+"""Shared fixtures: the tiny data set, one training of it, a synthetic scene and a data set of its pictures."""
 
 import shutil
 

@@ -79,7 +79,7 @@ def _characters(folder: Path, special: dict[str, str]) -> None:
 
 
 def _pixels(processor: str) -> dict[str, object]:
-    """What image processors have in common."""
+    """Settings that all image processors share."""
     steps = {"do_resize": True, "do_rescale": True, "do_normalize": True, "rescale_factor": 1 / 255, "resample": 3}
     return {"image_processor_type": processor, "image_mean": _MEAN, "image_std": _STD, **steps}
 

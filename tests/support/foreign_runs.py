@@ -37,7 +37,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a rule draws: centres [N, 3] and covariances [N, 3, 3]."""
+    """Gaussians that a rule draws: centres [N, 3] and covariances [N, 3, 3]."""
 
     means: Tensor
     covariances: Tensor
@@ -81,7 +81,7 @@ def write_cloud(path: Path, cloud: Cloud, extra: tuple[str, ...] = ()) -> None:
 
 
 def write_common(folder: Path, cloud: Cloud, iteration: int, config: str, extra: tuple[str, ...] = ()) -> None:
-    """What all layouts share: the PLY of an iteration, ``cfg_args`` and ``cameras.json``."""
+    """Files of all layouts: the PLY of an iteration, ``cfg_args`` and ``cameras.json``."""
     write_cloud(folder / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply", cloud, extra)
     (folder / "cfg_args").write_text(f"Namespace(data_device='cuda', sh_degree=3, {config})")
     camera = view()
@@ -231,7 +231,7 @@ def skew(w: Tensor) -> Tensor:
 
 
 def matrices(quats: Tensor) -> Tensor:
-    """What the kernel of 3DGS makes of quaternions of any length, without normalising them. [N, 3, 3]"""
+    """Matrices that the kernel of 3DGS computes from quaternions of any length, unnormalised. [N, 3, 3]"""
     return torch.stack(
         [torch.eye(3, dtype=torch.float64) + 2 * q[0] * skew(q[1:]) + 2 * skew(q[1:]) @ skew(q[1:]) for q in quats]
     )

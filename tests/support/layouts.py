@@ -64,7 +64,7 @@ class _SetOnly:
 
 
 def draw(bpy, *panels):
-    """What panels say that want to be drawn, one after the other; menus and lists are passed over."""
+    """Text of the panels that are drawn, one after the other; menus and lists are skipped."""
     said = []
     for panel in panels:
         if hasattr(panel, "bl_rna") and not issubclass(panel, bpy.types.Panel):

@@ -38,12 +38,12 @@ def go_to(bpy, collection, t):
 
 
 def matrix(bpy, obj):
-    """Where an object is in the world. [4, 4]"""
+    """World matrix of an object. [4, 4]"""
     return np.array(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).matrix_world, np.float64)
 
 
 def points(bpy, cloud):
-    """Where the points of a cloud are in the world. [n, 3]"""
+    """World positions of the points of a cloud. [n, 3]"""
     evaluated = cloud.evaluated_get(bpy.context.evaluated_depsgraph_get())
     local = np.empty(3 * len(evaluated.data.points), np.float32)
     evaluated.data.attributes["position"].data.foreach_get("vector", local)
@@ -57,7 +57,7 @@ def clouds(collection):
 
 
 def all_points(bpy, collection, n):
-    """Where the Gaussians of a loaded scene are in the world, NaN for those that no cloud holds. [n, 3]"""
+    """World positions of the Gaussians of a loaded scene; NaN for those that no cloud holds. [n, 3]"""
     places = np.full((n, 3), np.nan)
     for cloud in clouds(collection):
         places[cloud.r5dgs.start : cloud.r5dgs.start + cloud.r5dgs.count] = points(bpy, cloud)
@@ -65,7 +65,7 @@ def all_points(bpy, collection, n):
 
 
 def offsets(bpy, collection, scene, t):
-    """How far from where playback has it each Gaussian is at a time, in sizes of the scene. [N]"""
+    """Distance of each Gaussian from its position in playback at a time, in sizes of the scene. [N]"""
     go_to(bpy, collection, t)
     expected = (
         scene_player.frame(scene, t).means.astype(np.float64) @ cameras.WORLD_TO_BLENDER[scene.world_convention].T

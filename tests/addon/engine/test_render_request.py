@@ -1,4 +1,4 @@
-"""What a picture shows: every loaded scene, as the depsgraph has it, through any camera."""
+"""A render request holds every loaded scene, as evaluated by the depsgraph, and works for any camera."""
 
 import dataclasses
 import importlib

@@ -1,4 +1,4 @@
-"""What a scene carries follows from what was measured, and the table says so."""
+"""The parts of a scene follow from the measurements, and the table of needs lists them."""
 
 import dataclasses
 

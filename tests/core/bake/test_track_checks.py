@@ -1,4 +1,4 @@
-"""What is wrong with one track is told and stays there."""
+"""A fault in one track is reported and leaves the other tracks as they are."""
 
 from __future__ import annotations
 

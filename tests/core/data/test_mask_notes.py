@@ -1,4 +1,4 @@
-"""What a folder says of its masks is read back, and decides how they may be used."""
+"""The notes of a folder of masks are read back and decide how its masks may be used."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What the standard library writes, OpenImageIO reads."""
+"""OpenImageIO reads the images that the standard library writes."""
 
 import numpy as np
 import OpenImageIO as oiio

@@ -239,7 +239,7 @@ def test_open_clip_needs_its_package(monkeypatch, perception):
 
 
 class StandIn:
-    """What open_clip makes: a text is its length, a picture its mean colour."""
+    """Stand-in for a model of open_clip: encodes a text as its length, an image as its mean colour."""
 
     def eval(self):
         return self

@@ -122,7 +122,7 @@ def test_following_agrees_with_the_librarys_own_loop(model, video):
 
 
 def test_memory_does_not_grow_with_the_video(model, video, monkeypatch):
-    """What is remembered after forty images is what was remembered after twenty."""
+    """The tracker keeps no more memory after forty images than after twenty."""
     long = videos.Video("long", video.views * 7)
     sizes = []
     forget = sam2_tracking._forget

@@ -20,7 +20,7 @@ directions = vectors.filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
 def places(model, points, taus=TAU):
-    """Where points of the body, seen from the pivot, are. [H, n, 3]"""
+    """Positions of points of the body, given relative to the pivot. [H, n, 3]"""
     quats, displacements = models.evaluate(model, taus)
     body = np.broadcast_to(points, (len(taus), len(points), 3))
     return rotations.rotate(quats[:, None], body) + displacements[:, None]

@@ -173,7 +173,7 @@ def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, v
 
 
 def test_the_literal_form_is_rigid_where_the_object_only_moved_along(twisted):
-    """Where f_def is a translation, offsets in the canonical state are those at t_max."""
+    """If f_def is a translation, offsets in the canonical state are those at t_max."""
     dynamics = twisted.dynamics.rates.copy()
     dynamics[:, 3:6] *= 0.1  # TRACE's midpoint steps are exact enough for slow spins
     dynamics[:, 9:] *= 0.1

@@ -161,7 +161,7 @@ def test_the_largest_acceleration_that_a_file_may_hold_plays_to_finite_centres(s
 @pytest.mark.parametrize("shift", [0.0, 1e4])
 @pytest.mark.parametrize("t", [T_MAX / 2, 2.0, 100 * T_MAX])
 def test_bodies_keep_their_shape_near_and_far_and_for_long(scene, shift, t):
-    """Where the origin is the body's own place, to single precision of the body's size."""
+    """Distances from the body's own place are kept, to single precision of the body's size."""
     away = np.array([1.0, -1.0, 0.5]) * shift
     groups = tuple(dataclasses.replace(group, pivot=group.pivot + away) for group in scene.groups)
     moved = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept."""
+"""The cache of compiled kernels: its folder, its notices and its validity."""
 
 import ast
 import os

@@ -1,4 +1,4 @@
-"""What cannot be drawn is named as the caller knows it; what can be understood is drawn."""
+"""Inputs that cannot be drawn are named as the caller knows them; all others are drawn."""
 
 import dataclasses
 import math
@@ -21,7 +21,7 @@ def scene(n=10, n_channels=3):
 
 
 def gaussians(count=4, **changes):
-    """What `rasterize` takes: raw parameters with harmonics of ``count`` coefficients."""
+    """Inputs of `rasterize`: raw parameters with harmonics of ``count`` coefficients."""
     means, quats, scales, opacities, _ = scene()
     raw = {
         **{"means": means, "quats": quats, "log_scales": scales.log(), "opacity_logits": torch.logit(opacities, 1e-4)},

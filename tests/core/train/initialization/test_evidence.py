@@ -1,4 +1,4 @@
-"""What images can tell of a body: texture tells its turn, masks how much is seen, backdrops whether it is there."""
+"""Evidence of a body in images: texture shows its turn, masks how much is seen, backdrops if it is there."""
 
 import dataclasses
 

@@ -14,7 +14,7 @@ SLANT = np.eye(3) - np.outer(NORMAL, NORMAL) + np.outer([0.5, 0, 0], NORMAL)
 
 
 def carried(points, group):
-    """Where points of the last knot were at each knot, as members of a group. [n, 9, 3]"""
+    """Positions at each knot of points of the last knot, as members of a group. [n, 9, 3]"""
     path = np.repeat(points[:, None], len(KNOTS), 1)
     rise = np.stack([0 * KNOTS, 0.3 * KNOTS, 0.8 * KNOTS**2], axis=1)
     if group == SHADOW:

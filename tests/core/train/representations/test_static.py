@@ -1,4 +1,4 @@
-"""Where nothing moves there is nothing that moves: not in the run, not in the file, not in memory."""
+"""A scene at rest has no moving parts: not in the run, not in the file, not in memory."""
 
 import dataclasses
 import json
