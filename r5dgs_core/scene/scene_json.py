@@ -30,44 +30,9 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
         "world_convention": scene.world_convention,
         "near_plane": float(scene.near_plane),
         "harmonics_turn": bool(scene.harmonics_turn),
-        "objects": [
-            {
-                "id": o.id,
-                "name": o.name,
-                "aliases": list(o.aliases),
-                "caption": o.caption,
-                "color": [float(c) for c in o.color],
-                "start": o.start,
-                "count": o.count,
-            }
-            for o in scene.objects
-        ],
-        "groups": [
-            {
-                "id": g.id,
-                "object_id": g.object_id,
-                "role": g.role,
-                "anchor_index": g.anchor_index,
-                "pivot": np.asarray(g.pivot, np.float64).tolist(),
-                "model": g.model.to_dict(),
-                "follows": g.follows,
-                "follow_matrix": None if g.follow_matrix is None else np.asarray(g.follow_matrix, np.float64).tolist(),
-                "rigid_rms": float(g.rigid_rms),
-                "rigid_max": float(g.rigid_max),
-                "seen": None if g.seen is None else [float(t) for t in g.seen],
-            }
-            for g in scene.groups
-        ],
-        "cameras": [
-            {
-                "name": c.name,
-                "width": c.width,
-                "height": c.height,
-                "intrinsics": c.intrinsics.tolist(),
-                "T_cam_world": c.T_cam_world.tolist(),
-            }
-            for c in scene.cameras
-        ],
+        "objects": [_object_tree(item) for item in scene.objects],
+        "groups": [_group_tree(group) for group in scene.groups],
+        "cameras": [_camera_tree(camera) for camera in scene.cameras],
         "light_direction": None if light is None else np.asarray(light, np.float64).tolist(),
         "vocabulary": list(scene.vocabulary),
         **({} if scene.lookup is None else {"lookup": _table_tree(scene.lookup)}),
@@ -274,6 +239,45 @@ def _read_view(row: Row) -> View:
         threshold=row.get("threshold", float),
         t=row.optional("t", float),
     )
+
+
+def _object_tree(item: SceneObject) -> dict[str, Any]:
+    return {
+        "id": item.id,
+        "name": item.name,
+        "aliases": list(item.aliases),
+        "caption": item.caption,
+        "color": [float(channel) for channel in item.color],
+        "start": item.start,
+        "count": item.count,
+    }
+
+
+def _group_tree(group: MotionGroup) -> dict[str, Any]:
+    matrix = group.follow_matrix
+    return {
+        "id": group.id,
+        "object_id": group.object_id,
+        "role": group.role,
+        "anchor_index": group.anchor_index,
+        "pivot": np.asarray(group.pivot, np.float64).tolist(),
+        "model": group.model.to_dict(),
+        "follows": group.follows,
+        "follow_matrix": None if matrix is None else np.asarray(matrix, np.float64).tolist(),
+        "rigid_rms": float(group.rigid_rms),
+        "rigid_max": float(group.rigid_max),
+        "seen": None if group.seen is None else [float(t) for t in group.seen],
+    }
+
+
+def _camera_tree(camera: Camera) -> dict[str, Any]:
+    return {
+        "name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "intrinsics": camera.intrinsics.tolist(),
+        "T_cam_world": camera.T_cam_world.tolist(),
+    }
 
 
 def _table_tree(found: Table) -> dict[str, Any]:
