@@ -16,6 +16,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one process per core, so each gets on
 
 BPY_PYTHON = (3, 11)
 STATUS = pytest.StashKey[int]()
+NOT_QUICK = ("blender", "slow", "gpu", "browser", "cluster")
 
 hypothesis.settings.register_profile("r5dgs", deadline=None, max_examples=50)
 hypothesis.settings.load_profile("r5dgs")
@@ -34,6 +35,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("r5dgs")
     group.addoption("--bit-flips", type=int, default=200, metavar="N", help="flipped bits of each checkpoint")
     group.addoption("--kills", type=int, default=30, metavar="N", help="killed runs of the slow test")
+    left_out = f"leave out tests marked {', '.join(NOT_QUICK)}, whatever -m chooses"
+    group.addoption("--quick", action="store_true", help=left_out)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselect long tests with ``--quick``. Tests with the fixture `blender` count as marked."""
+    if not config.getoption("--quick"):
+        return
+    left_out = [
+        item
+        for item in items
+        if any(item.get_closest_marker(name) for name in NOT_QUICK) or "blender" in getattr(item, "fixturenames", ())
+    ]
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = [item for item in items if item not in set(left_out)]
 
 
 def pytest_report_header(config: pytest.Config) -> str:

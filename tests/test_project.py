@@ -203,3 +203,17 @@ def test_the_first_five_minutes_in_blender_name_objects_of_the_demo():
     prompt = re.search(r"Type `([^`]*)` into \*\*Select by Prompt", text)
     assert prompt is not None and objects and all(name in text for name in objects)
     assert all(phrase.removeprefix("the ") in objects for phrase in prompt[1].split(" and "))
+
+
+def test_quick_leaves_out_long_tests_whatever_markers_are_chosen():
+    files = [
+        f"tests/{name}.py"
+        for name in ("core/train/test_checkpoint_damage", "addon/ui/test_plural", "core/test_strict_json")
+    ]
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-m", "slow or not slow", *files]
+    plain, quick = (
+        subprocess.run([*command, *more], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        for more in ([], ["--quick"])
+    )
+    assert "test_plural" in plain and "kill" in plain
+    assert "test_strict_json" in quick and "test_plural" not in quick and len(quick) < len(plain)
