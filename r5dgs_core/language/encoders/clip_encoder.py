@@ -16,6 +16,16 @@ TEMPLATES = ("{}", "a photo of a {}", "a render of a {}")
 _BATCH = 16
 
 
+def detect(folder: Path) -> bool:
+    """Return True if a folder holds a CLIP or SigLIP model of transformers."""
+    return encoder_base.model_type(folder) in ("clip", "siglip")
+
+
+def load(folder: Path) -> ClipEncoder:
+    """Load the encoder of a folder. Raises `BackendError`."""
+    return ClipEncoder(folder, str(encoder_base.model_type(folder)))
+
+
 class ClipEncoder:
     """CLIP or SigLIP model of a folder.
 

@@ -121,6 +121,12 @@ def quieten() -> None:
     logging.set_verbosity_error()
 
 
+def model_type(folder: Path) -> object:
+    """Return ``model_type`` of a folder's config.json, or None if there is no such file. Raises `BackendError`."""
+    path = folder / "config.json"
+    return read_json(path).get("model_type") if path.is_file() else None
+
+
 def missing_package(error: ImportError) -> errors.BackendError:
     """Error for a missing optional package."""
     return errors.BackendError(

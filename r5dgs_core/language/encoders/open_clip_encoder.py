@@ -13,6 +13,17 @@ from . import encoder_base
 from .clip_encoder import TEMPLATES
 
 _BATCH = 16
+CONFIG = "open_clip_config.json"
+
+
+def detect(folder: Path) -> bool:
+    """Return True if a folder holds an open_clip model."""
+    return (folder / CONFIG).is_file()
+
+
+def load(folder: Path) -> OpenClipEncoder:
+    """Load the encoder of a folder. Raises `BackendError`."""
+    return OpenClipEncoder(folder)
 
 
 class OpenClipEncoder:
@@ -23,7 +34,7 @@ class OpenClipEncoder:
     """
 
     def __init__(self, folder: Path):
-        config = encoder_base.read_json(folder / "open_clip_config.json")
+        config = encoder_base.read_json(folder / CONFIG)
         try:
             import open_clip
             import torch

