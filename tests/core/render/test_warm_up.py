@@ -51,7 +51,7 @@ def start(cache, *arguments):
 
 
 def finish(process, data=b""):
-    """What it prints and what it complains of."""
+    """Wait for a process; return its output and its errors."""
     out, complaints = process.communicate(data, timeout=300)
     assert process.returncode == 0, complaints.decode()
     return out, complaints.decode()
@@ -99,13 +99,13 @@ def talk(cache, scene_path):
 
 @pytest.fixture(scope="module")
 def cold(cache, scene_path):
-    """What the first worker of a machine says."""
+    """Messages of the first worker of a machine."""
     return talk(cache, scene_path)
 
 
 @pytest.fixture(scope="module")
 def warm_ups(cold, cache):
-    """What two calls of ``r5dgs warm-up`` after it say: events, and complaints."""
+    """Events and errors of two calls of ``r5dgs warm-up`` after it."""
     calls = []
     for _ in range(2):
         out, complaints = finish(start(cache, "-m", "r5dgs_core.cli", "warm-up", "--progress", "json"))
