@@ -49,7 +49,7 @@ def make_scene(count: int, bodies: int, kind: str = "ballistic_spin", seed: int 
     poses, own = [np.tile([1.0, 0, 0, 0, 0, 0, 0], (KNOTS, 1))], np.zeros((count, 12))
     for g in range(1, bodies + 1):
         v, a, w, eps = rng.normal(size=(4, 3)) * [[0.5], [0.5], [1.5], [0.7]]
-        inertia = np.diag([0.4, 0.8, 1.0]) if kind == "free_top" else None
+        inertia = np.diag([0.4, 0.8, 1.0]) if models.KINDS[kind].needs_inertia else None
         rates = {"velocity": v, "acceleration": a, "angular_velocity": w, "angular_acceleration": eps}
         model = models.MotionModel(kind, **rates, inertia=inertia, radius=0.5, offset_rotvec=rng.normal(size=3) * 0.01)
         quats, displacements, _, _ = models.curve(models.MotionModel("ballistic_spin", **rates), times - T_MAX)

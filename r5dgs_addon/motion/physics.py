@@ -24,28 +24,7 @@ from ..scene import timeline
 from ..ui import plural
 from . import fcurves
 
-KINDS = (
-    ("static", "Still", "Does not move"),
-    ("translation", "Slide", "Moves without turning; with swings, it oscillates like a mass on a spring"),
-    (
-        "ballistic_spin",
-        "Throw and Spin",
-        "Spins about a center that flies; a hinge or a pendulum if the center is fixed",
-    ),
-    ("constant_twist", "Screw", "Turns at a constant rate and moves along its own axes"),
-    ("world_twist", "Orbit", "Turns about a point in the world, with constant acceleration"),
-    ("free_top", "Tumble", "Flies and spins freely, like a rigid body of its shape without contact"),
-)
-RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "center_offset")
-FIELDS = {  # shown fields of each kind, in addition to `pivot`
-    "static": (),
-    "translation": ("velocity", "acceleration", "frequency"),
-    "ballistic_spin": RATES[:4] + ("frequency",),
-    "constant_twist": ("velocity", "angular_velocity"),
-    "world_twist": RATES[:4],
-    "free_top": ("velocity", "acceleration", "angular_velocity"),
-}
-_POWERS = {"velocity": 1, "acceleration": 2, "angular_velocity": 1, "angular_acceleration": 2, "frequency": 1}
+RATES = tuple(models.RATES)
 _re_extrapolate: Callable[[list[bpy.types.Object]], object] | None = None  # set by `extrapolate`
 _LEAST_MOMENT = 1e-3  # minimum moment of inertia of flat or thin bodies, as a fraction of the largest
 
@@ -71,7 +50,7 @@ def call_on_change(re_extrapolate: Callable[[list[bpy.types.Object]], object] | 
 
 def _vector(name: str):
     """Property options with getter and setter of a vector in Blender's units."""
-    power = _POWERS.get(name, 0)
+    power = models.RATES[name].per_time
 
     def read(state):
         factor = units_per_second(state) ** power
@@ -119,7 +98,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     kind: EnumProperty(
         name="Motion",
         description="Type of motion past the last observed time",
-        items=KINDS,
+        items=[(name, kind.label, kind.tooltip) for name, kind in models.KINDS.items()],
         update=write_at_once,
         options=set(),
     )
@@ -337,7 +316,7 @@ def model(anchor: bpy.types.Object) -> MotionModel:
     if changed:
         values.update(offset_rotvec=np.zeros(3), offset_displacement=np.zeros(3))
     if "kind" in changed:
-        values.update(kind=state.kind, inertia=inertia(anchor) if state.kind == "free_top" else None)
+        values.update(kind=state.kind, inertia=inertia(anchor) if models.KINDS[state.kind].needs_inertia else None)
     try:
         return confidence.without(replace(base, **values), changed)
     except ValueError as error:

@@ -13,7 +13,7 @@ from mathutils import Vector
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import rotation_centers
-from ...r5dgs_core.motion.models import MotionModel
+from ...r5dgs_core.motion.models import KINDS, MotionModel
 from . import extrapolate, fcurves, physics
 
 _ON_AXIS = 1e-4  # tolerance as a fraction of the point's distance, because rates are float32
@@ -94,12 +94,12 @@ def _place(anchor: bpy.types.Object) -> np.ndarray:
 def _model(anchor: bpy.types.Object) -> MotionModel | None:
     """Motion model of the fields' rates, or None if they are invalid, or if the anchor tumbles or follows another."""
     state = anchor.r5dgs_motion
-    if state.kind == "free_top" or state.leader is not None:
+    if state.leader is not None:
         return None
     rates = {name: getattr(state, f"stored_{name}") for name in physics.RATES}
     try:
         return MotionModel(state.kind, frequency=state.stored_frequency, **rates)
-    except ValueError:  # invalid values
+    except ValueError:  # invalid values, or a kind that needs an inertia
         return None
 
 
@@ -112,7 +112,7 @@ def _offset(anchor: bpy.types.Object) -> np.ndarray | None:
     """
     model = _model(anchor)
     found = None if model is None else rotation_centers.center(model)
-    if model is None or found is None or model.kind in ("ballistic_spin", "translation"):
+    if model is None or found is None or not KINDS[model.kind].center_on_axis:
         return found
     along = rotation_centers.axis(model)
     assert along is not None  # a model with a center that is no spring turns

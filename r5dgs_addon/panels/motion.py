@@ -3,6 +3,7 @@
 import bpy
 
 from ...r5dgs_core import errors
+from ...r5dgs_core.motion import models
 from ..motion import confidence_tubes, duplicate_delete, fcurves, physics, pivot
 from ..scene import loaded_scenes
 from ..ui import status_bar
@@ -49,7 +50,7 @@ def _physics(layout, anchor) -> None:
     layout.prop(state, "kind")
     if not refused:
         _pivot(layout, anchor)
-    for name in physics.FIELDS[state.kind]:
+    for name in models.KINDS[state.kind].fields:
         layout.prop(state, name)
     layout.prop(state, "at_once")
     if state.too_fast:

@@ -18,8 +18,6 @@ from ..playback import affine_transform, scene_player
 from ..scene.scene import MotionGroup, Scene
 
 RIGID_TOLERANCE = 1e-3  # allowed deviation of the linear part of a motion from a rotation
-_LENGTHS = ("velocity", "acceleration", "center_offset", "offset_displacement")
-_ANGLES = ("angular_velocity", "angular_acceleration", "offset_rotvec")
 
 
 @dataclass(frozen=True)
@@ -164,30 +162,8 @@ def _turn_of(parent: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _turned_model(model: MotionModel, parent: np.ndarray) -> MotionModel:
-    """Transform a motion model as `_turned` does, including its covariance."""
-    if (parent == np.eye(3)).all():
-        return model
-    turn, scale = _turn_of(parent)
-    maps = {name: scale * turn for name in _LENGTHS} | {name: turn for name in _ANGLES}
-    values = {name: linear @ getattr(model, name) for name, linear in maps.items()}
-    if model.inertia is not None:
-        inertia = turn @ model.inertia @ turn.T
-        values["inertia"] = 0.5 * (inertia + inertia.T)
-    if model.covariance is not None:
-        change = _change(model.covariance_names, maps)
-        values["covariance"] = change @ model.covariance @ change.T
-    return replace(model, radius=abs(scale) * model.radius, **values)
-
-
-def _change(names: tuple[str, ...], maps: dict[str, np.ndarray]) -> np.ndarray:
-    """Change of basis for rates given by name, such as "velocity.x". [P, P]"""
-    change = np.eye(len(names))
-    parts = [name.partition(".") for name in names]
-    for i, (field, _, axis) in enumerate(parts):
-        for j, (other, _, other_axis) in enumerate(parts):
-            if axis and field == other and field in maps:
-                change[i, j] = maps[field]["xyz".index(axis), "xyz".index(other_axis)]
-    return change
+    """Transform a motion model as `_turned` does."""
+    return model if (parent == np.eye(3)).all() else model.transformed(*_turn_of(parent))
 
 
 def _track(

@@ -8,28 +8,21 @@ from pathlib import Path
 import numpy as np
 
 from .. import terminal
+from ..motion.models import KINDS
 from ..scene import quality
 from ..scene.scene import MotionGroup, Scene
 
 STILL = 0.05  # largest motion of a still object, as a share of its radius
-_KINDS = {  # names in Blender's sidebar
-    "static": "rests",
-    "translation": "slide",
-    "ballistic_spin": "throw+spin",
-    "constant_twist": "screw",
-    "world_twist": "orbit",
-    "free_top": "tumble",
-}
 
 
 def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
     """Return the motion of an object past t_max in words, by its motion models; "pinned" if no group can move."""
     words = []
     for group in groups:
-        if group.model.kind == "static" and _moved(scene, group) <= STILL * group.model.radius:
+        if not KINDS[group.model.kind].fields and _moved(scene, group) <= STILL * group.model.radius:
             words.append("still")
         else:
-            words.append(_KINDS[group.model.kind])
+            words.append(KINDS[group.model.kind].word)
     return ", ".join(dict.fromkeys(words)) or "pinned"
 
 

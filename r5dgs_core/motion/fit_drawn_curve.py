@@ -15,12 +15,8 @@ from . import models, rotations
 from .models import MotionModel
 
 # Kinds of `MotionModel` and their free rates, simplest first.
-_KINDS = (
-    ("static", ()),
-    ("translation", ("velocity", "acceleration")),
-    ("constant_twist", ("velocity", "angular_velocity")),
-    ("ballistic_spin", ("velocity", "acceleration", "angular_velocity", "angular_acceleration")),
-    ("ballistic_spin", ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "center_offset")),
+_FITS = sorted(
+    ((name, free) for name, kind in models.KINDS.items() for free in kind.drawn_fits), key=lambda fit: len(fit[1])
 )
 _STEPS = 60
 _DIFFERENCE = 1e-6
@@ -43,7 +39,7 @@ def fit(
     """
     best = MotionModel(radius=radius)
     error = pose_errors(*models.evaluate(best, taus), quats, displacements, radius).max(initial=0.0)
-    for kind, free in _KINDS[1:]:
+    for kind, free in _FITS:
         if error <= tolerance:
             break
         model = _solve(kind, free, taus, quats, displacements, radius)

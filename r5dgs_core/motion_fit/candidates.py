@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..motion import free_top, models, rotations, se3
+from ..motion import models, rotations
 
 _SIZES = {"r": 3, "e": 3, "v": 3, "a": 3, "w": 3, "eps": 3, "kappa": 1, "u": 3, "swing": 3, "phase": 1, "pace": 1}
 # Standard deviations of weak priors, in radii and spans, far wider than observed motions. They only constrain
@@ -40,7 +40,7 @@ class Candidate:
         tau_mid: Middle of the window, for "kappa".
         frequencies: Lowest and highest W of a motion with "pace". Less than a quarter period in the window cannot be
             distinguished from a constant acceleration.
-        inertia: Inertia of a "free_top" in the bind state. [3, 3]
+        inertia: Inertia in the bind state, for kinds that need it. [3, 3]
     """
 
     name: str
@@ -95,64 +95,18 @@ class Candidate:
     def poses(self, theta: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses of the fitted curve. [B, P], [S] -> quaternions [B, S, 4], displacements [B, S, 3]"""
         p = {name: part[..., None, :] for name, part in self.unpack(theta).items()}
-        span = tau[:, None]
-        if self.kind == "free_top":
-            return self._tumbling(theta, tau)
-        if self.kind == "constant_twist":
-            quats, d = models.twist_poses(p["v"], p["w"], span)
-        elif self.kind == "world_twist":
-            quats, d = _world_twist(p, tau)
-        else:
-            quats, d = models.spin_poses(p["v"], p["a"], p["w"], p["eps"], p["u"], p["frequency"], span)
-        return rotations.multiply(quats, rotations.rotvecs_to_quats(p["r"])), d + p["e"]
-
-    def _tumbling(self, theta: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`poses` of a free top, whose inertia rotates with the pose at t_max: R = exp(r) R_top(exp(-r) w)."""
-        assert self.inertia is not None
-        p = self.unpack(theta)
-        first = rotations.rotvecs_to_quats(p["r"])
-        quats, _ = free_top.turns(self.inertia, rotations.rotate(rotations.conjugate(first), p["w"]), tau)
-        span = tau[:, None]
-        return (
-            rotations.multiply(first[..., None, :], quats),
-            p["e"][..., None, :] + p["v"][..., None, :] * span + p["a"][..., None, :] * (0.5 * span**2),
-        )
-
-
-def _world_twist(p: dict[str, np.ndarray], tau: np.ndarray) -> se3.Pose:
-    """Poses from sixteen Magnus-4 steps to each time, accurate enough to compare candidates."""
-    steps = 16
-    h = (tau / steps)[:, None]
-    middles = np.arange(steps)[:, None, None, None] + 0.5
-    mw, mv = p["w"] + middles * h * p["eps"], p["v"] + middles * h * p["a"]
-    bracket = (rotations.cross(mw, p["eps"]), rotations.cross(mw, p["a"]) - rotations.cross(p["eps"], mv))
-    return se3.product(*se3.exp(h * mw - h**3 / 12 * bracket[0], h * mv - h**3 / 12 * bracket[1]))
+        rates = models.Rates(p["v"], p["a"], p["w"], p["eps"], p["u"], p["frequency"])
+        return models.KINDS[self.kind].fitted(rates, p["r"], p["e"], tau, self.inertia)
 
 
 # Ordered by the number of parameters; among equals, the simpler motion first.
-FAMILY = (
-    Candidate("static", "static", ()),
-    Candidate("translation", "translation", ("v",)),
-    Candidate("spin", "ballistic_spin", ("w",)),
-    Candidate("spin, accelerating", "ballistic_spin", ("w", "kappa")),
-    Candidate("translation, quadratic", "translation", ("v", "a")),
-    Candidate("translation + spin", "ballistic_spin", ("v", "w")),
-    Candidate("constant twist", "constant_twist", ("v", "w")),
-    Candidate("hinge", "ballistic_spin", ("w", "kappa", "u")),
-    Candidate("spring", "translation", ("v", "a", "pace")),
-    Candidate("pendulum", "ballistic_spin", ("swing", "phase", "u", "pace")),
-    Candidate("ballistic + spin", "ballistic_spin", ("v", "a", "w")),
-    Candidate("ballistic + spin, accelerating", "ballistic_spin", ("v", "a", "w", "kappa")),
-    Candidate("ballistic + spin, free axis", "ballistic_spin", ("v", "a", "w", "eps")),
-    Candidate("ballistic + spin, free centre", "ballistic_spin", ("v", "a", "w", "u")),
-    Candidate("full, free centre", "ballistic_spin", ("v", "a", "w", "eps", "u")),
+ALL = sorted(
+    (Candidate(name, kind, fit) for kind in models.KINDS for name, fit in models.KINDS[kind].fits.items()),
+    key=lambda candidate: (candidate.parameters, candidate.oscillates),
 )
-# The world twist is excluded: it cannot describe a falling body that spins, because the rate of its centre would be
-# quadratic in time, and the hinges and screws that it can describe are members already. `model_selection` tries the
-# free top separately.
-FREE_TOP = Candidate("free top", "free_top", ("v", "a", "w"))
-EXTRA = (Candidate("world twist", "world_twist", ("v", "a", "w", "eps")), FREE_TOP)
-BY_NAME = {candidate.name: candidate for candidate in (*FAMILY, *EXTRA)}
+FAMILY = tuple(candidate for candidate in ALL if models.KINDS[candidate.kind].fits_by_default)
+BY_NAME = {candidate.name: candidate for candidate in ALL}
+FREE_TOP = BY_NAME["free top"]
 
 
 @dataclass(frozen=True)

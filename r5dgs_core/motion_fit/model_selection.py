@@ -172,7 +172,7 @@ def fit(
 
 def _may_tumble(picked: Solution, inertia: np.ndarray) -> bool:
     """Return True if the selected motion has a spin of changing axis that a free body of this inertia can have."""
-    if "eps" not in picked.candidate.blocks or picked.candidate.kind != "ballistic_spin":
+    if "eps" not in picked.candidate.blocks or not models.KINDS[picked.candidate.kind].may_tumble:
         return False
     p = picked.candidate.unpack(picked.theta)
     across = np.linalg.norm(np.cross(p["w"], p["eps"]))
@@ -224,7 +224,7 @@ def _check(times: np.ndarray, quats: np.ndarray, displacements: np.ndarray, weig
 def _named(name: str, inertia: np.ndarray | None) -> Candidate:
     if name not in families.BY_NAME:
         raise ValueError(f"candidates: {name!r} is none of {', '.join(families.BY_NAME)}")
-    if name == families.FREE_TOP.name and inertia is None:
+    if models.KINDS[families.BY_NAME[name].kind].needs_inertia and inertia is None:
         raise ValueError(f"candidates: {name!r} needs the inertia")
     return replace(families.BY_NAME[name], inertia=inertia)
 
@@ -330,7 +330,7 @@ def _to_model(
     slopes = np.concatenate([(moved[name] - rates[name]) / step for name in names], axis=-1).T
     frequency = float(rates.pop("frequency")[0])
     inertia = None
-    if solution.candidate.inertia is not None and solution.candidate.kind == "free_top":
+    if solution.candidate.inertia is not None and models.KINDS[solution.candidate.kind].needs_inertia:
         turn = rotations.quats_to_rotmats(rotations.rotvecs_to_quats(rates["offset_rotvec"]))
         inertia = turn @ solution.candidate.inertia @ turn.T
     covariance = slopes @ _covariance(solution, track, sigmas) @ slopes.T

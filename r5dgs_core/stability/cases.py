@@ -167,7 +167,7 @@ def world_twist(twist: Twist) -> models.MotionModel:
 
 def model_of(kind: str, **rates: Any) -> models.MotionModel:
     """A motion model of any kind; a top gets three different moments of inertia."""
-    inertia = np.diag([0.4, 0.8, 1.0]) if kind == "free_top" else None
+    inertia = np.diag([0.4, 0.8, 1.0]) if models.KINDS[kind].needs_inertia else None
     return models.MotionModel(kind, radius=RADIUS, inertia=inertia, **rates)
 
 

@@ -505,8 +505,7 @@ def test_stepped_keys_are_not_smoothed_away(blender, loaded, mug):
 
 def test_the_panel_shows_what_a_motion_has_and_whether_it_was_edited(blender, loaded, mug):
     (panel,) = importlib.import_module("r5dgs.r5dgs_addon.panels.motion").CLASSES
-    physics = motions.addon("motion.physics")
-    for kind, fields in physics.FIELDS.items():
+    for kind, fields in ((name, kind.fields) for name, kind in models.KINDS.items()):
         mug.r5dgs_motion.kind = kind
         said = layouts.draw(blender, panel)
         assert set(fields) <= set(said) and "r5dgs.re_extrapolate" in said

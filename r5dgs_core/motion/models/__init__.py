@@ -1,0 +1,34 @@
+"""Rigid motion past t_max: one module per kind of motion, and their evaluation at any time."""
+
+import importlib
+
+from .base import KINDS, RATES, MotionKind, MotionModel, Rates, clocks
+from .evaluation import Stack, curve, evaluate, evaluate_all, evaluate_with_rates, steps_needed
+
+# Each kind is the module of its name. Append new ones: .blend files store the position in Blender's menu.
+_NAMES = (
+    "static",
+    "translation",
+    "ballistic_spin",
+    "constant_twist",
+    "world_twist",
+    "free_top",
+)
+KINDS.update({name: importlib.import_module(f"{__name__}.{name}").KIND for name in _NAMES})
+STATIC = MotionModel()
+
+__all__ = [
+    "KINDS",
+    "RATES",
+    "STATIC",
+    "MotionKind",
+    "MotionModel",
+    "Rates",
+    "Stack",
+    "clocks",
+    "curve",
+    "evaluate",
+    "evaluate_all",
+    "evaluate_with_rates",
+    "steps_needed",
+]
