@@ -1,9 +1,12 @@
-"""Seconds that Blender takes to load a scene: `python benchmarks/load.py [--json FILE]`, in the bpy module.
+"""Time to load a scene in Blender.
 
-In a program: ``blender -b --factory-startup --python benchmarks/load.py -- [--json FILE]``. Synthetic scenes of twelve
-moving bodies are loaded into an empty file in turn, ``--rounds`` times. ``wall`` and ``cpu`` are the least seconds of
-the whole operator on the clock and of the processor; ``read`` and ``keys`` are what reading the file and writing the
-keys take of the latter, ``rest`` is what making the objects and filling their points does. ``mb`` is the file's size.
+    python benchmarks/load.py [--json FILE]
+
+In Blender instead of bpy: ``blender -b --factory-startup --python benchmarks/load.py -- [--json FILE]``. Synthetic
+scenes of twelve moving bodies are loaded into an empty file in turn, ``--rounds`` times. ``wall`` and ``cpu`` are the
+minimum wall and processor seconds of the whole operator; ``read``, ``keys`` and ``rest`` are the processor seconds of
+reading the file, writing keys, and creating objects and points. ``mb`` is the file size. Results:
+docs/results/blender.md.
 """
 
 import argparse

@@ -1,17 +1,18 @@
-"""Times the motion stage of a frame beside what TRACE computes for one: `python benchmarks/motion.py [--json FILE]`.
+"""Time to pose the Gaussians of a frame, compared with TRACE's networks.
 
-A generated scene of ``--gaussians`` Gaussians in ``--bodies`` bodies that turn and fly, all moving, with dynamics of
-their own, is played past t_max in every mode by a `scene_player.Player`. Rows:
+    python -m benchmarks.motion [--json FILE]
 
-    networks   what TRACE evaluates for every frame: deformation field and TRD of its sizes for all Gaussians (with
-               random weights), then TRACE's midpoint steps of all of them
-    poses      the poses of the bodies alone, of every kind of motion model
+A generated scene of ``--gaussians`` Gaussians in ``--bodies`` moving bodies, with dynamics of single Gaussians, is
+played past t_max in every mode by a `scene_player.Player`. Rows:
+
+    networks   deformation field and TRD of TRACE's sizes for all Gaussians (random weights), then TRACE's midpoint
+               steps of all of them
+    poses      poses of the bodies alone, for each kind of motion model
     frame      Gaussians at a time: centres, rotations and shading, with the centres relative to a camera
-    bending    frames in the observed time, where every Gaussian has residuals
+    bending    frames in the observed time in which every Gaussian has residuals
 
-``ms`` is the smallest and ``ms_median`` the median processor time of a call, on one thread; all take turns, so that
-what else the machine does meets all of them alike, and every call asks for another time. ``times_faster`` is the
-networks' median over the row's.
+``ms`` is the minimum and ``ms_median`` the median processor time of a call, on one thread, in interleaved rounds; every
+call uses another time. ``times_faster`` is the networks' median over the row's. Results: docs/results/motion.md.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def bending(scene: Scene) -> Scene:
 
 
 class Networks:
-    """What TRACE evaluates for every frame past t_max, with the networks of a size."""
+    """TRACE's networks of a size, evaluated for every frame past t_max."""
 
     def __init__(self, scene: Scene, size: str):
         generator = torch.Generator().manual_seed(0)
@@ -132,7 +133,7 @@ class Networks:
 
 
 def contenders(count: int, bodies: int, size: str, horizon: float) -> dict[tuple[str, str], Callable[[float], object]]:
-    """What is timed, by stage and name: functions of a share of the horizon, in [0, 1]."""
+    """Timed functions of a share of the horizon, in [0, 1], by stage and name."""
     scene = make_scene(count, bodies)
     networks, bent = Networks(scene, size), scene_player.Player(bending(scene))
     calls: dict[tuple[str, str], Callable[[float], object]] = {

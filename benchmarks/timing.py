@@ -1,4 +1,4 @@
-"""Measuring: contenders take turns, so that what else the machine does meets all of them alike."""
+"""Timing in interleaved rounds, so that background load affects all contenders equally."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ SETTLE_S = 0.02  # until threads that wait in a spinning loop give up their core
 
 @dataclass
 class Contender:
-    """Something to be timed and the times found.
+    """A timed function and its times.
 
     Attributes:
-        label: What its row says beside the times.
+        label: Other columns of its row.
         run: One call.
         torch_threads: Threads of torch's own operations.
         cpu_ms: Processor time of each call, over all threads.
         wall_ms: Time of each call.
         turns: Turns taken.
-        peak_mb: Largest resident memory during a call beyond that before it; None where the system does not tell.
+        peak_mb: Largest resident memory during a call beyond that before it; None if the system does not report it.
     """
 
     label: dict[str, Any]

@@ -1,13 +1,16 @@
-"""How well words find objects by their names: `python benchmarks/words.py --encoder DIR|text [--json FILE]`.
+"""Quality of finding objects by words, from their names.
 
-Tables of names alone, without captions, are asked for things that are called otherwise, and for things that are not
-there. The prompts were written down before any threshold was looked at; only the margin between matches was chosen
-by them afterwards. For each table:
+    python -m benchmarks.words --encoder DIR|text [--json FILE]
 
-    top1     prompts whose best match is a right one
+Tables of names without captions are queried with other words for their objects, and with words for missing things. The
+prompts were written before any threshold was chosen; only the margin between matches was chosen with them. Columns:
+
+    top1     prompts whose best match is right
     all      prompts whose matches are exactly the right ones
-    hits     right objects that were found, of all ``right`` ones and of all that were ``found``
-    nothing  prompts for absent things that find nothing
+    hits     right objects found, of all ``right`` ones and of all ``found`` ones
+    nothing  prompts for missing things that match nothing
+
+Results: docs/results/words.md.
 """
 
 from __future__ import annotations
@@ -128,7 +131,7 @@ def named(names: tuple[str, ...]) -> Scene:
 
 
 def measure(name: str, encoder: encoder_base.Encoder) -> dict[str, Any]:
-    """One row: counts, and what went wrong."""
+    """Return a row: counts, and the wrong answers."""
     scene = build_table.make(named(NAMES[name]), encoder).scene
     called = {item.id: item.name for item in scene.objects}
     row: dict[str, Any] = {"table": name, "present": 0, "top1": 0, "all": 0, "wrong": []}

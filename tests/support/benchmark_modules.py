@@ -9,24 +9,28 @@ import torch
 
 from r5dgs_core.raster import compilation
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
+ROOT = Path(__file__).parents[2]
 
 
 @contextlib.contextmanager
 def importing(monkeypatch):
-    """Give a function that imports a benchmark by name, as running it as a script would.
+    """Give a function that imports a module of the benchmarks by name, such as "raster.speed".
 
-    Afterwards its modules are forgotten, and the numbers of threads are what they were.
+    Afterwards these modules are forgotten, and the numbers of threads are what they were.
     """
     before = compilation.threads(), torch.get_num_threads()
-    monkeypatch.syspath_prepend(str(FOLDER))
-    names = [path.stem for path in FOLDER.glob("*.py")]
-    hidden = {name: sys.modules.pop(name) for name in names if name in sys.modules}
+    monkeypatch.syspath_prepend(str(ROOT))
+    hidden = _forget()
     try:
-        yield importlib.import_module
+        yield lambda name: importlib.import_module(f"benchmarks.{name}")
     finally:
-        for name in names:
-            sys.modules.pop(name, None)
+        _forget()
         sys.modules.update(hidden)
         compilation.set_threads(before[0])
         torch.set_num_threads(before[1])
+
+
+def _forget():
+    """Remove the modules of the benchmarks from `sys.modules`; returns them by name."""
+    names = [name for name in sys.modules if name.partition(".")[0] == "benchmarks"]
+    return {name: sys.modules.pop(name) for name in names}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import extreme_scenes
+from benchmarks.raster import extreme_scenes
 from r5dgs_core.raster import RasterSettings, RasterStats, rasterize_splats
 from tests.support.agreement import FORWARD, assert_within_bars
 from tests.support.splats import camera, draw, splats

@@ -1,7 +1,9 @@
-"""Times colours out of spherical harmonics, kernels against plain torch or numpy: `python benchmarks/harmonics.py`.
+"""Time of colors from spherical harmonics: kernels against plain torch or numpy.
 
-Rows are the colours of N Gaussians as an eye sees them, forward and with gradients of coefficients and centres, and a
-sky; columns as in `raster.py`. All run on one thread and in turns; ``ratio`` is of the smallest processor times.
+    python -m benchmarks.raster harmonics [--json FILE]
+
+Rows are the view-dependent colors of N Gaussians, forward and with gradients of coefficients and centres, and a sky;
+columns as in `speed`. Interleaved rounds on one thread; ``ratio`` compares minimum processor times.
 """
 
 from __future__ import annotations
@@ -13,11 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from timing import Contender, take_turns
 
 from r5dgs_core.raster import compilation, shade
 from r5dgs_core.scene import cameras, sh_color
 from r5dgs_core.scene.cameras import Camera
+
+from ..timing import Contender, take_turns
 
 COLUMNS = ("work", "degree", "way", "cpu_ms", "wall_ms_min", "wall_ms_median", "peak_mb", "ratio")
 

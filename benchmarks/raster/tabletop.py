@@ -1,7 +1,7 @@
-"""A generated scene like those that training makes: a table before two walls with six bodies on it that move.
+"""Generated scene that resembles trained ones: a table before two walls with six moving bodies.
 
-Gaussians lie flat on surfaces, most are nearly opaque, colours depend on the view (degree 3), and each body has a
-rigid track and a motion past t_max. Seeded, the same on every machine.
+Gaussians lie flat on surfaces, most are nearly opaque, colors depend on the view (degree 3), and each body has a rigid
+track and a motion past t_max. The seed is fixed, so the scene is the same on every machine.
 """
 
 from __future__ import annotations

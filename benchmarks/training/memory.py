@@ -1,11 +1,12 @@
-"""Peak memory of training, phase by phase, with as many Gaussians as asked for.
+"""Peak memory of training by phase, with a given number of Gaussians. Linux only.
 
-    python benchmarks/memory.py [--gaussians 300000] [--size 400] [--cameras 12] [--times 12] [--steps 24] [--json FILE]
+    python -m benchmarks.training memory [--gaussians 300000] [--size 400] [--cameras 12] [--times 12] [--steps 24]
+                                         [--json FILE]
 
-A data set of moving textured balls on a textured floor is drawn by ray casting, in a process of its own. Gaussians
-double in rounds until they are as many as asked for, then some steps are taken, a checkpoint is written, labels and
-identities are made, and the scene is baked. Memory is the largest resident size in each phase; seconds are processor
-time. Linux only.
+A data set of moving textured balls on a textured floor is ray cast in a separate process. Gaussians double in rounds
+up to the given number; then some steps are taken, a checkpoint is written, labels and identities are computed, and the
+scene is baked. Memory is the peak resident size of each phase; seconds are processor time. Results:
+docs/results/training.md.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import timing
+
+from .. import timing
 
 ANGLE_X = 0.7
 T_MAX = 0.75

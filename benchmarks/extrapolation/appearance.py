@@ -1,26 +1,23 @@
-"""What is left of the error past t_max, by cause: poses, borders, sides never seen, shading, shadows, the rest.
+"""Causes of the image error past t_max: poses, borders, sides never seen, shading, shadows, background.
 
-    python benchmarks/appearance.py DATA --run RUN [--json FILE] [--pictures FOLDER]
+    python -m benchmarks.extrapolation appearance DATA --run RUN [--json FILE] [--pictures FOLDER]
 
-A finished run of ``tracks`` is baked, and its test views are drawn with the motion that the scene plays and with the
-true poses of the data set (the oracle). Each row is a share of the squared error of the first, summed over all pixels
-of all test views; the shares add up to one:
+A run of ``tracks`` is baked, and its test views are drawn with the scene's motion and with the true poses of the data
+set (the oracle). Each row is a share of the squared error with the scene's motion, summed over all pixels of all test
+views; the shares add up to one:
 
-- poses: error of the first minus that of the oracle, below 0 where the true poses are no better. All that follows is
-  error of the oracle.
+- poses: that error minus the oracle's; negative if true poses are no better. The other rows are errors of the oracle.
 - borders: pixels next to an edge of the object mask.
 - unseen sides: other pixels of objects, drawn mostly by Gaussians that no training view showed from within 30 degrees.
-- shading: what the best affine change of colour of each object at each time removes from its other pixels.
-- objects: what it leaves there.
-- shadows: other pixels of the background where the true image is more than three levels of 255 off the scene without
-  all that moves. Where that draws its textures wrongly, they count too.
-- background: the rest of it.
+- shading: the part that the best affine change of color of each object at each time removes from its other pixels.
+- objects: the part that remains there.
+- shadows: other pixels of the background at which the true image differs by more than three levels of 255 from the
+  scene without moving objects. Wrong textures of the background count, too.
+- background: the rest.
 
-``if gone`` is the gain in PSNR if that share alone were zero. ``excess`` compares with val, whose times were observed:
-what a share has beyond the error that val has on such pixels, as its part of the distance in dB between test and a test
-with the errors of val; these add up to that distance.
-
-The last rows are what extrapolating wins: the same scene with shading, shadows or both as they are at t_max.
+``if gone`` is the gain in PSNR if that share were zero. ``excess`` is the part of a share beyond the error of val on
+such pixels, in dB; these add up to the distance between test and a test with the errors of val. The last rows compare
+the same scene with shading, shadows or both kept as at t_max. Results: docs/results/training.md.
 """
 
 from __future__ import annotations
@@ -64,14 +61,14 @@ Move = Callable[[float], scene_player.Frame]
 
 @dataclass(frozen=True)
 class Picture:
-    """A view and what a scene shows of it.
+    """A view and its rendering.
 
     Attributes:
         view: The view.
         truth: Its image. [H, W, 3]
         mask: Its objects. [H, W]
         drawn: The rendering, rounded to 8 bits. [H, W, 3]
-        frame: What was drawn.
+        frame: The Gaussians drawn.
     """
 
     view: datasets.View
@@ -164,7 +161,7 @@ def _towards(frame: scene_player.Frame, camera: Camera) -> np.ndarray:
 
 
 def visibility(scene: Scene, frame: scene_player.Frame, camera: Camera) -> np.ndarray:
-    """What a view shows of each Gaussian, as a share of what it would alone and whole. [N]"""
+    """Visible share of each Gaussian in a view, relative to drawing it alone and whole. [N]"""
     posed = scene_renderer.pose_frame(scene, frame)
     gaussians = scene_renderer.PosedGaussians(posed)
     ones = torch.ones(len(posed.means), 1, requires_grad=True)
@@ -186,7 +183,7 @@ def resting(scene: Scene) -> np.ndarray:
 
 
 def kinds(scene: Scene, sight: Sight, picture: Picture) -> np.ndarray:
-    """What each pixel of a picture shows, an index of `KINDS`. [H, W]"""
+    """Kind of each pixel of a picture, an index of `KINDS`. [H, W]"""
     mask, frame, camera = picture.mask, picture.frame, picture.view.camera
     edge = ndimage.maximum_filter(mask, 3) != ndimage.minimum_filter(mask, 3)
     unseen = sight.share(frame, camera) < 0.5
@@ -215,8 +212,8 @@ class Sums:
     Attributes:
         error: Of each kind. [5]
         pixels: Of each kind. [5]
-        objects: Of each object: error on each of the first three kinds, without what shading could remove, and that.
-            {id: [4]}
+        objects: Of each object: error on the first three kinds without the part that shading could remove, and that
+            part. {id: [4]}
     """
 
     error: np.ndarray
@@ -225,7 +222,7 @@ class Sums:
 
     @property
     def shading(self) -> float:
-        """What shading could remove from all objects."""
+        """Error of all objects that shading could remove."""
         return float(sum(parts[3] for parts in self.objects.values()))
 
 

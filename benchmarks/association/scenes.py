@@ -1,7 +1,7 @@
-"""Scenes of rigid bodies on a floor, seen as Gaussians by several cameras, for the benchmark of association.
+"""Scenes of rigid bodies on a floor, seen as Gaussians by several cameras, for the benchmarks of association.
 
-Every image is splatted front to back: each pixel keeps the Gaussians with most weight. The true object of a pixel is
-the one with most weight at exact places; what an association is given are the lists drawn with wrong places.
+Every image is splatted front to back, and each pixel keeps the Gaussians with the largest weights. The true object of a
+pixel is that with the largest weight at exact positions; an association gets the lists drawn at wrong positions.
 
 Notation: N Gaussians, T times, V views, P pixels of an image, k Gaussians kept per pixel.
 """
@@ -22,7 +22,7 @@ TALLEST = 0.24  # semi-axis of the largest body, world units
 
 @dataclass(frozen=True)
 class Plan:
-    """What a scene holds.
+    """Content of a scene.
 
     Attributes:
         bodies: Number of objects.
@@ -36,7 +36,7 @@ class Plan:
         radius: Smallest and largest semi-axis.
         extent: Half side of the square that objects stand on.
         sweep_rad: Angle that each camera turns about the middle from first to last time.
-        leaving: Whether one object is far away in the middle third of the time.
+        leaving: True if one object is far away in the middle third of the time.
     """
 
     bodies: int = 10

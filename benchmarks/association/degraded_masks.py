@@ -1,6 +1,6 @@
-"""Spoils true masks as trackers do, and measures masks: for the benchmark of association.
+"""Tracker errors added to true masks, and measures of masks, for the benchmarks of association.
 
-Masks are rows of pixels; 0 is background. A track is what one view calls by one id.
+Masks are rows of pixels; 0 is background.
 """
 
 from __future__ import annotations
@@ -9,25 +9,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from association_scenes import Image
 from scipy import ndimage, optimize
 
 from r5dgs_core.association.associate import Row
 from r5dgs_core.data.masks import UNKNOWN
 
+from .scenes import Image
+
 
 @dataclass(frozen=True)
 class Errors:
-    """How masks are spoilt.
+    """Errors added to masks.
 
     Attributes:
-        per_view: Whether each view numbers its tracks by itself.
-        switches: Chance per object and time, from the second on, to be one of two that swap their ids for good.
-        fragments: Chance per object and time, from the second on, that it goes on under a new id.
+        per_view: True if each view has its own numbering.
+        switches: Chance per object and time, from the second on, to swap its id permanently with another object.
+        fragments: Chance per object and time, from the second on, to get a new id.
         misses: Chance per object and image that it is background.
         merges: Chance per image that the two nearest of three drawn objects have one id.
         edge_px: Length of the smooth random shifts of outlines, pixels.
-        parts: Chance per object and image that it falls into two ids.
+        parts: Chance per object and image to be split into two ids.
     """
 
     per_view: bool = False
@@ -136,7 +137,7 @@ def miou(masks: Sequence[np.ndarray], images: Sequence[Image]) -> float:
 
 
 def oracle(masks: Sequence[np.ndarray], images: Sequence[Image]) -> list[np.ndarray]:
-    """Every segment named after the true object that most of it is: what relabelling can reach."""
+    """Masks in which every segment has the true object of most of its pixels: the upper bound of relabelling."""
     best = []
     for mask, image in zip(masks, images, strict=True):
         out = np.zeros_like(mask)

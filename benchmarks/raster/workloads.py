@@ -1,9 +1,9 @@
-"""What the benchmarks draw: cubes of random Gaussians, a generated garden, a moving table top, and scene files.
+"""Workloads: cubes of random Gaussians, a generated garden, a moving table top, and scene files.
 
-    python benchmarks/workloads.py [--workloads W1,W4] [--garden FILE]
+    python -m benchmarks.raster workloads [--workloads W1,W4] [--garden FILE]
 
-prints how heavy each one is. Everything generated is seeded and the same on every machine. The real garden is the file
-assets/test_garden.npz of github.com/nerfstudio-project/gsplat, which is not ours to pass on.
+prints statistics of each. Generated workloads are seeded and the same on every machine. The real garden is the file
+assets/test_garden.npz of github.com/nerfstudio-project/gsplat, which may not be redistributed here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tabletop
 import torch
 
 from r5dgs_core.motion import rotations
@@ -24,6 +23,8 @@ from r5dgs_core.raster import RasterSettings
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.scene.scene import Scene
+
+from . import tabletop
 
 GARDEN = "W4garden"  # needs a file; all others are generated
 
@@ -173,7 +174,7 @@ def _real_garden(path: Path) -> Workload:
 
 
 def _garden(name: str) -> Workload:
-    """A garden made to weigh what "W4garden" weighs: a table on gravel amid a lawn, within a ring of hedges.
+    """Generated garden with the load of "W4garden": a table on gravel amid a lawn, within a ring of hedges.
 
     Sizes are log-normal around a median that grows with the distance from the table, as the spacing of triangulated
     points does. Numbers were chosen so that the statistics of `describe` agree with those of the real points.
@@ -260,7 +261,7 @@ GENERATED: dict[str, Callable[[str], Workload]] = {
 
 
 def describe(workload: Workload) -> dict[str, float]:
-    """How heavy a workload is.
+    """Return statistics of a workload.
 
     Returns:
         ``gaussians`` and how many of them are ``visible_clouds`` (their alpha_min ellipse's box meets the image); three

@@ -1,14 +1,15 @@
 """Error against run time of the rasterizer's own settings.
 
-    python benchmarks/raster_error.py [--workloads W1,tabletop-small] [--json FILE] [--plot FILE]
+    python -m benchmarks.raster error [--workloads W1,tabletop-small] [--json FILE] [--plot FILE]
 
-One setting is changed at a time, and a few together; everything else is 3DGS's. The truth is the reference in float64
-with next to no cut-offs (`IDEAL`). Errors are of the colours of the whole image: largest and root mean square
-difference, and PSNR. Times are of whole forward calls on one thread, from Gaussians with spherical harmonics to pixels,
-taken in turns: the smallest processor time, which other work on the machine disturbs least, and the median wall time.
-A point is on the Pareto front of its workload where none with less processor time has at most its error.
+Settings are changed one at a time, and a few together; the others are those of 3DGS. The ground truth is the reference
+in float64 with minimal cut-offs (`IDEAL`). Errors are those of the colors of the whole image: largest and root mean
+square difference, and PSNR. Times are of whole forward calls on one thread, from Gaussians with spherical harmonics to
+pixels, in interleaved rounds: minimum processor time and median wall time. A point is on the Pareto front of its
+workload if no point with less processor time has at most its error.
 
 Rows have the shape of ``r5dgs report``: ``ms`` is the smallest processor time, ``error_kind`` max_abs, rms or psnr_db.
+Results: docs/results/rasterizer.md.
 """
 
 from __future__ import annotations
@@ -26,16 +27,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import polynomials
-import tabletop
-import timing
 import torch
-import workloads
 from torch.nn.functional import interpolate
 
 from r5dgs_core.raster import compilation, rasterize
 from r5dgs_core.scene import sh_color
 from r5dgs_core.scene.cameras import Camera
+
+from .. import timing
+from . import polynomials, tabletop, workloads
 
 IDEAL = {"alpha_min": 1e-4, "transmittance_min": 1e-8}
 DEFAULT = "defaults"
@@ -244,7 +244,7 @@ def _badness(point: Point, kind: str) -> float:
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Which points (time, error) are on the Pareto front: no other has at most as much of both, and less of one."""
+    """True for each point (time, error) on the Pareto front: no other has at most as much of both, and less of one."""
     return [not any(t <= time and e <= error and (t < time or e < error) for t, e in points) for time, error in points]
 
 
@@ -262,7 +262,7 @@ def table(points: Sequence[Point]) -> str:
 
 
 def verdict(points: Sequence[Point]) -> str:
-    """Text: whether the defaults are on the front by rms, and if not, what beats them and by how much."""
+    """Text that tells if the defaults are on the front by rms, and otherwise the points that beat them."""
     own = next(point for point in points if point.variant.setting == DEFAULT)
     error = own.errors["rms"]
     better = [p for p in points if p.ms < own.ms and p.errors["rms"] <= error]

@@ -1,8 +1,8 @@
-"""The obvious association, image by image with a fixed threshold: what the benchmark compares with.
+"""Association image by image with a fixed threshold, as a baseline.
 
-Votes per Gaussian, image after image: each segment takes the object that its Gaussians have voted for where their IoU
-is above the threshold (Hungarian method, over Gaussians that have voted), else it becomes a new object. Objects that
-fewer than 4 images show are dropped, and every image is asked again without its own votes, three times.
+Images vote per Gaussian, one after another. A segment joins the object that its Gaussians voted for if their IoU is
+above the threshold (Hungarian method, over Gaussians with votes), else it becomes a new object. Objects in fewer than 4
+images are dropped, and every image is assigned again without its own votes, three times.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Stiff and extreme scenes for the rasterizer: what `raster_extreme.py` tabulates and the tests hold to their bars.
+"""Stiff and extreme scenes for the rasterizer, for the benchmark `extreme` and the tests.
 
-Cameras look along +z from the origin where nothing else is said.
+Cameras look along +z from the origin unless stated.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Error against run time of training: complete runs of several lengths on one data set, measured on its held-out views.
+"""Quality against training time: complete runs of several lengths on one data set, measured on held-out views.
 
-    python benchmarks/training.py DATA [--iterations 500 1000 2000 4000 6000] [--json FILE] [--plot FILE]
+    python -m benchmarks.training curve DATA [--iterations 500 1000 2000 4000 6000] [--json FILE] [--plot FILE]
 
-Each point is a run of its own, its schedule scaled to its length; seconds are wall time of training and identities on
-this machine, without reading results back. Rows have the shape of ``r5dgs report``.
+Each point is a separate run with a schedule scaled to its length. Seconds are wall time of training and identities.
+Rows have the shape of ``r5dgs report``. Results: docs/results/training.md.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
-"""Association on a real data set: what masks with errors cost a run, and what associating them gives back.
+"""Effect of degraded and of repaired masks on training.
 
-    python benchmarks/association_runs.py DATA --out DIR [--seed 0] [--switches 0.03] [--misses 0.05]
-                                               [--iterations 6000] [--json FILE]
+    python -m benchmarks.association trained DATA --out DIR [--seed 0] [--switches 0.03] [--misses 0.05]
+                                                            [--iterations 6000] [--json FILE]
 
-The training masks of a data set with true ones are spoilt as the synthetic benchmark spoils them: each camera numbers
-its objects by itself, ids are switched for good, objects are missed. A run without masks then shows which segments are
-one object (``r5dgs associate``), and three runs are compared: on the true masks, on the spoilt ones as they are, on the
-associated ones. Overlaps are means over objects, after the one best map of ids per split, against the masks of views
-that no run has seen.
+The training masks of a data set are degraded: each camera has its own numbering, ids are switched permanently, objects
+are missed. A run without masks repairs them (``r5dgs associate``). Three runs are compared: with true, degraded and
+repaired masks. Overlaps are means over objects, after the best map of ids per split, against the masks of held-out
+views. Results: docs/results/association.md.
 """
 
 from __future__ import annotations
@@ -17,9 +16,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-import association_masks
 import numpy as np
-from association_scenes import Image
 
 from r5dgs_core.bake import bake
 from r5dgs_core.cli import associate
@@ -30,8 +27,11 @@ from r5dgs_core.evaluation import evaluate
 from r5dgs_core.masks import videos
 from r5dgs_core.train import run
 
+from . import degraded_masks
+from .scenes import Image
 
-def spoil(dataset: datasets.Dataset, folder: Path, errors: association_masks.Errors, seed: int) -> None:
+
+def spoil(dataset: datasets.Dataset, folder: Path, errors: degraded_masks.Errors, seed: int) -> None:
     """Write the training masks with errors, and notes that say that ids hold within a video."""
     shots = videos.of(dataset.train)
     views = [(k, i, view) for k, video in enumerate(shots) for i, view in enumerate(video.views)]
@@ -40,7 +40,7 @@ def spoil(dataset: datasets.Dataset, folder: Path, errors: association_masks.Err
         raise SystemExit(f"{dataset.root}: expected a true mask for every training view")
     nothing = np.zeros((0, 1))
     images = [Image(k, i, ids.reshape(-1), nothing, nothing) for (k, i, _), ids in zip(views, truth, strict=True)]
-    spoilt = association_masks.spoil(images, errors, truth[0].shape[1], seed)
+    spoilt = degraded_masks.spoil(images, errors, truth[0].shape[1], seed)
     for (_, _, view), ids, true in zip(views, spoilt, truth, strict=True):
         masks.write(folder / f"{view.name}.png", ids.reshape(true.shape))
     found = {}
@@ -55,11 +55,11 @@ def overlap(data: Path, folder: Path) -> float:
     true, other = datasets.read(data), datasets.read(data, str(folder))
     nothing = np.zeros((0, 1))
     images = [Image(0, 0, datasets.load_mask(view).reshape(-1), nothing, nothing) for view in true.train]
-    return association_masks.miou([datasets.load_mask(view).reshape(-1) for view in other.train], images)
+    return degraded_masks.miou([datasets.load_mask(view).reshape(-1) for view in other.train], images)
 
 
 def train(data: Path, train_masks: str, folder: Path, iterations: int, seed: int) -> dict[str, Any]:
-    """Train, bake and measure one run; goes on with what is there."""
+    """Train, bake and measure one run; continues an existing one."""
     settings = config.Config().replace(
         **{"train.iterations": iterations, "train.seed": seed, "data.masks": train_masks}
     )
@@ -81,7 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args(arguments)
     data, out = args.data.resolve(), args.out.resolve()
-    errors = association_masks.Errors(per_view=True, switches=args.switches, misses=args.misses)
+    errors = degraded_masks.Errors(per_view=True, switches=args.switches, misses=args.misses)
     spoilt, plain, associated = out / "spoilt", out / "spoilt_unnoted", out / "associated"
     dataset = datasets.read(data)
     spoil(dataset, spoilt, errors, args.seed)

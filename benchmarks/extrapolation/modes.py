@@ -1,11 +1,11 @@
-"""Extrapolation, one table over many runs: every playback mode, every motion model, and true poses as the oracle.
+"""Extrapolation of many runs in one table: playback modes, motion models, and true poses as the oracle.
 
-    python benchmarks/extrapolation.py RUN... [--split test] [--json FILE] [--markdown FILE]
+    python -m benchmarks.extrapolation modes RUN... [--split test] [--json FILE] [--markdown FILE]
 
-Each run is baked with its data set. A run with dynamics of single Gaussians (`field`) is played in every mode; one
-without (`tracks`) with each motion model alone. All are measured in dB on the test images, which lie past t_max, beside
-the same scene with true poses where the data set has them. Runs of one scene and training that differ in their seed are
-columns of their own.
+Each run is baked with its data set. A run with dynamics of single Gaussians (`field`) is played in every mode, one
+without (`tracks`) with each motion model. The table has the PSNR on the test images, which lie past t_max, and that of
+the scene with true poses if the data set has them. Seeds of one scene and training have separate columns. Results:
+docs/results/report.md.
 """
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
-"""Times drawing what moves into what stands still, against drawing everything: `python benchmarks/backdrop.py`.
+"""Time of drawing moving Gaussians into a static layer, against drawing everything.
 
-The scene is a workload of `raster.py` of which the Gaussians nearest to one point move along together. ``covered`` is
-the share of tiles that they touch, ``ratio`` that of the smallest processor times, ``build_ms`` what the backdrop cost
-before its first frame; images are compared and must be equal to the bit.
+    python -m benchmarks.raster static_layer [--json FILE]
+
+In a workload of `workloads`, the Gaussians nearest to one point move together. ``covered`` is the share of tiles that
+they touch, ``ratio`` compares minimum processor times, and ``build_ms`` is the time to build the layer. Both images
+must be equal bit for bit. Results: docs/results/rasterizer.md.
 """
 
 from __future__ import annotations
@@ -14,12 +16,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import workloads
-from timing import Contender, take_turns
 
 from r5dgs_core.raster import compilation, rasterize_splats
 from r5dgs_core.raster.cpu.projection import TILE
 from r5dgs_core.raster.cpu.static_layer import StaticLayer
+
+from ..timing import Contender, take_turns
+from . import workloads
 
 COLUMNS = ("workload", "threads", "moving", "covered", "build_ms", "all_ms", "backdrop_ms", "ratio")
 
@@ -56,7 +59,7 @@ def measure(name: str, share: float, threads: int, repeats: int) -> dict:
 def main(arguments: list[str] | None = None) -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--workloads", default="W1,W3", help="names, see raster.py")
+    parser.add_argument("--workloads", default="W1,W3", help="names in workloads.py")
     parser.add_argument("--moving", default="0.01,0.05,0.2,0.5", help="shares of the Gaussians that move")
     parser.add_argument("--threads", default="1,2")
     parser.add_argument("--repeats", type=int, default=10)

@@ -1,12 +1,11 @@
-"""Held-out times: how well training sees between the times that it saw.
+"""Quality between the observed times.
 
-    python benchmarks/held_out_times.py DATA [--every 3] [--offset 1] [--sparse] [--reference] [--json FILE]
+    python -m benchmarks.training held_out_times DATA [--every 3] [--offset 1] [--sparse] [--reference] [--json FILE]
 
-Every third observed time is removed from the training split in a copy of the data set, never the first or the last one;
-with ``--sparse`` all but every third are.
-After a run on the copy the scene is compared at observed and at held-out times, with cameras that training never had
-(val) and with those that it had (train). ``--reference`` trains on the whole data set too: on the same images at
-held-out times the two differ by what the interpolation in time loses.
+Every third observed time, except the first and last, is removed from the training split in a copy of the data set; with
+``--sparse`` all but every third are. After a run on the copy, the scene is compared at observed and at held-out times,
+with novel cameras (val) and with training cameras (train). ``--reference`` also trains on the whole data set; the
+difference at held-out times is the loss of the interpolation in time. Results: docs/results/training.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Other polynomials for the exponential of the `cpu` backend, each compiled in a process of its own.
+"""Other polynomials for the exponential of the `cpu` backend, each compiled in its own process.
 
-Kernels are compiled once per process and kept on disk, so a process that shall have another polynomial must be told
-before its first picture and must keep its machine code elsewhere.
+Kernels are compiled once per process and cached on disk, so another polynomial needs its own process and cache.
 """
 
 from __future__ import annotations
@@ -14,8 +13,9 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
-import timing
 import torch
+
+from .. import timing
 
 POINTS = 2001  # of [-1/2, 1/2] at which errors are looked at
 SWEEPS = 400  # of the iteration; more change nothing in float32

@@ -1,9 +1,11 @@
-"""Seconds until the first frame of a fresh process: `python benchmarks/first_frame.py [--json FILE]`.
+"""Seconds until the first frame of a new process.
 
-Every row is the median of several processes, each with a cache of compiled kernels in a temporary folder of its own:
-empty for ``cold``, filled by another process for ``warm``. ``import_s`` brings torch, numba and the core,
-``first_s`` counts from there to the first picture of the scene of `frame_rate`, motion included, and ``second_s`` is
-the picture after it.
+    python -m benchmarks.raster first_frame [--json FILE]
+
+Every row is the median of several processes, each with its own cache of compiled kernels in a temporary folder: empty
+for ``cold``, filled by another process for ``warm``. ``import_s``: importing torch, numba and the core; ``first_s``:
+from there to the first picture of the scene of `frames`, including motion; ``second_s``: the next picture. Results:
+docs/results/rasterizer.md.
 """
 
 from __future__ import annotations
@@ -20,21 +22,21 @@ from pathlib import Path
 
 COLUMNS = ("cache", "sh_degree", "sky_degree", "import_s", "first_s", "second_s")
 TIMES = COLUMNS[3:]
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def first_frame(count: int, size: int, sh_degree: int, sky_degree: int) -> dict[str, float]:
     """Seconds of the imports and of the first two frames of this process, which must not have drawn yet."""
     start = time.perf_counter()
-    import frame_rate
-
     from r5dgs_core.playback import scene_player
     from r5dgs_core.raster.cpu import autograd, sky  # noqa: F401  (all that frames import)
     from r5dgs_core.render import scene_renderer  # noqa: F401  (all that frames import)
 
+    from . import frames
+
     imported = time.perf_counter()
-    camera = frame_rate.make_camera(size)
-    scene = frame_rate.make_scene(count, 6, sh_degree, sky_degree, camera)
+    camera = frames.make_camera(size)
+    scene = frames.make_scene(count, 6, sh_degree, sky_degree, camera)
     marks = [time.perf_counter()]
     for t in (0.1, 0.2):
         scene_renderer.render_frame(scene, scene_player.frame(scene, t), camera)
@@ -47,7 +49,7 @@ def in_fresh_process(cache: Path, options: argparse.Namespace, degrees: str) -> 
     paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     shape = ["--count", str(options.count), "--size", str(options.size)]
     done = subprocess.run(
-        [sys.executable, __file__, "--alone", degrees, *shape],
+        [sys.executable, "-m", "benchmarks.raster.first_frame", "--alone", degrees, *shape],
         env={**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": paths},
         stdout=subprocess.PIPE,
         stderr=None if options.verbose else subprocess.DEVNULL,

@@ -1,11 +1,10 @@
-"""Time of one training step: processor milliseconds of tracks and of the field, on the same data and Gaussians.
+"""Processor time of one training step, of tracks and of the field, on the same data and Gaussians.
 
-    python benchmarks/step.py DATA [--gaussians 12000] [--steps 200] [--json FILE]
+    python -m benchmarks.training step DATA [--gaussians 12000] [--steps 200] [--json FILE]
 
-Each representation is trained until it has the wanted number of Gaussians (growth is hastened for that), all observed
-times from the first step on. Then steps at all times are timed with all kernels warm: median and least of processor
-time of one thread, pose, picture, loss, gradients and optimizer together; nothing grows meanwhile. Images, placing and
-baking are not in it.
+Each representation is trained up to the given number of Gaussians, with accelerated growth and all observed times from
+the first step on. Then steps without growth are timed with warm kernels: median and minimum on one thread, from posing
+to the optimizer. Results: docs/results/training.md.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
-"""Draws stiff and extreme scenes and prints what they give: `python benchmarks/raster_extreme.py [--case NAME ...]`.
+"""Differences between backend and reference on stiff and extreme scenes (`extreme_scenes`).
 
-A row is a scene, drawn by the `cpu` backend in float32 and by the `reference` in float64 from the same float32 numbers.
-``image`` is the largest difference of colours and alpha (both in [0, 1]), ``depth`` that of depth times alpha relative
-to the largest depth, ``gradient`` the largest difference of a gradient relative to the largest entry of its tensor, for
-a random gradient of image, alpha and depth. Tests hold all of them to the bars of docs/reference/rasterizer.md.
+    python -m benchmarks.raster extreme [--case NAME ...]
+
+Each row is a scene, drawn by the `cpu` backend in float32 and by the `reference` in float64 from the same float32
+numbers. ``image`` is the largest difference of colors and alpha (both in [0, 1]), ``depth`` that of depth times alpha
+relative to the largest depth, ``gradient`` the largest difference of a gradient relative to the largest entry of its
+tensor, for a random gradient of image, alpha and depth. Results: docs/results/rasterizer.md.
 """
 
 from __future__ import annotations
@@ -12,9 +14,10 @@ import argparse
 from dataclasses import dataclass
 
 import torch
-from extreme_scenes import CASES, Case
 
 from r5dgs_core.raster import RasterStats, SplatImage, rasterize_splats
+
+from .extreme_scenes import CASES, Case
 
 NAMES = ("means", "quats", "scales", "opacities", "channels")
 
@@ -56,7 +59,7 @@ def draw(scene: Case, backend: str) -> Drawing:
 
 
 def compare(found: Drawing, expected: Drawing) -> Errors:
-    """How far the first drawing is from the second."""
+    """Return the differences between two drawings."""
 
     def largest(tensor: torch.Tensor) -> float:
         return tensor.detach().abs().max().item() if tensor.numel() else 0.0

@@ -1,4 +1,4 @@
-"""Where the time of the `cpu` backend goes: wall time of each kernel, and the rest of the call."""
+"""Wall time of each kernel of the `cpu` backend, and of the rest of the call."""
 
 from __future__ import annotations
 

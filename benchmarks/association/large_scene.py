@@ -1,9 +1,11 @@
-"""What `r5dgs associate` takes on a large scene, stage by stage: `python benchmarks/association_time.py`.
+"""Time and memory of `r5dgs associate` on a large scene, by stage.
 
-A synthetic scene is seen by a ring of cameras; its masks are spoilt as trackers do (`association_masks.py`, case D) and
-repaired by the very work of the command. ``read_s`` is reading the masks, ``draw_s`` drawing what each segment shows,
-``rest_s`` associating the segments and mending masks by drawn votes; wall time, kernels compiled before. The Gaussians
-fill a box, so that nearly all of them are drawn by every camera.
+    python -m benchmarks.association large_scene [--json FILE]
+
+A ring of cameras sees a synthetic scene whose Gaussians fill a box, so that nearly every camera draws all of them. Its
+masks are degraded (`degraded_masks`, case D) and repaired by the code of the command. ``read_s``: reading the masks;
+``draw_s``: rendering the segments; ``rest_s``: associating segments and mending masks. Wall time, kernels compiled
+beforehand. Results: docs/results/association.md.
 """
 
 from __future__ import annotations
@@ -12,14 +14,11 @@ import argparse
 import dataclasses
 import json
 import resource
-import sys
 import tempfile
 import time
 from pathlib import Path
 
-import association_masks
 import numpy as np
-from association_scenes import Image
 
 from r5dgs_core.association import mask_repair
 from r5dgs_core.data import dataset as datasets
@@ -28,9 +27,10 @@ from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.render.warm_up import warm_up
 from r5dgs_core.scene.scene import Scene
+from tests.support import scenes
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from tests.support import scenes  # noqa: E402  (the line before finds them)
+from . import degraded_masks
+from .scenes import Image
 
 CAMERAS = 10
 
@@ -46,7 +46,7 @@ def make_views(scene: Scene, images: int, pixels: int, folder: Path) -> tuple[li
             truth.append(Image(k, i, np.maximum(ids.numpy(), 0).astype(np.int32).reshape(-1), nothing, nothing))
             path = folder / f"camera{k}_{i:03d}.png"
             views.append(datasets.View(path.stem, camera, float(t), "train", path, path, mask_video=f"camera{k}"))
-    for view, ids in zip(views, association_masks.spoil(truth, association_masks.CASES["D"], pixels, 7), strict=True):
+    for view, ids in zip(views, degraded_masks.spoil(truth, degraded_masks.CASES["D"], pixels, 7), strict=True):
         assert view.mask_path is not None
         id_masks.write(view.mask_path, ids.reshape(pixels, pixels))
     return views, truth
@@ -81,8 +81,8 @@ def measure(gaussians: int, objects: int, images: int, pixels: int) -> dict[str,
         "rest_s": end - moments["draw", len(views)],
         "whole_s": end - start,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "in": association_masks.miou(incoming, truth),
-        "out": association_masks.miou(mended, truth),
+        "in": degraded_masks.miou(incoming, truth),
+        "out": degraded_masks.miou(mended, truth),
     }
     return {"gaussians": gaussians, "objects": objects, "images": len(views), "pixels": pixels} | {
         key: round(value, 3) for key, value in found.items()

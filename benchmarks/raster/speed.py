@@ -1,24 +1,26 @@
-"""Times the rasterizer: `python benchmarks/raster.py --workloads W1,W2,W3,W4 --threads 1 --json FILE`.
+"""Time and memory of the rasterizer.
 
-A row is one pass over one workload with one backend and number of threads. ``cpu_ms`` is the smallest processor time
-over all threads (comparable on a busy machine), wall times are smallest and median, and ``peak_mb`` is the largest
-resident memory of the process during the pass beyond that before it, measured in calls of their own (null where the
-system does not tell; memory of a GPU does not count). Everything takes turns, so that what else the machine does meets
-all alike. Times are of whole calls, checks included. Passes:
+    python -m benchmarks.raster speed --workloads W1,W2,W3,W4 --threads 1 --json FILE
+
+A row is one pass over one workload with one backend and number of threads. ``cpu_ms`` is the minimum processor time
+over all threads (comparable on a busy machine), wall times are minimum and median, and ``peak_mb`` is the additional
+resident memory of a pass, measured in separate calls (null if the system does not report it; without GPU memory). All
+calls run in interleaved rounds and include input checks. Passes:
 
     forward           without gradients
     forward_backward  with gradients of every input
     motion            scenes only: from the scene file's arrays to Gaussians at a time (`scene_player.frame`)
-    frame             scenes only: motion, colours seen from the camera, forward, ids; what playback costs
+    frame             scenes only: motion, view-dependent colors, forward, ids
 
-The threads are the rasterizer's. Beside the backend `cpu`, torch's own few operations run on one, or its waiting
-threads would be counted too; other backends and peers get them all.
+Threads are those of the rasterizer. With the backend `cpu`, torch's own operations run on one thread, because its
+spinning threads would count as processor time; other backends and peers get all threads.
 
-A peer is another renderer that takes turns with ours: a Python module (dotted name, or path to a .py file) with
-``NAME``, ``prepare(inputs, camera) -> state`` and ``forward(state) -> image [H, W, D]``, and if it has them
+A peer is another renderer: a Python module (dotted name, or path to a .py file) with ``NAME``,
+``prepare(inputs, camera) -> state`` and ``forward(state) -> image [H, W, D]``, and optionally
 ``forward_backward(state, upstream)``, with the gradient of the image [H, W, D], and ``supports(workload) -> bool``.
 ``inputs`` are means [N, 3], quats [N, 4] (wxyz), scales [N, 3], opacities [N], channels [N, D], float32 tensors;
-``camera`` has ``width``, ``height``, ``intrinsics`` [3, 3] and ``T_cam_world`` [4, 4] (OpenCV axes).
+``camera`` has ``width``, ``height``, ``intrinsics`` [3, 3] and ``T_cam_world`` [4, 4] (OpenCV axes). Results:
+docs/results/rasterizer.md.
 """
 
 from __future__ import annotations
@@ -35,17 +37,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import stages
-import timing
 import torch
-import workloads
-from workloads import Workload
 
 from r5dgs_core import errors
 from r5dgs_core.playback import scene_player
 from r5dgs_core.raster import backends, rasterize_splats
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import scene_file
+
+from .. import timing
+from . import stages, workloads
+from .workloads import Workload
 
 COLUMNS = ("workload", "backend", "threads", "pass", "cpu_ms", "wall_ms_min", "wall_ms_median", "peak_mb")
 DEFAULT_WORKLOADS = ["W1", "W2", "W3", "W4"]
@@ -251,7 +253,7 @@ def _split(workload: Workload, threads: int, repeats: int) -> str:
 
 
 def _compare_images(peer: ModuleType, workload: Workload) -> str:
-    """How much a peer's image differs from ours: whether both did the same work."""
+    """Print the difference between a peer's image and ours, to check that both did the same work."""
     if hasattr(peer, "supports") and not peer.supports(workload.name):
         return ""
     theirs = peer.forward(peer.prepare(workload.inputs, workload.camera))
@@ -280,7 +282,7 @@ def _rasterizer_threads(count: int) -> Iterator[None]:
 
 
 def _choose(options: argparse.Namespace) -> list[Callable[[], Workload]]:
-    """Makers of the workloads asked for. Raises what is wrong with the names before anything is measured."""
+    """Return makers of the requested workloads. Raises an error for wrong names before anything is measured."""
     names = [name for part in options.workloads or [] for name in part]
     if not names and options.scene is None:
         names = list(DEFAULT_WORKLOADS)

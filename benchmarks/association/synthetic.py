@@ -1,12 +1,21 @@
-"""Spoils true masks and repairs them: `python benchmarks/association.py --seeds judging`.
+"""Repair of degraded masks of synthetic scenes.
 
-Synthetic scenes (`association_scenes.py`) are seen through Gaussians at wrong places; their masks are spoilt as
-trackers do (`association_masks.py`) and given to `association.associate`. ``in``: the masks as they come;
-``majority``: every Gaussian takes the id it shows most; ``sequential``: image by image with a fixed threshold
-(`association_sequential.py`); ``ours``: with the segments' new ids; ``mended``: with `association.mending`, too;
-``oracle``: every segment named after the true object that most of it is. All are mIoU with one map of ids for all
-images (`association_masks.miou`). ``found`` is the number of objects, ``precision`` and ``recall`` are those of the
-switches in the list, ``usual`` is the median overlap of a segment with the other images' votes.
+    python -m benchmarks.association synthetic --seeds judging
+
+Synthetic scenes (`scenes`) are seen through misplaced Gaussians; their masks are degraded by tracker errors
+(`degraded_masks`) and given to `associate.associate`. The columns are mIoU with one map of ids for all images
+(`degraded_masks.miou`):
+
+    in          the input masks
+    majority    every Gaussian takes its most frequent id
+    sequential  image by image with a fixed threshold (`sequential_baseline`)
+    ours        with the new ids of the segments
+    mended      with `association.mending`, too
+    oracle      every segment takes the true object of most of its pixels
+
+``found`` is the number of objects, ``precision`` and ``recall`` those of the listed switches, ``usual`` the median
+overlap of a segment with the votes of the other images. ``--large`` measures time and memory instead. Results:
+docs/results/association.md.
 """
 
 from __future__ import annotations
@@ -18,12 +27,11 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import association_masks
-import association_scenes
-import association_sequential
 import numpy as np
 
 from r5dgs_core.association import associate, mending, segment_stack
+
+from . import degraded_masks, scenes, sequential_baseline
 
 SEEDS = {"development": (1, 2, 3), "judging": (101, 102, 103, 104, 105)}
 ERRORS_PX = (0.0, 0.7, 1.5, 3.0)
@@ -32,16 +40,16 @@ MEASURES = (
     *("in", "majority", "sequential", "ours", "mended", "oracle", "objects", "found", "precision", "recall"),
     *("confident", "usual", "fallback", "seconds"),
 )
-LARGE = association_scenes.Plan(
+LARGE = scenes.Plan(
     bodies=30, gaussians=360_000, floor=374, views=10, times=20, pixels=400, radius=(0.09, 0.13), extent=1.25
 )
 
 
-def measure(plan: association_scenes.Plan, case: str, error_px: float, model: str, seed: int) -> dict[str, float]:
+def measure(plan: scenes.Plan, case: str, error_px: float, model: str, seed: int) -> dict[str, float]:
     """One run."""
-    scene = association_scenes.make(plan, seed)
-    images = list(association_scenes.observe(scene, error_px, model, seed + 1000))
-    masks = association_masks.spoil(images, association_masks.CASES[case], plan.pixels, seed + 2000)
+    scene = scenes.make(plan, seed)
+    images = list(scenes.observe(scene, error_px, model, seed + 1000))
+    masks = degraded_masks.spoil(images, degraded_masks.CASES[case], plan.pixels, seed + 2000)
     count = len(scene.paths)
     start = time.process_time()
     given = [
@@ -57,16 +65,16 @@ def measure(plan: association_scenes.Plan, case: str, error_px: float, model: st
         table[seen] = shares
         drawn = np.einsum("pk,pkc->pc", images[k].weights, table[images[k].indices])
         mended.append(mending.mend(masks[k], given[k].ids, drawn, found, k))
-    precision, recall = association_masks.switches(masks, images, found.rows)
+    precision, recall = degraded_masks.switches(masks, images, found.rows)
     score = [
-        association_masks.miou(version, images)
+        degraded_masks.miou(version, images)
         for version in (
             masks,
-            association_masks.majority(masks, images, count),
+            degraded_masks.majority(masks, images, count),
             sequential(masks, images, count),
             ours,
             mended,
-            association_masks.oracle(masks, images),
+            degraded_masks.oracle(masks, images),
         )
     ]
     seen_objects = len(np.unique(np.concatenate([np.unique(image.truth) for image in images]))) - 1
@@ -74,8 +82,8 @@ def measure(plan: association_scenes.Plan, case: str, error_px: float, model: st
     return dict(zip(MEASURES, map(float, (*score, *rest, seconds)), strict=True))
 
 
-def sequential(masks: Sequence[np.ndarray], images: Sequence[association_scenes.Image], count: int) -> list[np.ndarray]:
-    """Masks relabelled by `association_sequential` from the one Gaussian with most weight in each pixel."""
+def sequential(masks: Sequence[np.ndarray], images: Sequence[scenes.Image], count: int) -> list[np.ndarray]:
+    """Masks relabelled by `sequential_baseline` from the one Gaussian with most weight in each pixel."""
     given = [
         segment_stack.from_pixels(
             mask, image.indices[:, :1], np.ones_like(image.weights[:, :1]), count, view=image.view, time=image.time
@@ -83,7 +91,7 @@ def sequential(masks: Sequence[np.ndarray], images: Sequence[association_scenes.
         for mask, image in zip(masks, images, strict=True)
     ]
     stack = segment_stack.stack(given)
-    labels = np.maximum(association_sequential.associate(stack), 0)
+    labels = np.maximum(sequential_baseline.associate(stack), 0)
     return [
         mending.relabel(mask, bag.ids, labels[stack.images == k])
         for k, (mask, bag) in enumerate(zip(masks, given, strict=True))
@@ -92,9 +100,9 @@ def sequential(masks: Sequence[np.ndarray], images: Sequence[association_scenes.
 
 def large(seed: int) -> dict[str, float]:
     """Seconds and memory for 500 000 Gaussians in 200 images of 400 x 400, 30 objects, case D, 0.7 px."""
-    scene = association_scenes.make(LARGE, seed)
-    images = list(association_scenes.observe(scene, 0.7, "drift", seed + 1000))
-    masks = association_masks.spoil(images, association_masks.CASES["D"], LARGE.pixels, seed + 2000)
+    scene = scenes.make(LARGE, seed)
+    images = list(scenes.observe(scene, 0.7, "drift", seed + 1000))
+    masks = degraded_masks.spoil(images, degraded_masks.CASES["D"], LARGE.pixels, seed + 2000)
     start = time.perf_counter()
     neighbours = nearest(scene.paths[:, 0])
     tree_s = time.perf_counter() - start
@@ -119,9 +127,9 @@ def large(seed: int) -> dict[str, float]:
         "associate_s": seconds,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "of_which_images_mb": images_mb,
-        "in": association_masks.miou(masks, images),
-        "ours": association_masks.miou(ours, images),
-        "oracle": association_masks.miou(association_masks.oracle(masks, images), images),
+        "in": degraded_masks.miou(masks, images),
+        "ours": degraded_masks.miou(ours, images),
+        "oracle": degraded_masks.miou(degraded_masks.oracle(masks, images), images),
         "found": len(found.objects),
     }
 
@@ -171,10 +179,10 @@ def _mean(values: Sequence[float]) -> float:
 def main(arguments: list[str] | None = None) -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scenes", default=",".join(association_scenes.PLANS), help="see association_scenes.py")
-    parser.add_argument("--cases", default=",".join(association_masks.CASES), help="see association_masks.py")
+    parser.add_argument("--scenes", default=",".join(scenes.PLANS), help="names in scenes.py")
+    parser.add_argument("--cases", default=",".join(degraded_masks.CASES), help="names in degraded_masks.py")
     parser.add_argument("--errors", default=",".join(map(str, ERRORS_PX)), help="of the geometry, pixels")
-    parser.add_argument("--models", default=",".join(MODELS), help="of the error, see association_scenes.py")
+    parser.add_argument("--models", default=",".join(MODELS), help="models of the error in scenes.py")
     parser.add_argument("--seeds", default="development", help="development, judging, or numbers")
     parser.add_argument("--large", action="store_true", help="measure time and memory of a large scene instead")
     parser.add_argument("--out", type=Path, help="write OUT.json and OUT.md, too")
@@ -196,7 +204,7 @@ def main(arguments: list[str] | None = None) -> None:
                     if not error_px and model != options.models.split(",")[0]:
                         continue  # without an error there is nothing to model
                     for seed in seeds:
-                        found = measure(association_scenes.PLANS[scene], case, error_px, model, seed)
+                        found = measure(scenes.PLANS[scene], case, error_px, model, seed)
                         row = {"scene": scene, "case": case, "error_px": error_px, "model": model, "seed": seed}
                         rows.append(row | {key: round(value, 4) for key, value in found.items()})
                     print(table(rows[-len(seeds) :]).splitlines()[-1], flush=True)

@@ -1,13 +1,15 @@
-"""Frames per second of a moving scene, motion included: `python benchmarks/frame_rate.py [--json FILE]`.
+"""Frames per second of a moving scene, motion included.
 
-A generated scene is played over its observed time and as long past it. In the ``cube`` bodies that turn and fly are
-slabs of a cube of Gaussians, of which the rest is still: they cover most of the image. In the ``room`` they are small
-balls before still walls. ``share`` of all Gaussians belong to the bodies.
+    python -m benchmarks.raster frames [--json FILE]
 
-``fps`` counts whole frames, from the time t to the picture, by the median. The parts are medians, too: ``ms_motion``
-brings the Gaussians to time t, ``ms_colors`` evaluates their harmonics and the sky, ``ms_raster`` is the rest of the
-frame. ``fps_stage`` and ``ms_stage`` are of whole frames that a `Stage` draws, which keeps what stands still; each of
-its pictures is compared with that of all Gaussians drawn anew.
+A generated scene is played over its observed time and as long past it. In the ``cube``, moving bodies are slabs of a
+cube of static Gaussians and cover most of the image. In the ``room``, they are small balls before static walls.
+``share`` of all Gaussians belong to the bodies.
+
+``fps`` counts whole frames, from scene time to picture, by the median. Medians of the parts: ``ms_motion`` poses the
+Gaussians, ``ms_colors`` evaluates harmonics and sky, ``ms_raster`` is the rest. ``fps_stage`` and ``ms_stage`` are of
+whole frames drawn by a `Stage`, which caches the static layer; each of its pictures is compared with a complete
+drawing. Results: docs/results/rasterizer.md.
 """
 
 from __future__ import annotations

@@ -1,0 +1,1 @@
+"""Benchmarks of the rasterizer. Run ``python -m benchmarks.raster COMMAND --help``."""

@@ -1,0 +1,1 @@
+"""Benchmarks of training. Run ``python -m benchmarks.training COMMAND --help``."""

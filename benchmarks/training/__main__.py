@@ -1,0 +1,16 @@
+"""Benchmarks of training.
+
+    python -m benchmarks.training COMMAND [OPTIONS]
+
+    curve           quality against training time
+    step            time of one step
+    memory          peak memory by phase
+    held_out_times  quality between the observed times
+
+Results: docs/results/training.md.
+"""
+
+from ..commands import run
+
+if __name__ == "__main__":
+    run(__package__, __doc__)
