@@ -13,7 +13,6 @@ def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> 
     """Features of a Blender scene that the engine does not render, as sentences without a period.
 
     Args:
-        scene: Blender scene.
         depsgraph: Evaluated depsgraph, or None to skip the check for hold-outs other than point clouds.
     """
     notes = []

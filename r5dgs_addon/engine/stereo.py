@@ -23,7 +23,6 @@ def eyes(
     """Iterate over the views, making each the active view of the engine.
 
     Args:
-        engine: Render engine.
         depsgraph: Evaluated depsgraph.
 
     Yields:

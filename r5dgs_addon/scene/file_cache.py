@@ -24,7 +24,6 @@ class Remembered(Generic[T]):
         """Return the content of a file.
 
         Args:
-            path: The file.
             again: True to retry a read that failed before, for explicit requests of the user.
 
         Raises:

@@ -37,7 +37,6 @@ def remember(collection: bpy.types.Collection, meanings: bool) -> None:
     """Mark the data-blocks that are named after objects in a newly built scene.
 
     Args:
-        collection: Loaded scene.
         meanings: True if its file stores embeddings.
     """
     collection.r5dgs_named.meanings = meanings
@@ -115,7 +114,6 @@ def rename(collection: bpy.types.Collection, object_id: int, wanted: str) -> str
     """Rename an object in the table, with its collection, anchor, point clouds and shadow.
 
     Args:
-        collection: Loaded scene.
         object_id: Object of its table.
         wanted: New name.
 

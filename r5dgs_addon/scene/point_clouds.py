@@ -43,7 +43,6 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     scene file, kept when other points are deleted; and for display, `radius` and `display_color` (linear).
 
     Args:
-        cloud: Point cloud.
         scene: Source scene.
         rows: Rows of the scene to write.
         extent: Extent of the scene.

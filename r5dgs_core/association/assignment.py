@@ -44,7 +44,6 @@ def refine(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, cou
     """Repeat `assign` until the labels are stable, at most `PASSES` times.
 
     Args:
-        stack: The segments.
         runs: Run of each segment, -1 for background. [S]
         labels: Initial objects. [S]
         count: Number of objects.

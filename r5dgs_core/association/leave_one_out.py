@@ -49,7 +49,6 @@ def cast(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> sparse.c
     """Sum the weights of segments by object.
 
     Args:
-        stack: The segments.
         labels: Object of each segment, 0 = background, -1 = no vote. [S]
         count: Number of objects, K.
 

@@ -74,7 +74,6 @@ def repair(
     Args:
         scene: A scene trained from the data set; best without masks (`none`), so that wrong masks have no influence.
         dataset: The data set, with the masks.
-        backend: Rasterizer.
         progress: Called with events.
 
     Raises:

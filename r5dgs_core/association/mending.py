@@ -43,7 +43,6 @@ def mend(mask: np.ndarray, ids: np.ndarray, drawn: np.ndarray, found: associate.
         mask: Incoming ids. [H, W]
         ids: Incoming id of each segment, `segment_stack.ImageBags.ids`. [S]
         drawn: Rendered votes of the other images, see `shares`. [H, W, K + 1]
-        found: The association.
         image: Index of the image.
 
     Returns:

@@ -33,7 +33,6 @@ def draw(
         scene: The scene; within the observed time it is played with its learned motion and residuals.
         views: Views in the scene's world.
         masks: Incoming ids of each view, 0 = background, `masks.UNKNOWN` = ignored. Sequence of [H, W]
-        backend: Rasterizer.
         progress: Called with the number of finished views.
 
     Returns:

@@ -28,11 +28,7 @@ def mend(
 
     Args:
         scene: The scene that the bags were rendered from.
-        views: Its views.
         masks: Their incoming ids. Sequence of [H, W]
-        images: Their bags.
-        found: The association.
-        backend: Rasterizer.
 
     Yields:
         New ids of the next view, see `mending.mend`. [H, W] int32

@@ -35,7 +35,6 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
     Writes the files of each case (`cases`), `RESULT_FILE`, `TABLES_FILE` and `PLOT_FILE` into ``plan.out``.
 
     Args:
-        plan: The plan.
         remeasure: Bake and measure finished runs again.
         progress_kind: Form of progress output (`progress.make`).
 

@@ -28,10 +28,8 @@ def measure(
     counted, because it loads kernels and fills caches.
 
     Args:
-        scene: The scene.
         views: Cameras and times.
         modes: Playback modes from `scene_player.modes`.
-        backend: Rasterizer.
 
     Returns:
         By mode ``fps`` (frames per second by the median), medians ``ms_frame``, ``ms_motion`` and ``ms_raster``,

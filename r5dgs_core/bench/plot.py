@@ -21,9 +21,6 @@ def write(records: Sequence[dict[str, Any]], path: Path) -> Path:
         records: Measured cases by mode (docs/user/bench.md). Colors show method and mode, markers show the scene.
         path: The PNG file.
 
-    Returns:
-        ``path``.
-
     Raises:
         ConfigError: The file cannot be written.
     """

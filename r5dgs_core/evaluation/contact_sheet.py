@@ -57,16 +57,10 @@ def write(
     """Render views of a data set and write the contact sheet.
 
     Args:
-        scene: The scene.
-        dataset: The data set.
         path: PNG file to write.
         views: Columns of the sheet; `choose_views` if None.
         mode: Playback mode past t_max.
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
-        backend: Rasterizer.
-
-    Returns:
-        ``path``.
     """
     views = choose_views(dataset) if views is None else views
     renderings = [render(scene, view.camera, view.t, mode, backend=backend) for view in views]
@@ -151,7 +145,6 @@ def color_ids(scene: Scene, ids: np.ndarray) -> np.ndarray:
     """Color an id map with the objects' colors; background is dark gray, ids without object magenta.
 
     Args:
-        scene: The scene.
         ids: Object ids. [H, W]
 
     Returns:

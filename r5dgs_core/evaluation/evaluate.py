@@ -1,7 +1,7 @@
 """Evaluation of a baked scene against the images, masks and true poses of its data set.
 
-The result has a fixed form (docs/results/evaluation.md) that is comparable across versions. Renderings are rounded to 8
-bits before they are measured, as in an image file.
+The result has a fixed form (docs/reference/evaluation.md) that is comparable across versions. Renderings are rounded to
+8 bits before they are measured, as in an image file.
 """
 
 from __future__ import annotations
@@ -75,12 +75,9 @@ def evaluate(
     """Measure a scene on the held-out views of a data set.
 
     Args:
-        scene: The scene.
-        dataset: The data set.
         modes: Playback modes past t_max, from `scene_player.modes`.
         splits: Splits to measure.
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
-        backend: Rasterizer.
         train: Cost of training: "seconds", "iterations", "gaussians".
         progress: Called with the number of measured images and the total.
 
@@ -132,11 +129,9 @@ def measure(
     """Measure pictures of a scene whose Gaussians are moved by a function.
 
     Args:
-        scene: The scene.
         views: Cameras, times and true images.
         move: Returns the scene's Gaussians at a time.
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
-        backend: Rasterizer.
         measured: Called after each image.
 
     Returns:

@@ -58,7 +58,6 @@ def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> t
     """Return the motion groups of a scene whose true motion is known.
 
     Args:
-        scene: The scene.
         ground_truth: True poses. For a scene with discovered objects, positions decide which object is which.
         every: Return all bodies of an object instead of only the one with most of its Gaussians.
 

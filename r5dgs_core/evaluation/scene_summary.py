@@ -37,7 +37,6 @@ def summary(scene: Scene, path: Path | None = None) -> str:
     """Return the summary of a scene: duration, frames, extent, moving objects and quality, as lines.
 
     Args:
-        scene: The scene.
         path: File of the scene; an evaluation beside it provides the quality.
     """
     objects = [item for item in scene.objects if item.id > 0]

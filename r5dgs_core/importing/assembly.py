@@ -96,7 +96,6 @@ def make_scene(foreign: Foreign, motion: Motion | None, times: np.ndarray, **res
     """Assemble the scene.
 
     Args:
-        foreign: The run.
         motion: Result of `sample`, None for a static scene.
         times: Knots. [S]
         **rest: The fields of `Scene` that do not come from the run: name, frames_per_unit, world_convention, cameras,

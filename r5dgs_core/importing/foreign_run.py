@@ -63,7 +63,6 @@ def twisted_state(splats: Splats, network: DeformNetwork, rows: slice, t: float,
         splats: The canonical Gaussians.
         network: The deformation network.
         rows: Rows to evaluate.
-        t: The time.
         codes: Codes of these rows, if the network takes them. [n, C]
     """
     with torch.no_grad():

@@ -62,7 +62,6 @@ def read(run: RunFolder, t_max: float | None = None) -> Foreign:
     """Read a run folder with the reader of its layout.
 
     Args:
-        run: The folder.
         t_max: Last time of the deformation, if given by the user.
 
     Raises:
@@ -81,8 +80,6 @@ def import_run(folder: Path, options: Options = Options(), progress: assembly.Pr
     """Convert a run folder of 3DGS, Gaussian Grouping, Deformable-3DGS, TRACE or FreeGave to a scene.
 
     Args:
-        folder: The run folder.
-        options: User options.
         progress: Called with the number of sampled Gaussians and their total.
 
     Raises:

@@ -25,7 +25,6 @@ def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
     """Read the Gaussians and both networks.
 
     Args:
-        run: The folder.
         velocity: Content of its ``vel.pth``.
         t_max: Last time of the deformation.
     """

@@ -57,9 +57,6 @@ def find(
     """Find the best views of objects, spread over cameras and times.
 
     Args:
-        scene: The scene.
-        object_ids: The objects.
-        backend: Rasterizer.
         progress: Called with the number of finished pictures and their total.
 
     Returns:

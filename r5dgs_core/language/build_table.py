@@ -58,10 +58,8 @@ def make(
     """Add a lookup table to a scene, replacing an existing one.
 
     Args:
-        scene: The scene.
         encoder: The encoder; queries must use the same one.
         words: Words to store besides the objects' names and the common nouns.
-        backend: Rasterizer.
         progress: Called for the stages "views" and "objects".
 
     Returns:

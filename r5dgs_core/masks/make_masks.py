@@ -83,7 +83,6 @@ def make(
     Finished videos are skipped. An interrupted run loses only the current video.
 
     Args:
-        views: The views.
         backend: Source of the masks.
         folder: Folder of masks; created if missing.
         overwrite: True to replace other masks in the folder.

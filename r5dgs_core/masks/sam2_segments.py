@@ -62,7 +62,6 @@ def find(model: Sam2, image: np.ndarray, settings: SegmentSettings) -> list[Segm
     """Segment an image.
 
     Args:
-        model: The model.
         image: RGB. [H, W, 3] uint8
         settings: Criteria for accepting masks.
 

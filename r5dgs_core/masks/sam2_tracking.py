@@ -56,8 +56,6 @@ def follow(model: Sam2, frames: Frames, key: int, marked: Tensor) -> Iterator[tu
     Only the past images that the network attends to are remembered, so memory does not grow with the video.
 
     Args:
-        model: The model.
-        frames: The images.
         key: Index of the image in which the objects are marked.
         marked: Their logits in it, above 0 inside the objects. [M, s, s]
 
@@ -122,7 +120,6 @@ class Canvas:
         """Give each pixel of an image to the object with the largest logit, unless an earlier object's is as large.
 
         Args:
-            index: The image.
             ids: Ids of the objects. (M,)
             logits: Above 0 inside the objects. [M, H, W]
         """

@@ -37,9 +37,6 @@ def of(views: Sequence[datasets.View]) -> list[Video]:
     The images of a named or static camera form a video. If every image has its own camera, as with one moving camera,
     consecutive images form a video as long as the camera moves little between them.
 
-    Args:
-        views: The views.
-
     Returns:
         The videos by first appearance; each view is in exactly one.
     """

@@ -136,7 +136,6 @@ def check_exclusions(labels: Sequence[Label], text: str, missing: Sequence[str])
 
     Args:
         labels: Labels of the objects.
-        text: The text.
         missing: Result of `not_excluded` for the text.
 
     Raises:

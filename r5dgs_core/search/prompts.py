@@ -48,7 +48,6 @@ def parse(text: str, names: Iterable[str] = ()) -> Prompt:
     """Parse a prompt.
 
     Args:
-        text: The prompt.
         names: Names of objects; a prompt that equals one selects only that, even "Not" or "all".
 
     Raises:
