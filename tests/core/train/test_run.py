@@ -15,7 +15,7 @@ import torch
 from r5dgs_core import atomic_files
 from r5dgs_core.cli import main
 from r5dgs_core.errors import CheckpointError, Interrupted, TrainingError
-from r5dgs_core.train import checkpoint, run
+from r5dgs_core.train import checkpoint, finish, run
 from tests.support import tiny_datasets
 
 STEPS, IDENTITY = 150, 20
@@ -134,7 +134,7 @@ def test_a_run_killed_before_its_last_labels_only_makes_these(tiny, unbroken, tm
     def die(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "_finish", die)
+    monkeypatch.setattr(finish, "outcome", die)
     with pytest.raises(Interrupted, match="--resume"):
         run.train(tiny.root, folder, settings)
     monkeypatch.undo()
