@@ -277,7 +277,7 @@ class MotionKind:
     def curve(self, model: MotionModel, tau: np.ndarray, most_steps: int | None) -> Curve:
         """`motion` of a model at times [...], in at most ``most_steps`` integration steps."""
         v, a, w, eps, u = (getattr(model, name) for name in RATES)
-        return self.motion(Rates(v, a, w, eps, u, np.float64(model.frequency)), tau[..., None])
+        return self.motion(Rates(v, a, w, eps, u, np.array(model.frequency)), tau[..., None])
 
     def stacked(self, models: Sequence[MotionModel]) -> Callable[[float], se3.Pose] | None:
         """Function from a time > 0 to the poses of K models; None if they do not move. [K, 4], [K, 3]"""
