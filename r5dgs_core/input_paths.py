@@ -29,8 +29,10 @@ def check_foreign_run(folder: Path) -> None:
 def check_scene(path: Path) -> None:
     """Raise `SceneFileError` if a path is not a file."""
     if not _holds(path.is_file):
-        found = "a folder; 'r5dgs train' makes a scene from a folder of images"
-        found = found if path.is_dir() else "nothing; look for its new place, or bake it again"
+        found = "nothing; look for its new place, or bake it again"
+        if path.is_dir():
+            made = "bake' makes one from a run" if (path / RUN_FILE).exists() else "train' makes a run from images"
+            found = f"a folder; 'r5dgs {made}"
         raise errors.SceneFileError(f"{path}: expected a {SCENE_SUFFIX} file, found {found}")
 
 

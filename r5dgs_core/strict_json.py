@@ -15,6 +15,7 @@ from .errors import R5dgsError
 MOST_BYTES = 64 << 20  # per file
 MOST_MEMORY = 256 << 20  # bytes of parsed values, as estimated by `memory_of`
 MOST_DEPTH = 64  # nesting levels
+_DAMAGED = "write the file again, or copy it again"  # default remedy
 _MOST_DIGITS = 19  # of a 64-bit integer; longer text is not converted, because that takes quadratic time
 
 
@@ -22,8 +23,9 @@ def parse(
     data: bytes,
     place: str,
     kind: type[R5dgsError],
-    remedy: str = "is it truncated?",
+    remedy: str = _DAMAGED,
     *,
+    finite: bool = True,
     memory: int = MOST_MEMORY,
     size: int = MOST_BYTES,
 ) -> Any:
@@ -34,6 +36,7 @@ def parse(
         place: Start of error messages: the file, or the member of a file.
         kind: Class of the error.
         remedy: End of error messages about damage.
+        finite: Refuse NaN, infinity and floats out of range; otherwise the caller checks its numbers.
         memory: Memory limit of the result, without its text, bytes.
         size: Size limit of ``data``, bytes.
 
@@ -42,7 +45,7 @@ def parse(
 
     Raises:
         R5dgsError: Of class ``kind``: invalid JSON, too large, nested deeper than `MOST_DEPTH`, a repeated key in an
-            object, NaN, infinity, a number out of range, or an unpaired surrogate.
+            object, an unpaired surrogate, an integer of more than 64 bits, or a float that ``finite`` refuses.
     """
     needed = memory_of(data)
     if len(data) > size or needed > memory:
@@ -53,8 +56,8 @@ def parse(
     try:
         content = json.loads(
             data.decode("utf-8"),
-            parse_constant=lambda constant: _refuse(constant, data),
-            parse_float=_float,
+            parse_constant=(lambda constant: _refuse(constant, data)) if finite else float,
+            parse_float=_float if finite else float,
             parse_int=_integer,
             object_pairs_hook=_object,
         )
@@ -70,7 +73,7 @@ def parse(
     return content
 
 
-def read(path: Path, kind: type[R5dgsError], remedy: str = "is it truncated?") -> Any:
+def read(path: Path, kind: type[R5dgsError], remedy: str = _DAMAGED, *, finite: bool = True) -> Any:
     """Parse a JSON file, see `parse`; a missing or unreadable file is also an error of class ``kind``."""
     try:
         with open(path, "rb") as stream:
@@ -79,7 +82,7 @@ def read(path: Path, kind: type[R5dgsError], remedy: str = "is it truncated?") -
         raise kind(f"{path}: the file is missing") from error
     except OSError as error:
         raise kind(f"{path}: cannot be read ({error})") from error
-    return parse(data, str(path), kind, remedy, size=MOST_BYTES)
+    return parse(data, str(path), kind, remedy, finite=finite, size=MOST_BYTES)
 
 
 def memory_of(data: bytes) -> int:

@@ -45,11 +45,17 @@ def _check_checkpoints(folder: Path, collect: Collector) -> int | None:
     if checkpoint.newest_file(folder) is None:
         collect.add("R02", f"{folder / checkpoint.CHECKPOINT_FILE}: expected a checkpoint, found none")
     steps = None
+    damaged = []
     for name in checkpoint.GENERATIONS:
         if (folder / name).exists():
-            with collect(), coded("R03"):
+            try:
                 state = checkpoint.read(folder / name)
                 steps = state.iteration if steps is None else steps
+            except errors.CheckpointError as error:
+                damaged.append(error)
+    remedy = "; train again with --overwrite" if steps is None else ""
+    for error in damaged:
+        collect.add("R03", f"{error}{remedy}")
     return steps
 
 

@@ -166,10 +166,14 @@ def load(
         try:
             values = tomllib.loads(data.decode("utf-8"))
         except (ValueError, RecursionError) as error:  # ValueError: not TOML or UTF-8, or a number with too many digits
-            raise ConfigError(f"{path}: not valid TOML: {error}") from None
+            raise ConfigError(f"{path}: not valid TOML in UTF-8: {error}; write the file again") from None
     if preset is not None:
         values = _merge_under(values, PRESETS[preset])
-    return from_dict(_merge(values, _parsed(overrides)), guard)
+    merged = _merge(values, _parsed(overrides))
+    try:
+        return from_dict(merged, guard)
+    except ConfigError as error:
+        raise (ConfigError(f"{path}: {error}") if path is not None else error) from None
 
 
 def _parsed(overrides: Sequence[str]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import errors, strict_json
+from .. import errors, findings, strict_json
 from . import masks
 
 OBJECTS = "objects.json"
@@ -38,8 +38,14 @@ class GroundTruth:
         return replace(self, matrices=matrices)
 
 
-def read_objects(root: Path) -> tuple[dict[int, str], dict[int, tuple[str, ...]]]:
+def read_objects(
+    root: Path, guard: findings.Guard = findings.STRICT
+) -> tuple[dict[int, str], dict[int, tuple[str, ...]]]:
     """Read ``objects.json``: ``{"1": "mug"}`` or ``{"1": {"name": "mug", "aliases": ["cup"]}}``.
+
+    Args:
+        root: Folder of the file.
+        guard: Entered around each entry.
 
     Returns:
         Name and aliases of each id; empty without the file.
@@ -53,27 +59,30 @@ def read_objects(root: Path) -> tuple[dict[int, str], dict[int, tuple[str, ...]]
     if not isinstance(content, dict):
         raise errors.DatasetError(f'{path}: expected an object such as {{"1": "mug"}}, found {type(content).__name__}')
     for key, value in content.items():
-        entry = {"name": value} if isinstance(value, str) else value
-        if not key.isdecimal():
-            raise errors.DatasetError(f"{path}: expected object ids as keys, found {key!r}")
-        if int(key) > masks.MAX_ID:
-            raise errors.DatasetError(
-                f"{path}: expected object ids up to {masks.MAX_ID}, which masks of 16 bits hold, found {key}"
-            )
-        words = entry.get("aliases", []) if isinstance(entry, dict) else None
-        if (
-            not isinstance(entry, dict)
-            or not isinstance(entry.get("name"), str)
-            or not entry["name"].strip()
-            or not isinstance(words, list)
-            or not all(isinstance(word, str) for word in words)
-        ):
-            raise errors.DatasetError(f'{path}: {key!r}: expected a name or {{"name": ..., "aliases": [...]}}')
-        if entry["name"] in names.values():
-            raise errors.DatasetError(f"{path}: {key!r}: the name {entry['name']!r} is used twice; make names unique")
-        names[int(key)] = entry["name"]
-        if words:
-            aliases[int(key)] = tuple(words)
+        with guard(), findings.coded("D20"):
+            entry = {"name": value} if isinstance(value, str) else value
+            if not key.isdecimal():
+                raise errors.DatasetError(f"{path}: expected object ids as keys, found {key!r}")
+            if int(key) > masks.MAX_ID:
+                raise errors.DatasetError(
+                    f"{path}: expected object ids up to {masks.MAX_ID}, which masks of 16 bits hold, found {key}"
+                )
+            words = entry.get("aliases", []) if isinstance(entry, dict) else None
+            if (
+                not isinstance(entry, dict)
+                or not isinstance(entry.get("name"), str)
+                or not entry["name"].strip()
+                or not isinstance(words, list)
+                or not all(isinstance(word, str) for word in words)
+            ):
+                raise errors.DatasetError(f'{path}: {key!r}: expected a name or {{"name": ..., "aliases": [...]}}')
+            if entry["name"] in names.values():
+                raise errors.DatasetError(
+                    f"{path}: {key!r}: the name {entry['name']!r} is used twice; make names unique"
+                )
+            names[int(key)] = entry["name"]
+            if words:
+                aliases[int(key)] = tuple(words)
     return names, aliases
 
 

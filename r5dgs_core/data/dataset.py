@@ -175,7 +175,7 @@ def read(
     names: dict[int, str] = {}
     aliases: dict[int, tuple[str, ...]] = {}
     with guard(), findings.coded("D20"):
-        names, aliases = read_objects(mask_folder if mask_folder is not None and own_ids else root)
+        names, aliases = read_objects(mask_folder if mask_folder is not None and own_ids else root, guard)
     with guard():
         _check_convention(root, raw.header)
     ground_truth = None
@@ -186,6 +186,9 @@ def read(
         ground_truth = ground_truth.moved(-origin)
         for object_id, name in zip(ground_truth.object_ids, ground_truth.names, strict=True):
             names.setdefault(object_id, name)
+    has_alpha = False
+    with guard():
+        has_alpha = _has_alpha(views["train"])
     frames_per_unit = FRAMES_PER_UNIT
     with guard():
         frames_per_unit = _frames_per_unit(root, raw.header, [e for split in SPLITS for e in raw.entries[split]])
@@ -198,7 +201,7 @@ def read(
         ground_truth=ground_truth,
         world_convention=raw.header.get("world_convention", "blender"),
         frames_per_unit=frames_per_unit,
-        has_alpha=_has_alpha(views["train"]),
+        has_alpha=has_alpha,
         digest=hasher.hexdigest(),
         points=raw.points,
         point_colors=raw.colors,

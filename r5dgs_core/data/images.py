@@ -85,7 +85,7 @@ def read_raw(path: Path) -> np.ndarray:
     source.close()
     if pixels is None or problem:
         raise errors.DatasetError(
-            f"{path}: the image cannot be decoded ({problem or 'no pixels'}); is it truncated?", code="D12"
+            f"{path}: the image cannot be decoded ({problem or 'no pixels'}); copy or render it again", code="D12"
         )
     return np.ascontiguousarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
 
@@ -186,7 +186,8 @@ def _open(path: Path):
         source, reason = None, "damaged"
     if source is None:
         raise errors.DatasetError(
-            f"{path}: not an image that can be read ({reason}); convert it to PNG or JPEG", code="D11"
+            f"{path}: the image cannot be read ({reason}); copy or render it again, or convert it to PNG or JPEG",
+            code="D12",
         )
     spec = source.spec()
     try:

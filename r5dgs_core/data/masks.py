@@ -244,7 +244,7 @@ def _read_indices(path: Path) -> np.ndarray:
         raw = np.frombuffer(zlib.decompressobj().decompress(bytes(packed), size + 1), np.uint8)
     except zlib.error as error:
         raise errors.DatasetError(
-            f"{path}: the mask cannot be decoded ({error}); is it truncated?", code="D17"
+            f"{path}: the mask cannot be decoded ({error}); write it again", code="D17"
         ) from error
     if raw.size != size:
         found = "more" if raw.size > size else raw.size

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors, findings, strict_json
+from ..scene.validation import MOST_TIME
 
 RIGID_TOLERANCE = 1e-3
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -60,7 +61,7 @@ def read(path: Path, guard: findings.Guard = findings.STRICT) -> tuple[list[Entr
         The frames in the file's order, and the file's top-level keys other than the frames.
     """
     with findings.coded("D02"):
-        content = strict_json.read(path, errors.DatasetError)
+        content = strict_json.read(path, errors.DatasetError, finite=False)  # frames are named below
     if not isinstance(content, dict):
         raise errors.DatasetError(f"{path}: expected a JSON object, found {type(content).__name__}", code="D02")
     if isinstance(content.get("frames"), list):
@@ -170,14 +171,15 @@ def _read_frame(at: str, frame: Any, common: dict, shared_matrix: Any, camera: s
         if key in lens and lens[key] <= 0:
             raise errors.DatasetError(f"{at}: '{key}' must be positive, found {lens[key]:g}", code="D08")
     number = frame.get("frame")
+    numbered = isinstance(number, (int, float)) and not isinstance(number, bool)
     return Entry(
         place=at,
         file_path=frame["file_path"],
-        t=finite(at, "time", frame["time"]) if "time" in frame else t,
+        t=time_of(at, "time", frame["time"]) if "time" in frame else t,
         matrix=rigid_matrix(at, frame.get("transform_matrix", shared_matrix)),
         camera=str(frame.get("view", frame.get("camera", camera))),
         lens=lens,
-        frame=float(number) if isinstance(number, (int, float)) and not isinstance(number, bool) else None,
+        frame=finite(at, "frame", number) if numbered else None,
     )
 
 
@@ -215,6 +217,14 @@ def _lens_keys(source: dict) -> dict[str, Any]:
     names = {"img_w": "w", "img_h": "h"}
     keys = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h", "img_w", "img_h", *_DISTORTION)
     return {names.get(key, key): source[key] for key in keys if key in source}
+
+
+def time_of(place: str, key: str, value: Any) -> float:
+    """Return the value of a key as a scene time; DatasetError if a scene file cannot hold it."""
+    t = finite(place, key, value)
+    if abs(t) > MOST_TIME:
+        raise errors.DatasetError(f"{place}: '{key}' must be a time up to {MOST_TIME:g}, found {t:g}", code="D03")
+    return t
 
 
 def finite(place: str, key: str, value: Any) -> float:

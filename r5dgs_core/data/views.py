@@ -93,10 +93,14 @@ def _find_image(root: Path, entry: transforms.Entry) -> Path:
     path = root / entry.file_path.replace("\\", "/")
     candidates = [path] if path.suffix.lower() in images.SUFFIXES else []
     candidates += [path.with_name(path.name + suffix) for suffix in images.SUFFIXES]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    present = [path] if path.is_file() else sorted(path.parent.glob(f"{glob.escape(path.name)}.*"))
+    try:
+        for candidate in candidates:
+            if candidate.is_file():
+                return candidate
+        siblings = sorted(path.parent.glob(f"{glob.escape(path.name)}.*"))
+        present = [file for file in (path, *siblings) if file.is_file()]
+    except OSError as error:  # for example a name that is too long
+        raise errors.DatasetError(f"{entry.place}: the image cannot be read: {error.strerror}", code="D10") from error
     if present:
         raise images.unreadable_kind(present[0], entry.place)
     raise errors.DatasetError(f"{entry.place}: the image is missing, expected {candidates[0]}", code="D10")

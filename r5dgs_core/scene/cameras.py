@@ -80,7 +80,7 @@ def check(camera: Camera) -> None:
     if off > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
         raise ValueError(
             f"{place}: T_cam_world: expected a rotation in its first three rows and columns, found one that is off by "
-            f"{off:.2g} or mirrors; remedy: take scale and mirroring out of it"
+            f"{off:.2g} or mirrors; take scale and mirroring out of it"
         )
     if abs(camera.intrinsics[1, 0]) > _ROUNDING:
         raise ValueError(f"{place}: intrinsics: expected 0 at index (1, 0), found {camera.intrinsics[1, 0]}")

@@ -27,7 +27,8 @@ _LARGE = 1e9  # colours, logits, embeddings
 _LOG_SCALE, _LEAST_LOG_SCALE = 40.0, -1e4  # thinner Gaussians than float32 resolves are drawn at the minimum width
 _SPIN = 1e6  # rad per unit of time, and per its square
 _LEAST_LENGTH = 1e-30  # smallest near plane and radius
-_LEAST_STEP, _MOST_TIME = 1e-12, 1e12  # smallest step between observed times, and largest time
+MOST_TIME = 1e12  # largest time
+_LEAST_STEP = 1e-12  # smallest step between observed times
 _RATES = np.repeat([cameras.FARTHEST, _SPIN, cameras.FARTHEST, _SPIN], 3)
 _POSE = np.repeat([_LARGE, cameras.FARTHEST], [4, 3])
 _LIMITS: dict[str, float | np.ndarray] = {
@@ -36,7 +37,7 @@ _LIMITS: dict[str, float | np.ndarray] = {
     "log_scales": _LOG_SCALE,
     "opacity_logits": _LARGE,
     "sh": _LARGE,
-    "track_times": _MOST_TIME,
+    "track_times": MOST_TIME,
     "track_poses": _POSE,
     "background_sh": _LARGE,
     "identities": _LARGE,
@@ -60,7 +61,7 @@ _MODEL_LIMITS = {
     "center_offset": cameras.FARTHEST,
     "offset_rotvec": _SPIN,
     "offset_displacement": cameras.FARTHEST,
-    "fade_time": _MOST_TIME,
+    "fade_time": MOST_TIME,
     "radius": cameras.FARTHEST,
     "frequency": _SPIN,
 }
@@ -235,10 +236,10 @@ def _check_times(scene: Scene, place: str, guard: findings.Guard) -> None:
             _fail(place, "track_times", f"at least one time, increasing by {_LEAST_STEP:g} or more", times)
     with guard():
         if not np.isfinite(scene.t_max) or times[-1] != scene.t_max:
-            _fail(place, "t_max", f"the last of track_times, {times[-1]!r}", repr(scene.t_max))
+            _fail(place, "t_max", f"the last of track_times, {float(times[-1])!r}", repr(scene.t_max))
     with guard():
-        if not 1 / _MOST_TIME <= scene.frames_per_unit <= _MOST_TIME:
-            _fail(place, "frames_per_unit", f"a positive number up to {_MOST_TIME:g}", scene.frames_per_unit)
+        if not 1 / MOST_TIME <= scene.frames_per_unit <= MOST_TIME:
+            _fail(place, "frames_per_unit", f"a positive number up to {MOST_TIME:g}", scene.frames_per_unit)
     with guard():
         if not _LEAST_LENGTH <= scene.near_plane <= cameras.FARTHEST:
             _fail(place, "near_plane", f"a positive depth up to {cameras.FARTHEST:g}", scene.near_plane)

@@ -92,7 +92,7 @@ def read(root: Path, min_registered: float = MIN_REGISTERED, guard: findings.Gua
             header["frames_per_unit"] = float(numbers)
         frames = frames or [_Frame(image.name, image, _stem(image.name)) for image in model.images]
         with guard():
-            _check_registered(root, frames, model.images, min_registered)
+            _check_registered(root, frames, model.images, min_registered, guard)
     splits = _split(frames, header.get("t_max", math.inf))
     entries = {
         split: [_entry(sparse, frame) for frame in sorted(part, key=lambda frame: (frame.t, frame.name))]
@@ -115,11 +115,15 @@ def _read_times(path: Path) -> tuple[dict[str, float], dict[str, float]]:
         more = {key: transforms.finite(str(path), key, content[key]) for key in given}
     if not times:
         raise errors.DatasetError(f"{path}: expected image names and times, found none", code="D16")
-    return {str(name).replace("\\", "/"): transforms.finite(str(path), name, t) for name, t in times.items()}, more
+    return {str(name).replace("\\", "/"): transforms.time_of(str(path), name, t) for name, t in times.items()}, more
 
 
 def _check_registered(
-    root: Path, frames: list[_Frame], registered: tuple[Registered, ...], min_registered: float
+    root: Path,
+    frames: list[_Frame],
+    registered: tuple[Registered, ...],
+    min_registered: float,
+    guard: findings.Guard,
 ) -> None:
     """Raise DatasetError if too many images have no pose, or if there are videos among them."""
     placed = {frame.name for frame in frames} | {image.name for image in registered}
@@ -132,7 +136,8 @@ def _check_registered(
     missing = sorted(present - placed)
     for name in missing:
         if name.lower().endswith(images.VIDEO_SUFFIXES):
-            raise images.unreadable_kind(root / IMAGES / name)
+            with guard():
+                raise images.unreadable_kind(root / IMAGES / name)
     if len(present) - len(missing) >= min_registered * len(present):
         if missing:
             _log.warning("%d of %d images have no pose and are left out: %s", len(missing), len(present), missing[0])

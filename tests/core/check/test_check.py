@@ -563,6 +563,90 @@ def test_data_sets_and_scenes_are_checked_without_torch(tmp_path):
     assert done.returncode == 0, done.stderr + done.stdout
 
 
+def codes_of(path):
+    return [finding.code for finding in check.check(path) if finding.severity == findings.ERROR]
+
+
+def test_numbers_that_are_not_finite_are_faults_of_their_frames(tmp_path):
+    def change(content):
+        content["frames"][0]["transform_matrix"][0][3] = float("nan")
+        content["frames"][1]["time"] = float("inf")
+        content["frames"][2]["frame"] = float("nan")
+        del content["frames"][3]["transform_matrix"]
+
+    assert sorted(codes_of(cameras_changed(tmp_path, change))) == ["D03", "D03", "D05", "D06"]
+
+
+def test_a_time_that_a_scene_file_cannot_hold_is_refused(tmp_path):
+    root = frame_changed(tmp_path, time=1e300)
+    assert codes_of(root) == ["D03"]
+    with pytest.raises(errors.DatasetError, match="frame 0 .*'time'"):
+        data.dataset.read(root)
+
+
+def test_a_name_that_is_too_long_for_the_file_system_is_a_fault_of_its_frame(tmp_path):
+    root = frame_changed(tmp_path, file_path="x" * 5000)
+    assert codes_of(root) == ["D10"]
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b'{"frames": [', b'{"frames": [7]}'])
+def test_a_faulty_camera_file_is_not_reported_as_empty_too(content, tmp_path):
+    assert len(codes_of(file_written(tmp_path, "transforms_train.json", content))) == 1
+
+
+def test_training_images_with_faults_cause_no_warnings_about_the_others(tmp_path):
+    def change(content):
+        for frame in content["frames"][1:]:
+            frame["transform_matrix"] = None
+
+    found = {finding.code for finding in check.check(cameras_changed(tmp_path, change))}
+    assert found & {"D05"} and not found & {"D41", "D42", "D43", "D47"}
+
+
+def test_all_faults_of_objects_json_are_listed(tmp_path):
+    names = {"1": "mug", "2": "mug", "3": {"name": 7}, "x": "pan", "4": {"name": "pot", "aliases": "lid"}}
+    root = file_written(tmp_path, "objects.json", names)
+    assert codes_of(root) == ["D20"] * 4
+
+
+def test_damaged_images_are_not_called_unreadable_kinds(tmp_path):
+    write_flat(tmp_path)
+    first, second, third = sorted((tmp_path / "train").glob("*.png"))[:3]
+    first.write_bytes(b"")
+    second.unlink()
+    second.mkdir()
+    third.unlink()
+    third.symlink_to(third.name)
+    assert sorted(codes_of(tmp_path)) == ["D10", "D10", "D12"]
+
+
+def test_a_damaged_first_image_with_alpha_hides_no_other_fault(tmp_path):
+    write_flat(tmp_path)
+    first, second = sorted((tmp_path / "train").glob("*.png"))[:2]
+    images.write_png(first, np.random.default_rng(0).random((HEIGHT, WIDTH, 4)))
+    first.write_bytes(first.read_bytes()[:-60])
+    second.write_bytes(second.read_bytes()[:-20])
+    assert codes_of(tmp_path) == ["D12", "D12"]
+
+
+def test_each_video_beside_a_reconstruction_is_listed(tmp_path):
+    root = reconstruction(tmp_path)
+    for name in ("a.mp4", "b.mov"):
+        (root / "images" / name).write_bytes(b"film")
+    (root / "images" / "c.heic").write_bytes(b"image")
+    found = check.check(root)
+    assert [finding.code for finding in found].count("D11") == 2
+    assert any(finding.code == "D54" and "c.heic" in finding.problem for finding in found)
+
+
+def test_a_run_without_valid_checkpoint_is_not_advised_to_resume(small_run, tmp_path):
+    run = shutil.copytree(small_run, tmp_path / "run")
+    for name in ("checkpoint.pt", "checkpoint.previous.pt"):
+        (run / name).write_bytes(b"damaged")
+    remedies = [finding.remedy for finding in check.check(run) if finding.code == "R03"]
+    assert remedies == ["train again with --overwrite"] * 2
+
+
 def test_all_faults_of_a_scene_are_listed(tmp_path, monkeypatch):
     scene = scenes.make_scene(n=60, objects=3)
     groups = [dataclasses.replace(g, role="ghost" if g.id in (1, 2) else g.role) for g in scene.groups]

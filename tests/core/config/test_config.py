@@ -98,7 +98,7 @@ def test_what_cannot_be_used_is_named(override, message):
 def test_faults_of_a_file_are_named(tmp_path, text, message):
     path = tmp_path / "c.toml"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=message.replace("?", r"\?")):
+    with pytest.raises(ConfigError, match=f"c.toml: {message}".replace("?", r"\?")):
         config.load(path)
 
 

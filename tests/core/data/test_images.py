@@ -84,7 +84,7 @@ def test_a_truncated_image_is_named(tmp_path):
     images.write_png(tmp_path / "a.png", rng.integers(0, 255, (64, 64, 3)).astype(np.uint8))
     data = (tmp_path / "a.png").read_bytes()
     (tmp_path / "a.png").write_bytes(data[: len(data) // 2])
-    with pytest.raises(errors.DatasetError, match=r"a\.png.*truncated"):
+    with pytest.raises(errors.DatasetError, match=r"a\.png.*hit end of file"):
         images.read(tmp_path / "a.png")
 
 
