@@ -21,9 +21,9 @@ from . import images, masks, transforms, view_masks
 from . import origin as origins
 from .annotations import OBJECTS, GroundTruth, read_ground_truth, read_objects
 from .layouts import registry
-from .layouts.camera_files import CAMERAS_FILE
 from .layouts.colmap import MIN_REGISTERED
 from .layouts.raw_dataset import RawDataset
+from .layouts.registry import CAMERAS_FILE
 from .view_masks import MASKS
 from .views import SPLITS, View, make_views
 

@@ -8,8 +8,7 @@ from typing import Any
 from ... import findings
 from .. import transforms
 from .raw_dataset import RawDataset
-
-CAMERAS_FILE = "transforms_train.json"
+from .registry import CAMERAS_FILE
 
 
 def detect(root: Path) -> bool:

@@ -7,8 +7,8 @@ from pathlib import Path
 from types import ModuleType
 
 from ... import errors
-from .camera_files import CAMERAS_FILE
 
+CAMERAS_FILE = "transforms_train.json"  # of the layout `camera_files`
 MODULES = ["camera_files", "colmap"]  # modules of this folder; the first that detects its files reads the folder
 
 
