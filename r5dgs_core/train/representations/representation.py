@@ -7,7 +7,7 @@ object, `field` by a deformation field, and `still` not at all. `registry` creat
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
@@ -16,10 +16,12 @@ from torch import Tensor
 from ...config.config import Config
 from ...errors import CheckpointError
 from ...model.gaussians import Gaussians
-from ...model.residual_field import ResidualField
 from ...scene.cameras import Camera
 from ..observed_motion import ObservedMotion
 from . import fused_posing
+
+if TYPE_CHECKING:
+    from ...model.residual_field import ResidualField  # a scene at rest does not load it
 
 TRACKS, FIELD, STILL = "tracks", "field", "still"
 

@@ -467,14 +467,14 @@ def gaussians(n=300, k=16, seed=16):
 @pytest.mark.parametrize("k", [1, 4, 9, 16])
 def test_colours_come_from_the_harmonics_along_the_line_of_sight(k):
     scene, view = gaussians(k=k), camera()
-    directions = scene.gaussians.means - torch.tensor(view.center, dtype=torch.float32)
+    directions = scene.means - torch.tensor(view.center, dtype=torch.float32)
     directions = directions / directions.norm(dim=1, keepdim=True)
-    colors = (0.5 + sh_color.evaluate(scene.gaussians.sh, directions)).clamp_min(0)
+    colors = (0.5 + sh_color.evaluate(scene.sh, directions)).clamp_min(0)
     expected = rasterize_splats(
-        scene.gaussians.means,
-        scene.gaussians.quats,
-        scene.gaussians.log_scales.exp(),
-        scene.gaussians.opacity_logits.sigmoid(),
+        scene.means,
+        scene.quats,
+        scene.log_scales.exp(),
+        scene.opacity_logits.sigmoid(),
         colors,
         view,
     )
@@ -483,15 +483,15 @@ def test_colours_come_from_the_harmonics_along_the_line_of_sight(k):
 
 def test_features_in_the_same_pass_equal_those_of_their_own():
     scene, view, features = gaussians(), camera(), torch.rand(300, 16)
-    scene.gaussians.object_ids = torch.randint(0, 3, (300,))
+    scene.object_ids = torch.randint(0, 3, (300,))
     background = torch.rand(40, 48, 3)
     both = rasterize(scene, view, features, background)
     alone = rasterize(scene, view, background=background)
     own = rasterize_splats(
-        scene.gaussians.means,
-        scene.gaussians.quats,
-        scene.gaussians.log_scales.exp(),
-        scene.gaussians.opacity_logits.sigmoid(),
+        scene.means,
+        scene.quats,
+        scene.log_scales.exp(),
+        scene.opacity_logits.sigmoid(),
         features,
         view,
     )
@@ -506,10 +506,10 @@ def test_final_colours_take_the_place_of_the_harmonics():
     colors = torch.rand(300, 3, requires_grad=True)
     shown = rasterize(scene, view, colors=colors).color
     expected = rasterize_splats(
-        scene.gaussians.means,
-        scene.gaussians.quats,
-        scene.gaussians.log_scales.exp(),
-        scene.gaussians.opacity_logits.sigmoid(),
+        scene.means,
+        scene.quats,
+        scene.log_scales.exp(),
+        scene.opacity_logits.sigmoid(),
         colors,
         view,
     )

@@ -26,7 +26,7 @@ def picture(posed):
 
 
 def test_the_shares_of_all_groups_are_alpha_in_falling_order(posed):
-    groups = posed[0].object_ids + 1
+    groups = posed[0].gaussians.object_ids + 1
     found, parts = shares(posed, groups, 6)
     np.testing.assert_allclose(parts.sum(-1), picture(posed).alpha.numpy(), atol=1e-5)
     assert (np.diff(parts, axis=-1) <= 0).all() and (found[parts == 0] == -1).all()
@@ -34,7 +34,7 @@ def test_the_shares_of_all_groups_are_alpha_in_falling_order(posed):
 
 
 def test_fewer_ranks_keep_the_largest(posed):
-    groups = posed[0].object_ids + 1
+    groups = posed[0].gaussians.object_ids + 1
     all_found, all_parts = shares(posed, groups, 6)
     found, parts = shares(posed, groups, 2)
     np.testing.assert_array_equal(parts, all_parts[..., :2])
@@ -52,7 +52,7 @@ def test_more_groups_than_one_pass_holds_are_as_exact(posed):
 
 
 def test_who_is_of_no_interest_still_covers(posed):
-    groups = np.where(posed[0].object_ids == 1, 0, -1)
+    groups = np.where(posed[0].gaussians.object_ids == 1, 0, -1)
     _, parts = shares(posed, groups, 2)
     _, all_parts = shares(posed, np.zeros_like(groups), 2)
     assert (parts[..., 1] == 0).all() and (parts[..., 0] <= all_parts[..., 0] + 1e-6).all()

@@ -15,7 +15,7 @@ import torch
 from r5dgs_core import atomic_files
 from r5dgs_core.cli import main
 from r5dgs_core.errors import CheckpointError, Interrupted, TrainingError
-from r5dgs_core.train import checkpoint, finish, run
+from r5dgs_core.train import checkpoint, finish, run, step_log
 from tests.support import tiny_datasets
 
 STEPS, IDENTITY = 150, 20
@@ -256,7 +256,7 @@ def test_what_cannot_be_written_is_named(tiny, tmp_path, monkeypatch, name):
 
     monkeypatch.setattr(atomic_files, "replacing", full)
     if name == checkpoint.LOG_FILE:
-        monkeypatch.setattr(run, "open", full_disk, raising=False)
+        monkeypatch.setattr(step_log, "open", full_disk, raising=False)
     settings = tiny_datasets.settings("train.iterations=2", "identity.iterations=0")
     with pytest.raises(CheckpointError, match="run.*cannot be .*written: .*No space left"):
         run.train(tiny.root, tmp_path / "run", settings)
