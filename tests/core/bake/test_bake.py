@@ -8,7 +8,7 @@ import torch
 
 from r5dgs_core.bake import bake
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.errors import CheckpointError
+from r5dgs_core.errors import CheckpointError, Interrupted
 from r5dgs_core.evaluation import evaluate
 from r5dgs_core.model import track_state
 from r5dgs_core.motion import rotations
@@ -62,8 +62,13 @@ def test_a_baked_scene_shows_what_was_trained(baked, trained):
 
 @pytest.mark.parametrize("overrides", [("train.sh_degree=2",), ("train.shading=false", "train.shadows=false")])
 def test_unfinished_runs_with_other_options_bake_to_what_they_show(tiny, tmp_path, monkeypatch, overrides):
-    monkeypatch.setattr(finish, "outcome", lambda *args: {})
-    made = train_briefly(tiny, tmp_path / "run", *overrides)
+    def stop(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(finish, "outcome", stop)
+    with pytest.raises(Interrupted):
+        train_briefly(tiny, tmp_path / "run", *overrides)
+    made = checkpoint.open_run(tmp_path / "run")
     if overrides[0] == "train.sh_degree=2":  # strong harmonics, so that a wrong frame would be seen
         state = checkpoint.load(made.folder)
         draws = torch.Generator().manual_seed(1)
