@@ -1,4 +1,4 @@
-"""What Blender writes is what the worker reads."""
+"""Round trip of render requests: the worker reads what Blender writes."""
 
 import json
 
