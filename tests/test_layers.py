@@ -103,6 +103,9 @@ LATE_MODULES = {
 }
 # Further modules of the core, and what each may import inside functions.
 LATE_IMPORTS = {
+    # A layout is detected before numpy is imported.
+    "data.layouts.camera_files": {"data.transforms"},
+    "data.layouts.colmap": {"data.colmap_dataset"},
     # numba is optional.
     "raster.cpu.backend": {
         *("raster.compilation", "raster.cpu.autograd", "raster.cpu.forward"),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data import dataset, images, masks
+from ..data import colmap_dataset, dataset, images, masks
 from ..data.dataset import Dataset, View
 from ..data.layouts import camera_files, colmap
 from ..findings import Collector, Finding, coded
@@ -69,7 +69,7 @@ def _check_splits(found: Dataset, collect: Collector) -> None:
     for path, names in splits.items():
         if len(names) > 1:
             collect.add("D40", f"{path}: expected in one split, found in {' and '.join(sorted(names))}")
-    folder = found.root / colmap.IMAGES
+    folder = found.root / colmap_dataset.IMAGES
     if not camera_files.detect(found.root):
         kinds = (*images.SUFFIXES, *images.UNREADABLE_SUFFIXES)
         present = {path for path in folder.rglob("*") if path.suffix.lower() in kinds}

@@ -71,13 +71,13 @@ def run_export(
     """
     if to not in registry.MODULES:
         raise errors.UsageError(f"--to {to}: expected one of {', '.join(registry.MODULES)}")
-    chosen = registry.get(to)
+    input_paths.check_output("--out", out)
+    input_paths.check_scene(path)
+    chosen = registry.get(to)  # imports numpy
     if out.suffix.lower() != chosen.suffix:
         raise errors.UsageError(f"--out {out}: expected a name that ends in {chosen.suffix}")
     if t is not None and not math.isfinite(t):
         raise errors.UsageError(f"--time {t}: expected a finite number")
-    input_paths.check_output("--out", out)
-    input_paths.check_scene(path)
     from ..progress import make
     from ..scene import scene_file
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ... import findings
-from .. import transforms
 from .raw_dataset import RawDataset
 from .registry import CAMERAS_FILE
+
+if TYPE_CHECKING:
+    from ..transforms import Entry
 
 
 def detect(root: Path) -> bool:
@@ -27,7 +29,9 @@ def read(root: Path, min_registered: float = 0.0, guard: findings.Guard = findin
     Raises:
         DatasetError: A file is damaged.
     """
-    entries: dict[str, list[transforms.Entry]] = {"train": [], "val": [], "test": []}
+    from .. import transforms
+
+    entries: dict[str, list[Entry]] = {"train": [], "val": [], "test": []}
     header: dict[str, Any] = {}
     files = []
     for split in entries:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+if TYPE_CHECKING:  # a layout is detected before numpy is imported
+    import numpy as np
 
-from ..transforms import Entry
+    from ..transforms import Entry
 
 
 @dataclass(frozen=True)

@@ -452,7 +452,7 @@ for arguments in json.loads(sys.argv[1]):
         status = cli.main(arguments)
     except SystemExit as stop:
         status = stop.code
-    heavy = sorted({"torch", "numba", "scipy", "matplotlib", "rich"} & set(sys.modules))  # layouts import numpy
+    heavy = sorted({"torch", "numba", "scipy", "matplotlib", "numpy", "rich"} & set(sys.modules))
     print(json.dumps([arguments, status, heavy, os.listdir()]), file=sys.__stdout__)
 """
     settings = {**os.environ, "PYTHONPATH": str(Path(main.__file__).parents[2])}
