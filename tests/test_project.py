@@ -18,6 +18,7 @@ from packaging.version import Version
 
 import r5dgs_core
 from r5dgs_core.cli import parser
+from tests.support import pages
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -92,7 +93,7 @@ def test_the_commands_of_the_readme_exist():
 
 
 def test_the_python_of_the_readme_runs():
-    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+    blocks = pages.blocks("README.md")
     assert blocks
     names: dict = {}
     for block in blocks:

@@ -1,10 +1,8 @@
 """The public functions: the code of docs/reference/python.md runs, and importing the package loads nothing."""
 
-import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,10 +10,10 @@ import pytest
 import r5dgs_core
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
-from tests.support import tiny_datasets
+from tests.support import pages, tiny_datasets
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "python.md").read_text()
-PLAY, TRAIN = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+PAGE = "docs/reference/python.md"
+PLAY, TRAIN = pages.blocks(PAGE)
 
 
 def test_the_page_plays_a_scene(scene, tmp_path, monkeypatch):
@@ -51,8 +49,9 @@ def test_poses_move_the_gaussians_of_their_objects(scene):
 
 
 def test_every_public_name_is_on_the_page_and_others_are_refused():
+    page = (pages.ROOT / PAGE).read_text()
     for name in r5dgs_core.__all__:
-        assert callable(getattr(r5dgs_core, name)) and f"| `{name}(" in PAGE
+        assert callable(getattr(r5dgs_core, name)) and f"| `{name}(" in page
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = r5dgs_core.nonsense
 

@@ -9,7 +9,7 @@ from r5dgs_core.cli import main
 from r5dgs_core.formats import registry
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
-from tests.support import extending_page
+from tests.support import pages
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "user" / "export.md"
 
@@ -27,7 +27,7 @@ def test_the_users_page_lists_no_other_format():
 
 
 def test_the_developers_page_adds_a_format(scene, tmp_path, monkeypatch):
-    extending_page.load("Export format", "r5dgs_core.formats.csv_points", monkeypatch)
+    pages.load("Export format", "r5dgs_core.formats.csv_points", monkeypatch)
     monkeypatch.setitem(registry.MODULES, "csv", "csv_points")
     path = scene_file.write(scene, tmp_path / "scene.r5dgs")
     assert main.main(["export", str(path), "--to", "csv", "--out", str(tmp_path / "a.csv"), "--time", "0.5"]) == 0

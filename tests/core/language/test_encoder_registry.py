@@ -3,11 +3,11 @@
 import numpy as np
 
 from r5dgs_core.language.encoders import encoder_base, registry
-from tests.support import extending_page
+from tests.support import pages
 
 
 def test_the_developers_page_adds_an_encoder(tmp_path, monkeypatch):
-    extending_page.load("Encoder", "r5dgs_core.language.encoders.letter_encoder", monkeypatch)
+    pages.load("Encoder", "r5dgs_core.language.encoders.letter_encoder", monkeypatch)
     monkeypatch.setattr(registry, "MODULES", [*registry.MODULES, "letter_encoder"])
     (tmp_path / "letters.json").write_text('{"letters": "aeiou"}')
     found = registry.open_encoder(tmp_path)

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 import r5dgs_core
+from tests.support import pages
 
 PACKAGE = Path(r5dgs_core.__file__).parent
-PAGE = Path(__file__).resolve().parents[3] / "docs/developer/extending.md"
 NAME = "rolling"
 USE = """
 import dataclasses
@@ -62,8 +62,7 @@ assert all(hasattr(wheel, name) for name in kind.fields)
 def extended(tmp_path):
     """Folder with a copy of the package that has the kind of the page: one more file, one more name."""
     shutil.copytree(PACKAGE, tmp_path / "r5dgs_core", ignore=shutil.ignore_patterns("__pycache__"))
-    section = PAGE.read_text().partition("## Motion model")[2].partition("\n## ")[0]
-    (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    (code,) = pages.blocks(pages.EXTENDING, "Motion model")
     folder = tmp_path / "r5dgs_core/motion/models"
     (folder / f"{NAME}.py").write_text(code)
     registry = (folder / "__init__.py").read_text()

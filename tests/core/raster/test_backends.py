@@ -14,7 +14,7 @@ from tests.support.splats import camera, splats
 
 @pytest.fixture(autouse=True)
 def points(monkeypatch):
-    module = pages.module_of("developer/extending.md", "Rasterizer backend", "r5dgs_core.raster.points")
+    module = pages.load("Rasterizer backend", "r5dgs_core.raster.points", monkeypatch)
     monkeypatch.setattr(backends, "BACKENDS", [*backends.BACKENDS, module.PointsBackend()])
 
 

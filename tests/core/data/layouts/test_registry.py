@@ -6,7 +6,7 @@ import pytest
 from r5dgs_core import errors
 from r5dgs_core.data import dataset, images
 from r5dgs_core.data.layouts import registry
-from tests.support import extending_page
+from tests.support import pages
 
 
 def write_table(root, rows):
@@ -18,7 +18,7 @@ def write_table(root, rows):
 
 @pytest.fixture
 def table_layout(monkeypatch):
-    extending_page.load("Data set layout", "r5dgs_core.data.layouts.table", monkeypatch)
+    pages.load("Data set layout", "r5dgs_core.data.layouts.table", monkeypatch)
     monkeypatch.setattr(registry, "MODULES", [*registry.MODULES, "table"])
 
 
