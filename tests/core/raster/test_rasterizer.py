@@ -464,20 +464,19 @@ def gaussians(n=300, k=16, seed=16):
     )
 
 
+def blended(scene, channels, view):
+    """Image of any channels of the Gaussians."""
+    scales, opacities = scene.log_scales.exp(), scene.opacity_logits.sigmoid()
+    return rasterize_splats(scene.means, scene.quats, scales, opacities, channels, view)
+
+
 @pytest.mark.parametrize("k", [1, 4, 9, 16])
 def test_colours_come_from_the_harmonics_along_the_line_of_sight(k):
     scene, view = gaussians(k=k), camera()
     directions = scene.means - torch.tensor(view.center, dtype=torch.float32)
     directions = directions / directions.norm(dim=1, keepdim=True)
     colors = (0.5 + sh_color.evaluate(scene.sh, directions)).clamp_min(0)
-    expected = rasterize_splats(
-        scene.means,
-        scene.quats,
-        scene.log_scales.exp(),
-        scene.opacity_logits.sigmoid(),
-        colors,
-        view,
-    )
+    expected = blended(scene, colors, view)
     torch.testing.assert_close(rasterize(scene, view).color, expected.image, atol=1e-5, rtol=1e-4)
 
 
@@ -487,14 +486,7 @@ def test_features_in_the_same_pass_equal_those_of_their_own():
     background = torch.rand(40, 48, 3)
     both = rasterize(scene, view, features, background)
     alone = rasterize(scene, view, background=background)
-    own = rasterize_splats(
-        scene.means,
-        scene.quats,
-        scene.log_scales.exp(),
-        scene.opacity_logits.sigmoid(),
-        features,
-        view,
-    )
+    own = blended(scene, features, view)
     torch.testing.assert_close(both.color, alone.color)
     torch.testing.assert_close(both.features, own.image)
     assert alone.features is None and torch.equal(both.ids, alone.ids)
@@ -505,14 +497,7 @@ def test_final_colours_take_the_place_of_the_harmonics():
     scene, view = gaussians(k=4), camera()
     colors = torch.rand(300, 3, requires_grad=True)
     shown = rasterize(scene, view, colors=colors).color
-    expected = rasterize_splats(
-        scene.means,
-        scene.quats,
-        scene.log_scales.exp(),
-        scene.opacity_logits.sigmoid(),
-        colors,
-        view,
-    )
+    expected = blended(scene, colors, view)
     torch.testing.assert_close(shown, expected.image)
     shown.sum().backward()
     assert colors.grad.abs().sum() > 0
