@@ -16,6 +16,7 @@ from ..motion.models import MotionModel
 from ..playback import visibility
 from ..scene import sh_color
 from ..scene.scene import MotionGroup, Scene
+from ..scene.splats import to_opacities
 from ..train import observed_motion
 from ..train.representations import shading as shading_vectors
 from . import track_checks
@@ -31,7 +32,7 @@ def bind(observed: Observed, context: Context) -> Bound:
     names = {int(i): context.dataset.object_names.get(int(i), f"object {i}") for i in context.tensors["object_ids"]}
     means, quats, sh, shading, rest = (getattr(cloud, name).copy() for name in _COLUMNS)
     groups, trained, pivots, played = [], [], [], []
-    opacities = 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
+    opacities = to_opacities(cloud.opacity_logits)
     for index, group in enumerate(motion.groups):
         group = track_checks.sound(group, names.get(group.object_id, "background"))
         members = cloud.motion_ids == index

@@ -30,6 +30,7 @@ from ..motion import free_top, rotations
 from ..motion_fit import model_selection, shared_gravity
 from ..playback import visibility
 from ..scene.scene import Scene
+from ..scene.splats import to_opacities
 from . import bind_state, falling_bodies, image_evidence, needs, track_checks
 from .draft import Context, Draft, Need
 from .image_evidence import ImageEvidence
@@ -266,7 +267,7 @@ def _fit(
     The noise is at least that measured in the images.
     """
     members = scene.gaussians.motion_ids == group
-    opacities = 1 / (1 + np.exp(-scene.gaussians.opacity_logits[members].astype(np.float64)))
+    opacities = to_opacities(scene.gaussians.opacity_logits[members])
     body = free_top.inertia(scene.gaussians.means[members][visibility.seen(opacities)].astype(np.float64))
     track = shared_gravity.Track(scene.tracks.times, poses[:, :4], poses[:, 4:], observed.astype(np.float64))
     noise = {part.name == "rotation": part.spread / part.change for part in parts if part.seen and part.change > 0}

@@ -10,6 +10,7 @@ from ..findings import Collector, Finding
 from ..motion import key_reduction, models
 from ..scene import scene_file
 from ..scene.scene import Scene
+from ..scene.splats import to_opacities
 from ..terminal import printable
 from .codes import CODES
 
@@ -46,7 +47,7 @@ def _check_gaussians(scene: Scene, path: Path, collect: Collector) -> None:
         return
     with np.errstate(over="ignore"):
         large = int((np.exp(scene.gaussians.log_scales.astype(np.float64)).max(-1) > scene.extent).sum())
-        seen = float((1 / (1 + np.exp(-scene.gaussians.opacity_logits.astype(np.float64))) >= _SEEN).mean())
+        seen = float((to_opacities(scene.gaussians.opacity_logits) >= _SEEN).mean())
     if large:
         collect.add("S11", f"{path}: {large} of {len(scene.gaussians.means)} Gaussians are larger than the scene")
     if seen < _FEW_SEEN:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..scene.scene import Scene
+from ..scene.splats import to_opacities
 from . import edited_gaussians
 
 ROUNDING = 2e-6  # largest residual of centres under a map, relative to the largest coordinate
@@ -225,7 +226,7 @@ def _given_looks(part: Scene, edit: PointEdit) -> dict[str, np.ndarray]:
     found = {}
     if edit.base is not None:
         opacity = edit.base[:, 3].astype(np.float64)
-        own = 1 / (1 + np.exp(-part.gaussians.opacity_logits.astype(np.float64)))
+        own = to_opacities(part.gaussians.opacity_logits)
         same = np.isclose(opacity, own, rtol=SAME, atol=1e-7)
         if not same.all():
             opacity = np.clip(opacity, 1e-7, 1 - 1e-7)

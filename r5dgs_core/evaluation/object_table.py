@@ -16,6 +16,7 @@ from ..data import dataset as datasets
 from ..playback import scene_player
 from ..render import viewpoints
 from ..scene.scene import MotionGroup, Scene
+from ..scene.splats import to_opacities
 from . import evaluate, miou
 from .scene_summary import motion_of
 
@@ -122,7 +123,7 @@ def confidences(scene: Scene) -> dict[int, float]:
     """
     if scene.gaussians.identities is None or scene.classifier is None:
         return {}
-    opacities = 1 / (1 + np.exp(-scene.gaussians.opacity_logits.astype(np.float64)))
+    opacities = to_opacities(scene.gaussians.opacity_logits)
     found = {}
     for k, item in enumerate(item for item in scene.objects if item.id >= 0):
         rows = slice(item.start, item.start + item.count)

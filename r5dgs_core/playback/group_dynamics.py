@@ -14,6 +14,7 @@ import numpy as np
 from ..motion import key_reduction, models, rigid_fit, rotations, se3, twist_propagation
 from ..motion.models import STATIC, MotionModel
 from ..scene.scene import MotionGroup, Scene
+from ..scene.splats import to_opacities
 from . import visibility
 from .modes import SOURCES
 
@@ -130,7 +131,7 @@ def knots(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.nda
 def voters(scene: Scene, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows that are opaque enough to represent a group, or all if none is, and their opacities. [n] each"""
     with np.errstate(over="ignore"):
-        opacities = 1 / (1 + np.exp(-scene.gaussians.opacity_logits[rows].astype(np.float64)))
+        opacities = to_opacities(scene.gaussians.opacity_logits[rows])
     seen = visibility.seen(opacities)
     return rows[seen], np.maximum(opacities[seen], 1e-12)
 

@@ -1,4 +1,4 @@
-"""The `Splats` dataclass: Gaussians as most programs know them."""
+"""The `Splats` dataclass, Gaussians as most programs know them, and their opacities."""
 
 from __future__ import annotations
 
@@ -28,3 +28,8 @@ class Splats:
     sh: np.ndarray
     identities: np.ndarray | None = None
     object_ids: np.ndarray | None = None
+
+
+def to_opacities(logits: np.ndarray) -> np.ndarray:
+    """Opacities in [0, 1] of logits. float64"""
+    return 1 / (1 + np.exp(-logits.astype(np.float64)))

@@ -7,10 +7,10 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
 
 from ..config import training_needs
+from ..scene.splats import to_opacities
 from . import checkpoint_content, probe
 from .identity import identity_training, label_cleanup, packed_masks
 from .representations import registry
@@ -106,7 +106,7 @@ def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dic
     group_ids = ids.numpy() if motion.motion_ids is None else motion.motion_ids
     points = label_cleanup.bound(motion.groups, group_ids, gaussians["means"])
     going, moving = label_cleanup.companions(motion.groups, group_ids, points, trainer.object_ids)
-    opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].astype(np.float64)))
+    opacities = to_opacities(gaussians["opacity_logits"])
     found, changes = label_cleanup.clean(votes.numpy(), given, points, opacities, going, moving)
     counts = dataclasses.astuple(changes)
     log.info("labels: %d by neighbours, %d by motion, %d outliers changed of %d", *counts)

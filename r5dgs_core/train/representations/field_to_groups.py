@@ -15,6 +15,7 @@ from torch import Tensor
 from ...motion import rigid_fit, rotations, se3
 from ...motion_fit import model_selection
 from ...scene import sh_color
+from ...scene.splats import to_opacities
 from ..observed_motion import GroupTrack, ObservedMotion, PointMotion
 from . import regrouping as regroup
 from . import shading
@@ -92,7 +93,7 @@ def observed_motion(
     resting = ~np.isin(labels, own)  # objects without movers are groups, too,
     resting[rows.numpy()] = False  # but movers stay in their groups even if the masks label them as background
     motion_ids[resting] = labels[resting]
-    opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].numpy()[rows.numpy()].astype(np.float64)))
+    opacities = to_opacities(gaussians["opacity_logits"].numpy()[rows.numpy()])
     nearest = np.abs(times[None] - at[:, None]).argmin(1)
     observed = np.concatenate([np.ones((1, len(times)), bool), seen])[:, nearest]
     observed[:, -1] = True
