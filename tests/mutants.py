@@ -15,6 +15,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+HANG = 900  # seconds after which the tests of a mutant count as failed
 SWAPS = {
     **{ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Mod: ast.Mult},
     **{ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq},
@@ -62,6 +63,15 @@ def apply(source: str, node: ast.AST) -> tuple[str, str]:
     ).decode(), f"{ast.unparse(node)} -> {new}"
 
 
+def passes(folder: str, tests: list[str]) -> bool:
+    """Return True if tests pass in a copy of the repository; False if one fails or they hang."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+    try:
+        return subprocess.run(command, cwd=folder, capture_output=True, timeout=HANG).returncode == 0
+    except subprocess.TimeoutExpired:
+        return False
+
+
 def main() -> None:
     """Mutate, test and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -79,24 +89,19 @@ def main() -> None:
     sample = random.Random(options.seed).sample(found, min(options.count, len(found)))
     survivors = []
     with tempfile.TemporaryDirectory() as folder:
-        for part in ("r5dgs_core", "tests", "benchmarks", "examples", "pyproject.toml"):
+        for part in ("r5dgs_core", "tests", "benchmarks", "examples", "docs", "pyproject.toml"):
             source = ROOT / part
             (shutil.copytree if source.is_dir() else shutil.copy)(source, Path(folder) / part)
         tests = Path("tests/core") / options.room
+        if not passes(folder, [str(tests)]):
+            parser.error(f"{tests}: expected tests that pass before anything is changed")
         for path, k in sample:
             original = (ROOT / path).read_text(encoding="utf-8")
             node = places(original)[k]
             text, change = apply(original, node)
             (Path(folder) / path).write_text(text, encoding="utf-8")
             own = [str(p.relative_to(ROOT)) for p in sorted((ROOT / tests).glob(f"test_{path.stem}*.py"))]
-            command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
-            for given in filter(None, (own, [str(tests)])):
-                killed = (
-                    subprocess.run([*command, *given], cwd=folder, capture_output=True, timeout=900).returncode != 0
-                )
-                if killed:
-                    break
-            else:
+            if all(passes(folder, given) for given in (own, [str(tests)]) if given):
                 survivors.append(f"{path}:{node.lineno}: {change}")
             (Path(folder) / path).write_text(original, encoding="utf-8")
     print(f"{options.room}: {len(sample) - len(survivors)} of {len(sample)} mutants killed, seed {options.seed}")

@@ -1,6 +1,6 @@
 """Base class of motion representations, which move the Gaussians in the observed time.
 
-The trainer uses only `Representation`, and never asks which one it has. `tracks` moves Gaussians by one SE(3) track per
+The trainer uses only the methods of `Representation`. `tracks` moves Gaussians by one SE(3) track per
 object, `field` by a deformation field, and `still` not at all. `registry` creates them by name.
 """
 
