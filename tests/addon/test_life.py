@@ -1,6 +1,5 @@
 """The life of a session: files that move, scenes that are appended, linked, loaded twice, or loaded in odd places."""
 
-import inspect
 import shutil
 import subprocess
 import sys
@@ -11,7 +10,7 @@ import pytest
 from r5dgs_core import errors
 from r5dgs_core.scene import scene_file
 from tests.addon import conftest
-from tests.support import layouts, motions, scenes
+from tests.support import layouts, motions, registrations, scenes
 
 KINDS = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups", "scenes")
 
@@ -299,43 +298,19 @@ def test_a_linked_scene_is_not_loaded_into(blender, scene_path, tmp_path):
 # --- what stays after the extension ---
 
 
-def traces(bpy):
-    """Registrations of the extension in Blender: classes, properties, handlers, timers, menus, keymaps."""
-    found = {name for name in dir(bpy.types) if "R5DGS" in name.upper()}
-    for owner in ("Object", "Collection", "Scene", "WindowManager", "Material", "Camera", "PointCloud"):
-        properties = getattr(bpy.types, owner).bl_rna.properties
-        found |= {f"{owner}.{p.identifier}" for p in properties if "r5dgs" in p.identifier.lower()}
-    for name in dir(bpy.app.handlers):
-        listening = getattr(bpy.app.handlers, name)
-        if isinstance(listening, list):
-            found |= {f"{name}: {f}" for f in listening if getattr(f, "__module__", "").startswith("r5dgs.")}
-    for name, module in list(sys.modules.items()):
-        if name.startswith(("r5dgs.r5dgs_addon", "r5dgs.operators")):
-            functions = [value for value in vars(module).values() if inspect.isfunction(value)]
-            found |= {f"timer: {f}" for f in functions if bpy.app.timers.is_registered(f)}
-    for name in dir(bpy.types):
-        drawn = getattr(getattr(getattr(bpy.types, name), "draw", None), "_draw_funcs", ())
-        found |= {f"{name}: {f}" for f in drawn if f.__module__.startswith("r5dgs.")}
-    configurations = bpy.context.window_manager.keyconfigs
-    for configuration in configurations:
-        for keymap in configuration.keymaps:
-            found |= {
-                f"{keymap.name}: {item.idname}" for item in keymap.keymap_items if item.idname.startswith("r5dgs.")
-            }
-    return found
-
-
 def test_unregistering_leaves_nothing_and_registering_again_brings_all_back(blender, extension, scene_path):
-    present = traces(blender)
+    present = registrations.traces(blender)
     assert {"R5DGS_OT_load_scene", "R5DGS_PT_scene", "R5DGS_FH_scene", "Object.r5dgs"} <= present
     assert any(name.startswith("TOPBAR_MT_file_import") for name in present)
     for _ in range(2):
         extension.unregister()
         try:
-            assert traces(blender) == set()
+            assert registrations.traces(blender) == set()
         finally:
             extension.register()
-        assert {name.split(" at 0x")[0] for name in traces(blender)} == {name.split(" at 0x")[0] for name in present}
+        assert {name.split(" at 0x")[0] for name in registrations.traces(blender)} == {
+            name.split(" at 0x")[0] for name in present
+        }
     assert plays(blender, motions.load(blender, scene_path), scene_path)
 
 

@@ -167,6 +167,6 @@ def test_labels_and_tooltips_are_written_as_blenders_own(blender):
 
 def test_each_operator_has_a_file_of_its_own(extension):
     operators = importlib.import_module("r5dgs.operators")
-    for module in operators.MODULES:
+    for module in operators.modules():
         idnames = [cls.bl_idname for cls in module.CLASSES if cls.bl_idname.startswith("r5dgs.")]
         assert idnames == [f"r5dgs.{module.__name__.rpartition('.')[2]}"]

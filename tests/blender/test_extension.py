@@ -109,6 +109,9 @@ def test_the_archive_validates_and_holds_the_extension_only(archive):
         "blender_manifest.toml", "__init__.py", "LICENSE", "README.md", "CHANGELOG.md",
         "operators", "r5dgs_addon", "r5dgs_core",
     }  # fmt: skip
+    rooms = ("operators", "r5dgs_addon", "r5dgs_core")
+    modules = {path.relative_to(ROOT).as_posix() for room in rooms for path in (ROOT / room).rglob("*.py")}
+    assert modules <= set(names)
     assert not [name for name in names if name.endswith((".pyc", ".r5dgs", ".png", ".nbi", ".nbc"))]
     assert archive.stat().st_size < 2_000_000
 
