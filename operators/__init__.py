@@ -6,6 +6,7 @@ from types import ModuleType
 
 import bpy
 
+from ..r5dgs_addon.panels import export
 from ..r5dgs_addon.ui import stepwise_operator
 
 
@@ -19,10 +20,9 @@ def _menu_import(menu, context):
 
 
 def _menu_export(menu, context):
-    menu.layout.operator("r5dgs.export_ply", text="R5DGS Gaussians (.ply)")
+    export.draw_formats(menu.layout, in_menu=True)
     menu.layout.operator("r5dgs.export_scene", text="R5DGS Edited Scene (.r5dgs)")
     menu.layout.operator("r5dgs.export_masks", text="R5DGS Object Masks")
-    menu.layout.operator("r5dgs.export_cameras", text="R5DGS Cameras")
     menu.layout.operator("r5dgs.capture_dataset", text="R5DGS Training Data Set")
 
 

@@ -5,6 +5,7 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from ..r5dgs_addon.export import cameras, frame_range, gaussians
 from ..r5dgs_addon.ui import stepwise_operator
+from ..r5dgs_core.formats import registry
 
 
 class R5DGS_OT_export_cameras(stepwise_operator.Running, bpy.types.Operator):
@@ -12,6 +13,7 @@ class R5DGS_OT_export_cameras(stepwise_operator.Running, bpy.types.Operator):
 
     bl_idname = "r5dgs.export_cameras"
     bl_label = "Export Cameras"
+    bl_description = f"{__doc__}. {registry.get('cameras').summary}"
     bl_options = {"REGISTER", "PRESET"}
 
     directory: StringProperty(name="Folder", description="Output folder", subtype="DIR_PATH", options={"SKIP_SAVE"})

@@ -1,7 +1,5 @@
 """Export Gaussians operator: visible Gaussians as 3D Gaussian Splatting files."""
 
-from pathlib import Path
-
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
@@ -18,6 +16,7 @@ class R5DGS_OT_export_ply(stepwise_operator.Running, bpy.types.Operator):
 
     bl_idname = "r5dgs.export_ply"
     bl_label = "Export Gaussians"
+    bl_description = f"{__doc__}. {FORMAT.summary}"
     bl_options = {"REGISTER", "PRESET"}
 
     filepath: StringProperty(name="File", description="The .ply file", subtype="FILE_PATH", options={"SKIP_SAVE"})
@@ -43,13 +42,7 @@ class R5DGS_OT_export_ply(stepwise_operator.Running, bpy.types.Operator):
         return True
 
     def suggest(self, context):
-        if not self.filepath:
-            stem = Path(bpy.data.filepath).stem or "gaussians"
-            self.filepath = (
-                str(Path(bpy.path.abspath("//")) / f"{stem}{FORMAT.suffix}")
-                if bpy.data.filepath
-                else f"{stem}{FORMAT.suffix}"
-            )
+        self.suggest_file("gaussians", FORMAT.suffix)
         return False
 
     def steps(self, context):

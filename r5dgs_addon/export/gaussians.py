@@ -81,6 +81,20 @@ def chosen(context: bpy.types.Context, which: str) -> set[bpy.types.Object] | No
     return selected | {child for obj in selected for child in obj.children_recursive}
 
 
+def shown(depsgraph: bpy.types.Depsgraph, wanted: set[bpy.types.Object] | None) -> list[visible_clouds.VisibleCloud]:
+    """Visible point clouds and instances that are wanted; ``wanted`` is the result of `chosen`."""
+    found = visible_clouds.instances(depsgraph)[1]
+    return [one for one in found if wanted is None or one.object in wanted or one.parent in wanted]
+
+
+def nothing_shown(wanted: set[bpy.types.Object] | None) -> errors.ConfigError:
+    """Error of an export for which `shown` finds nothing."""
+    selected = "" if wanted is None else ", selected"
+    return errors.ConfigError(
+        f"export: expected a visible object of a loaded scene{selected}, found none; select or show one first"
+    )
+
+
 def world_to(axes: str, world: np.ndarray) -> np.ndarray:
     """Transform from Blender's world to the requested axes.
 
@@ -114,11 +128,8 @@ def splats_of(
         Gaussians, and the names of their point clouds.
     """
     depsgraph = context.evaluated_depsgraph_get()
-    _, found = visible_clouds.instances(depsgraph)
     parts, names = [], []
-    for one in found:
-        if wanted is not None and one.object not in wanted and one.parent not in wanted:
-            continue
+    for one in shown(depsgraph, wanted):
         scene, turn = sources.scene(one.collection), world_to(axes, one.world)
         sources.origins.add(tuple(loaded_scenes.origin(one.collection).tolist()))
         matrix, names = turn @ one.matrix, [*names, one.object.name]
@@ -212,10 +223,7 @@ def ply_steps(
             frame_range.go_to(scene, frame)
             splats, names = splats_of(context, wanted, axes, sources)
             if not names and not every:
-                raise errors.ConfigError(
-                    "export: expected a visible object of a loaded scene" + (", selected" if wanted is not None else "")
-                    + ", found none; select or show one first"
-                )  # fmt: skip
+                raise nothing_shown(wanted)
             ply.write(splats, target, plain=plain, origin=_shared_origin(sources) if axes == "FILE" else None)
             most, clouds = max(most, len(splats.means)), clouds | set(names)
     for origin in sorted(sources.origins):

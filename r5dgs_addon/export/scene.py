@@ -1,8 +1,9 @@
-"""Export of a loaded scene with its edits as a `.r5dgs` file.
+"""A loaded scene with its edits as a `Scene`, and its export as a `.r5dgs` file.
 
 The poses of the point clouds are sampled at the observed times and after t_max.
 """
 
+from collections.abc import Collection, Generator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -25,6 +26,21 @@ KEY_SHARE = 1.5  # share of the keys' own tolerance that is ignored in addition
 MOST_LATER = 64  # maximum number of sampled times past t_max
 MOST_EARLIER = 16  # maximum number of sampled frames before the first observed time
 _STILL = 1e-6  # maximum deviation of a parent's linear part that counts as the identity
+
+
+@dataclass(frozen=True)
+class Edited:
+    """A loaded scene with its edits.
+
+    Attributes:
+        scene: The scene.
+        notes: What it cannot hold, as messages for the user.
+        done: Number of completed steps.
+    """
+
+    scene: Scene
+    notes: list[str]
+    done: int
 
 
 @dataclass
@@ -58,38 +74,59 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
         SceneFileError: The scene's own file is missing, or the new one cannot be written.
     """
     _refuse_sources(path)
+    edited = yield from edited_steps(context, collection, further=1)
+    result, what = edited.scene, plural.of(len(edited.scene.gaussians.means), "Gaussian")
+    yield Step(edited.done, edited.done + 1, f"packing {what} into {path.name}", slow=True)
+    scene_file.write(result, path, exact=exact)
+    named = sum(item.id > 0 for item in result.objects)
+    return Outcome(f"{path.name}: {what}, {plural.of(named, 'object')}", edited.notes)
+
+
+def edited_steps(
+    context: bpy.types.Context,
+    collection: bpy.types.Collection,
+    clouds: Collection[bpy.types.Object] | None = None,
+    *,
+    further: int,
+) -> Generator[Step, None, Edited]:
+    """Apply the edits of a loaded scene. Blender's frame is as before afterwards.
+
+    Args:
+        context: Context with the scene's frames.
+        collection: Loaded scene.
+        clouds: Point clouds to keep; None for all.
+        further: Number of steps that the caller adds.
+
+    Raises:
+        ConfigError: A point cloud has lost its points.
+        SceneFileError: The scene's own file is missing.
+    """
     own = render_request.scene_path(collection)
     source = scene_file.read(own)
     times = timeline.of_collection(collection)
     members, names = _members(collection)
+    members = [member for member in members if clouds is None or member.cloud in clouds]
     if any(member.cloud.r5dgs.start + member.cloud.r5dgs.count > len(source.gaussians.means) for member in members):
         raise errors.SceneFileError(
             f"{own}: expected the scene that '{collection.name}' was loaded from, found another one; load it again"
         )
     when = np.concatenate([source.tracks.times, _later(times)])
-    earlier = _earlier(context.scene, times)
+    earlier, total = _earlier(context.scene, times), len(when) + 1 + further
     with frame_range.frame_kept(context.scene):
         before = []
         for frame in earlier:
             depsgraph, back = _go_to(context, collection, frame)
             before.append([back @ _matrix(member.cloud, depsgraph) for member in members])
         for number, t in enumerate(when):
-            yield Step(number, len(when) + 2, f"frame {times.frame(t):.4g}")
+            yield Step(number, total, f"frame {times.frame(t):.4g}")
             _look(context, collection, members, times.frame(float(t)), bind=number == len(source.tracks.times) - 1)
-    yield Step(len(when), len(when) + 2, "fitting motion to what was edited", slow=True)
+    yield Step(len(when), total, "fitting motion to what was edited", slow=True)
     changed = [member for member in members if member.points.edit is not None]
     extended, places = point_edits.extend(source, [member.points.edit.points for member in changed])
     placed = {id(member): place for member, place in zip(changed, places, strict=True)}
     pieces = [piece for member in members for piece in _pieces(member, extended, placed.get(id(member)))]
     result, notes = edited_scene.edit(extended, pieces, when, _table(collection, source, members, names))
     notes += _lost_points(members, source, extended)
-    yield Step(
-        len(when) + 1,
-        len(when) + 2,
-        f"packing {plural.of(len(result.gaussians.means), 'Gaussian')} into {path.name}",
-        slow=True,
-    )
-    scene_file.write(result, path, exact=exact)
     lost = _moving_before(members, before, TOLERANCE * source.extent, source.extent)
     if lost:
         notes.append(
@@ -97,11 +134,8 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
             "not in the file; move those keys behind it"
         )
     if not _rests(collection):
-        notes.append("The root was moved; a scene file has no place for that, and what loads it gets a new root")
-    named = sum(item.id > 0 for item in result.objects)
-    return Outcome(
-        f"{path.name}: {plural.of(len(result.gaussians.means), 'Gaussian')}, {plural.of(named, 'object')}", notes
-    )
+        notes.append("The root was moved; positions in the file are relative to the root")
+    return Edited(result, notes, len(when) + 1)
 
 
 def _lost_points(members: list[_Member], source: Scene, extended: Scene) -> list[str]:

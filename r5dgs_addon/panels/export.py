@@ -1,15 +1,32 @@
-"""*Export* panel."""
+"""*Export* panel, and the export formats in File > Export."""
 
 import bpy
 
+from ...r5dgs_core.formats import registry
 from . import sidebar
 
-ENTRIES = (
-    ("r5dgs.export_ply", "Gaussians (.ply)", "POINTCLOUD_DATA"),
-    ("r5dgs.export_scene", "Edited Scene (.r5dgs)", "FILE_TICK"),
-    ("r5dgs.export_masks", "Object Masks", "MOD_MASK"),
-    ("r5dgs.export_cameras", "Cameras", "CAMERA_DATA"),
-)  # fmt: skip
+FORMATS = {  # operator and icon of the formats that have their own, by name
+    "ply": ("r5dgs.export_ply", "POINTCLOUD_DATA"),
+    "cameras": ("r5dgs.export_cameras", "CAMERA_DATA"),
+}
+
+
+def draw_formats(layout: bpy.types.UILayout, in_menu: bool = False) -> None:
+    """Draw a button for each format of the registry, disabled if a package is missing.
+
+    Args:
+        layout: Layout of a panel or menu.
+        in_menu: True for Blender's own menus: labels begin with R5DGS, without icons.
+    """
+    for name in registry.MODULES:
+        found = registry.get(name)
+        row = layout.row()
+        row.enabled = found.obstacle() is None
+        operator, icon = FORMATS.get(name, ("r5dgs.export_format", "EXPORT"))
+        label = f"{found.label} ({found.suffix})"
+        button = row.operator(operator, text=f"R5DGS {label}" if in_menu else label, icon="NONE" if in_menu else icon)
+        if name not in FORMATS:
+            button.format = name
 
 
 class R5DGS_PT_export(sidebar.WithScene, bpy.types.Panel):
@@ -21,8 +38,9 @@ class R5DGS_PT_export(sidebar.WithScene, bpy.types.Panel):
 
     def draw(self, context):
         column = self.layout.column()
-        for operator, text, icon in ENTRIES:
-            column.operator(operator, text=text, icon=icon)
+        draw_formats(column)
+        column.operator("r5dgs.export_scene", text="Edited Scene (.r5dgs)", icon="FILE_TICK")
+        column.operator("r5dgs.export_masks", text="Object Masks", icon="MOD_MASK")
 
 
 CLASSES = (R5DGS_PT_export,)

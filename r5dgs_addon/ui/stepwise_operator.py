@@ -67,6 +67,13 @@ class Running:
         """Set a default path. Returns True to run without opening the file browser."""
         return False
 
+    def suggest_file(self, stem: str, suffix: str) -> None:
+        """Set ``filepath`` unless it is set: in the folder of the .blend and named after it, else named ``stem``."""
+        if not self.filepath and bpy.data.filepath:
+            self.filepath = str(Path(bpy.data.filepath).with_suffix(suffix))
+        elif not self.filepath:
+            self.filepath = f"{stem}{suffix}"
+
     def target_file(self, suffix: str) -> Path:
         """Return the file of ``filepath`` with the suffix added if missing. Raises ConfigError if it names no file."""
         path = bpy.path.abspath(self.filepath)

@@ -68,12 +68,13 @@ def run_export(
     Raises:
         UsageError: The format is unknown, or ``out`` or ``t`` does not suit it.
         ConfigError: A file exists, or no object matches the words.
+        BackendError: The format needs a package that is not installed.
     """
     if to not in registry.MODULES:
         raise errors.UsageError(f"--to {to}: expected one of {', '.join(registry.MODULES)}")
     input_paths.check_output("--out", out)
     input_paths.check_scene(path)
-    chosen = registry.get(to)  # imports numpy
+    chosen = registry.usable(to)  # imports numpy
     if out.suffix.lower() != chosen.suffix:
         raise errors.UsageError(f"--out {out}: expected a name that ends in {chosen.suffix}")
     if t is not None and not math.isfinite(t):

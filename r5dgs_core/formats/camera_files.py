@@ -78,7 +78,7 @@ FORMAT = registry.Format(
     name="cameras",
     label="Cameras",
     suffix=".json",
-    keeps="lens, pose and time of every camera of the data set, as transforms.json of NeRF and D-NeRF",
+    keeps="lens, pose and time of every camera, as transforms.json of NeRF and D-NeRF",
     loses="everything but cameras",
     write=export,
 )

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from .. import errors
 
 if TYPE_CHECKING:
     from ..scene.scene import Scene
@@ -45,6 +48,7 @@ class Format:
         write: Writes a scene and yields the path of each file when it is complete. Files are replaced atomically.
         per_frame: True if each frame is a file of its own.
         extra: Extra of ``pip install r5dgs[extra]`` that it needs, or None.
+        packages: Packages of the extra that `write` imports.
     """
 
     name: str
@@ -55,6 +59,22 @@ class Format:
     write: Callable[[Scene, Path, Options], Iterator[Path]]
     per_frame: bool = False
     extra: str | None = None
+    packages: tuple[str, ...] = ()
+
+    @property
+    def summary(self) -> str:
+        """What a file keeps and loses, for tooltips."""
+        return f"Keeps: {self.keeps}. Not kept: {self.loses}"
+
+    def obstacle(self) -> str | None:
+        """Return why this Python cannot write the format and the remedy, or None if it can."""
+        missing = [name for name in self.packages if importlib.util.find_spec(name) is None]
+        if not missing:
+            return None
+        return (
+            f"{self.label} ({self.suffix}): {', '.join(missing)} is not installed; remedy: pip install "
+            f"'r5dgs[{self.extra}]', then use the command r5dgs export"
+        )
 
     def paths(self, path: Path, options: Options) -> list[Path]:
         """Return the files that `write` makes."""
@@ -66,6 +86,14 @@ class Format:
 def get(name: str) -> Format:
     """Return a format by its name. Raises KeyError for an unknown name."""
     return importlib.import_module(f".{MODULES[name]}", __package__).FORMAT
+
+
+def usable(name: str) -> Format:
+    """Return a format that this Python can write. Raises KeyError for an unknown name, BackendError if it cannot."""
+    found = get(name)
+    if (obstacle := found.obstacle()) is not None:
+        raise errors.BackendError(obstacle)
+    return found
 
 
 def numbered(path: Path, frame: int) -> Path:

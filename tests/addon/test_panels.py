@@ -91,7 +91,7 @@ def test_no_text_is_longer_than_a_sidebar_of_normal_width_shows(blender, sidebar
 
 
 def test_import_menu_export_menu_and_drag_and_drop_lead_to_the_operators(blender, extension):
-    exports = [f"r5dgs.{name}" for name in ("export_ply", "export_scene", "export_masks", "export_cameras")]
+    exports = [f"r5dgs.{name}" for name in ("export_ply", "export_cameras", "export_scene", "export_masks")]
     exports.append("r5dgs.capture_dataset")
     for menu, operators in (("import", ["r5dgs.load_scene"]), ("export", exports)):
         functions = getattr(blender.types, f"TOPBAR_MT_file_{menu}").draw._draw_funcs

@@ -1,15 +1,17 @@
 """Export formats: the registry, the user's page and a format that the developer's page adds."""
 
+import dataclasses
 import re
 from pathlib import Path
 
 import pytest
 
 from r5dgs_core.cli import main
-from r5dgs_core.formats import registry
+from r5dgs_core.formats import ply, registry
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
 from tests.support import pages
+from tests.support.command_line import complaint
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "user" / "export.md"
 
@@ -35,3 +37,12 @@ def test_the_developers_page_adds_a_format(scene, tmp_path, monkeypatch):
     means = scene_player.frame(scene_file.read(path), 0.5).means
     assert head == "x,y,z" and len(rows) == len(means)
     assert [float(value) for value in rows[7].split(",")] == pytest.approx(means[7], rel=1e-5)
+
+
+def test_a_format_without_its_package_is_refused_with_the_remedy(scene, tmp_path, monkeypatch, capsys):
+    path = scene_file.write(scene, tmp_path / "scene.r5dgs")
+    lacking = dataclasses.replace(ply.FORMAT, extra="tables", packages=("numpy", "no_such_package"))
+    monkeypatch.setattr(ply, "FORMAT", lacking)
+    line = complaint(capsys, "export", path, "--to", "ply", "--out", tmp_path / "a.ply")
+    assert "no_such_package is not installed" in line and "pip install 'r5dgs[tables]'" in line
+    assert not (tmp_path / "a.ply").exists()

@@ -1,0 +1,58 @@
+"""Export of a loaded scene with its edits in any format of the core's registry."""
+
+from pathlib import Path
+
+import bpy
+
+from ...r5dgs_core import errors
+from ...r5dgs_core.formats import registry
+from ..scene import timeline
+from ..ui import plural
+from ..ui.stepwise_operator import Outcome, Step, Steps
+from . import frame_range, gaussians, scene
+
+
+def steps(
+    context: bpy.types.Context,
+    collection: bpy.types.Collection,
+    path: Path,
+    format: registry.Format,
+    which: str,
+    *,
+    every: bool,
+    step: int = 1,
+) -> Steps:
+    """Write the visible objects of a loaded scene with their edits, in the world of the scene file.
+
+    Args:
+        context: Context with the scene's frames; objects hidden in its view layer are left out.
+        collection: Loaded scene.
+        path: Output file; the frame number is appended to its name if each frame is a file of its own.
+        format: Output format.
+        which: Key of `gaussians.WHICH`.
+        every: True for the scene's frame range, False for the current frame.
+        step: Number of frames from one exported frame to the next.
+
+    Raises:
+        ConfigError: Nothing to export is visible at the current frame, or a point cloud has lost its points.
+        SceneFileError: The scene's own file is missing, or a file cannot be written.
+    """
+    wanted, times = gaussians.chosen(context, which), timeline.of_collection(collection)
+    clouds = {one.object for one in gaussians.shown(context.evaluated_depsgraph_get(), wanted)}
+    clouds &= set(collection.all_objects)
+    if not clouds:
+        raise gaussians.nothing_shown(wanted)
+    frames = frame_range.frames_of(context.scene, every, step)
+    numbers = tuple(frames) if every else None
+    at = frames if every else [context.scene.frame_current_final]
+    options = registry.Options(tuple(times.time(frame) for frame in at), numbers)
+    targets = format.paths(path, options)
+    edited = yield from scene.edited_steps(context, collection, clouds, further=len(targets))
+    yield Step(edited.done, edited.done + len(targets), f"writing {targets[0].name}", slow=True)
+    try:
+        for number, target in enumerate(format.write(edited.scene, path, options), edited.done + 1):
+            yield Step(number, edited.done + len(targets), target.name)
+    except OSError as error:
+        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
+    files = path.name if targets == [path] else plural.of(len(targets), "file")
+    return Outcome(f"{files}: {format.label} of {plural.of(len(clouds), 'cloud')}", edited.notes)

@@ -1,0 +1,143 @@
+"""Every format of the core's registry has a button in Blender, and is written with Blender's edits."""
+
+import dataclasses
+import importlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from r5dgs_core.cli import export as export_command
+from r5dgs_core.formats import ply, registry
+from r5dgs_core.scene import scene_file
+from tests.support import layouts, motions, pages, scenes
+
+pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
+
+from mathutils import Matrix  # noqa: E402  (bpy brings it)
+
+
+@pytest.fixture
+def scene_path(tmp_path):
+    made = scenes.make_scene(n=300, objects=3, sh_degree=2, seed=4, world_convention="colmap")
+    return scene_file.write(made, tmp_path / "scene.r5dgs")
+
+
+@pytest.fixture
+def csv(monkeypatch):
+    """Name of the format that the developer's page adds."""
+    pages.load("Export format", "r5dgs_core.formats.csv_points", monkeypatch)
+    monkeypatch.setitem(registry.MODULES, "csv", "csv_points")
+    return "csv"
+
+
+def cloud(collection, name):
+    return next(o for o in motions.clouds(collection) if o.name == name)
+
+
+def drawn(bpy):
+    """Text of the panel."""
+    return layouts.draw(bpy, importlib.import_module("r5dgs.r5dgs_addon.panels.export").R5DGS_PT_export)
+
+
+def drawn_menu(bpy):
+    """Text of the entries in File > Export."""
+    said = []
+    menu = layouts.Layout(bpy, said)
+    importlib.import_module("r5dgs.operators")._menu_export(SimpleNamespace(layout=menu), bpy.context)
+    return said
+
+
+def tooltip(bpy, name):
+    operator = importlib.import_module("r5dgs.operators.export_format").R5DGS_OT_export_format
+    return operator.description(bpy.context, SimpleNamespace(format=name))
+
+
+def rows(path):
+    """Positions in a file of the page's format, sorted. [n, 3]"""
+    return np.sort(np.loadtxt(path, delimiter=",", skiprows=1), axis=0)
+
+
+def test_the_format_of_the_developers_page_appears_in_blender(blender, loaded, csv, tmp_path):
+    assert "Centers (.csv)" in drawn(blender) and "R5DGS Centers (.csv)" in drawn_menu(blender)
+    assert "Keeps: centres of the Gaussians. Not kept: everything else" in tooltip(blender, csv)
+    blender.context.scene.frame_set(13)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(RuntimeError, match="give it a name"):
+        blender.ops.r5dgs.export_format(format=csv)
+    assert sorted(tmp_path.iterdir()) == before
+    assert blender.ops.r5dgs.export_format(format=csv, filepath=str(tmp_path / "a")) == {"FINISHED"}
+    assert blender.context.scene.frame_current == 13
+    time = 12 / loaded.r5dgs.frames_per_unit
+    (wanted,) = export_command.run_export(tmp_path / "scene.r5dgs", csv, tmp_path / "b.csv", t=time)
+    assert (tmp_path / "a.csv").read_bytes() == wanted.read_bytes()
+
+
+def test_without_the_format_there_is_no_button(blender, loaded):
+    said = drawn(blender)
+    assert "Centers (.csv)" not in said and {"Gaussians (.ply)", "Cameras (.json)"} <= set(said)
+    with pytest.raises(TypeError, match="csv"):
+        blender.ops.r5dgs.export_format(format="csv", filepath="a.csv")
+
+
+def test_each_frame_of_the_range_is_a_file(blender, loaded, csv, tmp_path):
+    view = blender.context.scene
+    view.frame_start, view.frame_end = 40, 60
+    options = {"format": csv, "frames": "RANGE", "frame_step": 10}
+    assert blender.ops.r5dgs.export_format(filepath=str(tmp_path / "a.csv"), **options) == {"FINISHED"}
+    for frame in (40, 50, 60):
+        time = (frame - 1) / loaded.r5dgs.frames_per_unit
+        (wanted,) = export_command.run_export(tmp_path / "scene.r5dgs", csv, tmp_path / f"b{frame}.csv", t=time)
+        assert (tmp_path / f"a_{frame:04d}.csv").read_bytes() == wanted.read_bytes()
+    assert sorted(path.name for path in tmp_path.glob("a*")) == ["a_0040.csv", "a_0050.csv", "a_0060.csv"]
+
+
+def test_edits_are_exported_and_hidden_or_unselected_objects_are_not(blender, loaded, tmp_path):
+    mug, car, apple = (cloud(loaded, name) for name in ("mug", "toy car", "red apple"))
+    mug.matrix_local = Matrix.Translation((0.3, -0.2, 0.4)) @ mug.matrix_local @ Matrix.Scale(1.6, 4)
+    mug.r5dgs_look.tint = (0.4, 1.3, 0.8)
+    blender.context.view_layer.update()
+    blender.context.scene.frame_set(46)
+    assert blender.ops.r5dgs.export_scene(filepath=str(tmp_path / "edited.r5dgs"), exact=True) == {"FINISHED"}
+    time = 45 / loaded.r5dgs.frames_per_unit
+    wanted = ply.read(export_command.run_export(tmp_path / "edited.r5dgs", "ply", tmp_path / "wanted.ply", t=time)[0])
+
+    def export(name, **options):
+        path = tmp_path / name
+        assert blender.ops.r5dgs.export_format(filepath=str(path), format="ply", **options) == {"FINISHED"}
+        return ply.read(path)
+
+    def assert_same(found, objects):
+        chosen = np.isin(wanted.object_ids, objects)
+        for name in ("means", "log_scales", "sh", "object_ids"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name)[chosen], err_msg=name)
+
+    everything = np.unique(wanted.object_ids)
+    assert_same(export("all.ply"), everything)
+    car.hide_set(True)
+    assert_same(export("visible.ply"), everything[everything != car.r5dgs.object_id])
+    motions.choose(blender, mug, apple)
+    assert_same(export("selected.ply", which="SELECTED"), [mug.r5dgs.object_id, apple.r5dgs.object_id])
+
+
+def test_without_a_visible_object_nothing_is_written(blender, loaded, csv, tmp_path):
+    for obj in motions.clouds(loaded):
+        obj.hide_set(True)
+    with pytest.raises(RuntimeError, match="expected a visible object"):
+        blender.ops.r5dgs.export_format(format=csv, filepath=str(tmp_path / "a.csv"))
+    assert not (tmp_path / "a.csv").exists()
+
+
+def test_a_format_whose_package_is_missing_is_disabled_with_the_reason(blender, loaded, csv, tmp_path, monkeypatch):
+    module = importlib.import_module("r5dgs_core.formats.csv_points")
+    lacking = dataclasses.replace(module.FORMAT, extra="tables", packages=("numpy", "no_such_package"))
+    monkeypatch.setattr(module, "FORMAT", lacking)
+    enabled = []
+    collected = property(fset=lambda row, value: enabled.append(value))
+    monkeypatch.setattr(layouts.Layout, "enabled", collected, raising=False)
+    assert "Centers (.csv)" in drawn(blender) and enabled == [True, True, False]
+    reason = "no_such_package is not installed; remedy: pip install 'r5dgs[tables]'"
+    assert reason in tooltip(blender, csv)
+    with pytest.raises(RuntimeError) as refused:
+        blender.ops.r5dgs.export_format(format=csv, filepath=str(tmp_path / "a.csv"))
+    assert reason in str(refused.value) and not (tmp_path / "a.csv").exists()
