@@ -11,15 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from . import models, rotations
+from . import levenberg_marquardt, models, rotations, se3
 from .models import MotionModel
 
 # Kinds of `MotionModel` and their free rates, simplest first.
 _FITS = sorted(
     ((name, free) for name, kind in models.KINDS.items() for free in kind.drawn_fits), key=lambda fit: len(fit[1])
 )
-_STEPS = 60
-_DIFFERENCE = 1e-6
 
 
 def fit(
@@ -60,38 +58,25 @@ def pose_errors(
 def _solve(
     kind: str, free: tuple[str, ...], taus: np.ndarray, quats: np.ndarray, displacements: np.ndarray, radius: float
 ) -> MotionModel:
-    """Fit the free rates by Levenberg-Marquardt, starting from `_rates`."""
+    """Fit the free rates by least squares, starting from `_rates`."""
     span = float(taus[-1])
-    rate = {"velocity": radius / span, "acceleration": radius / span**2, "center_offset": radius}
-    rate |= {"angular_velocity": 1 / span, "angular_acceleration": 1 / span**2}
-    units = np.repeat([rate[name] for name in free], 3)
+    units = {"velocity": radius / span, "acceleration": radius / span**2, "center_offset": radius}
+    units |= {"angular_velocity": 1 / span, "angular_acceleration": 1 / span**2}
     first = _rates(taus, quats, displacements)
+    start = np.concatenate([first.get(name, np.zeros(3)) / units[name] for name in free])
 
-    def model_of(x: np.ndarray) -> MotionModel:
-        values: dict[str, Any] = dict(zip(free, np.split(x * units, len(free)), strict=True))
-        return MotionModel(kind, radius=radius, **values)
+    def values(x: np.ndarray) -> dict[str, Any]:
+        parts = np.split(x, len(free), axis=-1)
+        return {name: part * units[name] for name, part in zip(free, parts, strict=True)}
 
-    def errors(x: np.ndarray) -> np.ndarray:
-        q, d = models.evaluate(model_of(x), taus)
-        turns = rotations.quats_to_rotvecs(rotations.multiply(q, rotations.conjugate(quats)))
-        return np.concatenate([(d - displacements) / radius, turns], axis=-1).ravel()
+    def errors(batch: np.ndarray) -> np.ndarray:
+        found, zero = values(batch[:, None]), np.zeros(3)
+        v, a, w, eps, u = (found.get(name, zero) for name in models.RATES)
+        rates = models.Rates(v, a, w, eps, u, frequency=np.zeros((1, 1)))
+        poses = models.KINDS[kind].fitted(rates, zero, zero, taus, None)
+        return se3.differences(poses, (quats, displacements), radius, 1.0)
 
-    x = np.concatenate([first.get(name, np.zeros(3)) for name in free]) / units
-    damping, now = 1e-4, errors(x)
-    for _ in range(_STEPS):
-        size = _DIFFERENCE * max(1.0, float(np.abs(x).max()))
-        jacobian = np.stack([errors(x + size * axis) - now for axis in np.eye(len(x))], axis=-1) / size
-        step = -np.linalg.solve(jacobian.T @ jacobian + damping * np.eye(len(x)), jacobian.T @ now)
-        then = errors(x + step)
-        if (then**2).sum() < (now**2).sum():
-            x, now, damping = x + step, then, max(damping / 10, 1e-12)
-            if np.abs(step).max() < 1e-9 * max(1.0, float(np.abs(x).max())):
-                break
-        else:
-            damping *= 10
-            if damping > 1e6:
-                break
-    return model_of(x)
+    return MotionModel(kind, radius=radius, **values(levenberg_marquardt.solve(errors, start).x))
 
 
 def _rates(taus: np.ndarray, quats: np.ndarray, displacements: np.ndarray) -> dict[str, np.ndarray]:

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import rotations
+from . import robust_weights, rotations
 
-_MAD_TO_SIGMA = 1.4826
 UNDETERMINED_RAD = 0.1
 ALIASED_RAD = np.radians(120.0)
 
@@ -85,11 +84,10 @@ def fit_rigid(
     size = float(np.sqrt(np.sum(current * ((source - center) ** 2).sum(-1))))
     for _ in range(rounds):
         used = residuals[base > 0]
-        median = float(np.median(used))
-        if used.max() <= 4 * median or used.max() <= 1e-12 * max(size, 1e-300):
+        if not robust_weights.has_outliers(used, 1e-12 * max(size, 1e-300)):
             break
-        scale = max(2 * _MAD_TO_SIGMA * median, 1e-9 * max(size, 1e-300))
-        current = base / (1 + (residuals / scale) ** 2)
+        scale = robust_weights.cauchy_scale(used, 1e-9 * max(size, 1e-300))
+        current = robust_weights.reweight(base, residuals, scale)
         current = current / current.sum()
         quat, center, moved, residuals = _kabsch(source, target, current)
 

@@ -68,6 +68,15 @@ def invert(pose: Pose) -> Pose:
     return back, -rotations.rotate(back, pose[1])
 
 
+def differences(a: Pose, b: Pose, length: float, angle: float) -> np.ndarray:
+    """Displacements and rotation vectors from poses ``b`` to poses ``a``, in units of a length and an angle (rad).
+
+    ([..., 4], [..., 3]) -> [..., 6]
+    """
+    turns = rotations.quats_to_rotvecs(rotations.multiply(a[0], rotations.conjugate(b[0])))
+    return np.concatenate([(a[1] - b[1]) / length, turns / angle], axis=-1)
+
+
 def recentre(
     w: Array,  # [..., 3]
     v: Array,  # [..., 3]

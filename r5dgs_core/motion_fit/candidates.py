@@ -11,16 +11,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..motion import models, rotations
+from ..motion import levenberg_marquardt, models, robust_weights, rotations, se3
 
 _SIZES = {"r": 3, "e": 3, "v": 3, "a": 3, "w": 3, "eps": 3, "kappa": 1, "u": 3, "swing": 3, "phase": 1, "pace": 1}
 # Standard deviations of weak priors, in radii and spans, far wider than observed motions. They only constrain
 # directions that the poses leave undetermined (a centre along its own axis, the centre of a body that does not rotate).
 _PRIORS = {"a": 100.0, "eps": 100.0, "kappa": 30.0, "u": 10.0, "swing": 10.0, "phase": 10.0, "pace": 5.0}
-_DIFFERENCE = 1e-5
-_STEPS = 30
-_STEPS_AGAIN = 4  # steps per reweighting round, which starts near the minimum
-_ROUNDS = 8
 _PACES = 25  # number of frequencies tried for an initial guess
 _STARTS = 2  # number of these that are refined
 _GAIN = 9.0  # variances; a frequency that differs from zero by three standard deviations
@@ -138,22 +134,20 @@ class Solution:
         candidate: The candidate.
         theta: Parameters. [P]
         robust: Robust weights of the poses, in [0, 1]. [S]
-        jacobian: Jacobian of the weighted scaled residuals, priors included. [6 S + P, P]
+        normal: Normal matrix of the weighted scaled residuals, priors included. [P, P]
         chi2: Weighted mean of the squared scaled residuals per component.
     """
 
     candidate: Candidate
     theta: np.ndarray
     robust: np.ndarray
-    jacobian: np.ndarray
+    normal: np.ndarray
     chi2: float
 
 
 def residuals(candidate: Candidate, theta: np.ndarray, track: Track, sigmas: tuple[float, float]) -> np.ndarray:
     """Displacement and rotation errors in units of their noise (sigma_t, sigma_r). [B, P] -> [B, S, 6]"""
-    quats, displacements = candidate.poses(theta, track.tau)
-    turn = rotations.quats_to_rotvecs(rotations.multiply(track.quats, rotations.conjugate(quats)))
-    return np.concatenate([(track.displacements - displacements) / sigmas[0], turn / sigmas[1]], axis=-1)
+    return se3.differences((track.quats, track.displacements), candidate.poses(theta, track.tau), *sigmas)
 
 
 def start(candidate: Candidate, track: Track) -> np.ndarray:
@@ -211,9 +205,8 @@ def _sweep(candidate: Candidate, track: Track, path: np.ndarray) -> _Sweep:
         return rates, sizes, (weights * sizes).sum(-1)
 
     _, sizes, misses = fit(track.weights)
-    best = sizes[1 + int(np.argmin(misses[1:]))]
-    scale2 = (2 * 1.4826) ** 2 * max(float(np.median(best)), 1e-18)
-    rates, _, misses = fit(track.weights / (1 + best / scale2))
+    best = np.sqrt(sizes[1 + int(np.argmin(misses[1:]))])
+    rates, _, misses = fit(robust_weights.reweight(track.weights, best, robust_weights.cauchy_scale(best, 1e-9)))
     least = float(misses[1:].min())
     gain = (float(misses[0]) - least) / max(least, 1e-18) * (3 * len(path) - 10)
     return _Sweep(frequencies[1:], rates[1:], misses[1:], gain)
@@ -264,82 +257,30 @@ def _swinging(candidate: Candidate, track: Track, frequency: float, rates: np.nd
 
 
 def solve(candidate: Candidate, track: Track, sigmas: tuple[float, float], first: np.ndarray | None = None) -> Solution:
-    """Fit by Levenberg-Marquardt under a Cauchy loss.
+    """Fit a candidate to poses, robustly.
 
     Args:
         candidate: The family.
         track: The poses.
         sigmas: Noise of displacements (radii) and rotations (rad), which sets their relative weight.
         first: Initial guess, or None for `start`; with a free frequency, for the best of `swinging_starts`. [P]
-
-    Returns:
-        The solution. Weights per pose are 1 / (1 + (rho / c)^2), rho the root mean square of its six scaled residuals
-        and c twice 1.4826 times their median; no reweighting if the largest is below four medians.
     """
     if first is None and candidate.oscillates:
         solutions = [solve(candidate, track, sigmas, guess) for guess in swinging_starts(candidate, track)]
         return min(solutions, key=lambda solution: solution.chi2)
-    theta = start(candidate, track) if first is None else first
-    precision = _prior_precision(candidate)
-    robust = np.ones(len(track.tau))
-    theta, values, jacobian = _levenberg(candidate, track, sigmas, theta, robust, precision, _STEPS)
-    for _ in range(_ROUNDS):
-        size = np.sqrt((values**2).mean(-1))
-        scale = 2 * 1.4826 * float(np.median(size))
-        if size.max() <= 4 * float(np.median(size)) or size.max() < 1e-6:
-            break
-        updated = 1 / (1 + (size / max(scale, 1e-9)) ** 2)
-        settled = np.abs(updated - robust).max() < 1e-3
-        robust = updated
-        theta, values, jacobian = _levenberg(candidate, track, sigmas, theta, robust, precision, _STEPS_AGAIN)
-        if settled:
-            break
-    weights = track.weights * robust
-    chi2 = float((weights[:, None] * values**2).sum() / (6 * weights.sum()))
-    return Solution(candidate, theta, robust, jacobian, chi2)
+    found = levenberg_marquardt.solve(
+        lambda batch: residuals(candidate, batch, track, sigmas),
+        start(candidate, track) if first is None else first,
+        weights=track.weights,
+        precision=_prior_precision(candidate),
+        robust=True,
+    )
+    weights = track.weights * found.robust
+    chi2 = float((weights[:, None] * found.residuals**2).sum() / (6 * weights.sum()))
+    return Solution(candidate, found.x, found.robust, found.normal, chi2)
 
 
 def _prior_precision(candidate: Candidate) -> np.ndarray:
     """Inverse standard deviations of the weak priors. [P]"""
     parts = [np.full(_SIZES[b], 1 / _PRIORS[b] if b in _PRIORS else 0.0) for b in ("r", "e", *candidate.blocks)]
     return np.concatenate(parts)
-
-
-def _levenberg(
-    candidate: Candidate,
-    track: Track,
-    sigmas: tuple[float, float],
-    theta: np.ndarray,
-    robust: np.ndarray,
-    precision: np.ndarray,
-    steps: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Minimise with fixed weights; return parameters [P], unweighted residuals [S, 6] and the Jacobian."""
-    count = len(theta)
-    root = np.sqrt(track.weights * robust)[:, None]
-    offsets = np.concatenate([np.zeros((1, count)), _DIFFERENCE * np.eye(count), -_DIFFERENCE * np.eye(count)])
-    damping = 1e-4
-    values = residuals(candidate, theta[None], track, sigmas)[0]
-    cost = float(((root * values) ** 2).sum() + ((precision * theta) ** 2).sum())
-    jacobian = np.zeros((values.size + count, count))
-    for _ in range(steps):
-        batch = residuals(candidate, theta + offsets, track, sigmas)
-        slopes = (batch[1 : count + 1] - batch[count + 1 :]) / (2 * _DIFFERENCE)
-        jacobian = np.concatenate([(slopes * root).reshape(count, -1).T, np.diag(precision)])
-        right = -jacobian.T @ np.concatenate([(root * batch[0]).reshape(-1), precision * theta])
-        normal = jacobian.T @ jacobian
-        diagonal = np.diag(normal) + 1e-12 * max(float(np.trace(normal)), 1e-300)
-        gain, size = -1.0, 0.0
-        for _ in range(8):
-            step = np.linalg.solve(normal + np.diag(damping * diagonal), right)
-            trial = residuals(candidate, (theta + step)[None], track, sigmas)[0]
-            trial_cost = float(((root * trial) ** 2).sum() + ((precision * (theta + step)) ** 2).sum())
-            if np.isfinite(trial_cost) and trial_cost <= cost:
-                gain, size = cost - trial_cost, float(np.abs(step).max())
-                theta, values, cost = theta + step, trial, trial_cost
-                break
-            damping = min(damping * 10, 1e12)
-        damping = max(damping * 0.1, 1e-12)
-        if gain <= 1e-6 * cost or size < 1e-12:
-            break
-    return theta, values, jacobian

@@ -265,14 +265,13 @@ def _noise(track: Track, family: tuple[Candidate, ...]) -> tuple[tuple[float, fl
         )
     ]
     best: tuple[float, Solution, np.ndarray] | None = None
-    swung: dict[str, np.ndarray] = {}
+    starts: dict[str, np.ndarray] = {}
     sigmas = (1.0, 1.0)
     for _ in range(2):
         best = None
         for candidate in wide:
-            solution = families.solve(candidate, track, sigmas, swung.get(candidate.name))
-            if candidate.oscillates:
-                swung[candidate.name] = solution.theta
+            solution = families.solve(candidate, track, sigmas, starts.get(candidate.name))
+            starts[candidate.name] = solution.theta
             values = families.residuals(candidate, solution.theta[None], track, (1.0, 1.0))[0]
             dof = max(6 * len(track.tau) - candidate.parameters, 1) / (6 * len(track.tau))
             level = solution.chi2 / dof
@@ -354,7 +353,7 @@ def _covariance(solution: Solution, track: Track, sigmas: tuple[float, float]) -
     energy = float((values**2).sum())
     lag = float((values[1:] * values[:-1]).sum()) / energy if energy > 0 else 0.0
     rho = min(max(lag + (size / 6 + 1) / count, 0.0), 0.9)
-    return s2 * (1 + rho) / (1 - rho) * np.linalg.pinv(solution.jacobian.T @ solution.jacobian, hermitian=True)
+    return s2 * (1 + rho) / (1 - rho) * np.linalg.pinv(solution.normal, hermitian=True)
 
 
 def _band(

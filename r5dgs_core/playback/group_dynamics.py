@@ -11,7 +11,16 @@ import functools
 
 import numpy as np
 
-from ..motion import key_reduction, models, rigid_fit, rotations, se3, twist_propagation
+from ..motion import (
+    key_reduction,
+    levenberg_marquardt,
+    models,
+    rigid_fit,
+    robust_weights,
+    rotations,
+    se3,
+    twist_propagation,
+)
 from ..motion.models import STATIC, MotionModel
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
@@ -222,11 +231,10 @@ def _screw(
         open_axes = (values <= floor) | (variance > doubt**2 * np.maximum(values, floor))
         w = axes @ np.where(open_axes, axes.T @ guess, axes.T @ w)
         distances = np.linalg.norm(u - rotations.cross(w, x), axis=-1)
-        median = float(np.median(distances))
-        if remaining == 0 or distances.max() <= 4 * median or distances.max() <= 1e-12 * np.abs(speeds).max():
+        largest = float(np.abs(speeds).max())
+        if remaining == 0 or not robust_weights.has_outliers(distances, 1e-12 * largest):
             break
-        scale = max(2 * 1.4826 * median, 1e-9 * float(np.abs(speeds).max()))
-        current = weights / (1 + (distances / scale) ** 2)
+        current = robust_weights.reweight(weights, distances, robust_weights.cauchy_scale(distances, 1e-9 * largest))
         current = current / current.sum()
     return mean - rotations.cross(w, center), w
 
@@ -249,28 +257,15 @@ def _kabsch(
 def _fit_twist(
     taus: np.ndarray, quats: np.ndarray, displacements: np.ndarray, guess: np.ndarray, radius: float
 ) -> np.ndarray:
-    """Fit the twist v, a, w, e to poses by Levenberg-Marquardt from an initial guess. [12]"""
+    """Fit the twist v, a, w, e to poses by least squares from an initial guess. [12]"""
     span = float(taus[-1])
     units = np.repeat([radius / span, radius / span**2, 1 / span, 1 / span**2], 3)
 
-    def errors(batch: np.ndarray) -> np.ndarray:  # [B, 12] -> [B, 6 K], in radii
+    def errors(batch: np.ndarray) -> np.ndarray:  # [B, 12] -> [B, K, 6], in radii
         v, a, w, e = (part[:, None] for part in np.split(batch * units, 4, axis=-1))
         durations = np.broadcast_to(taus, (len(batch), len(taus)))
         needed = se3.steps_needed(w, v, e, a, durations, radius, _TOLERANCE * radius)
-        q, d = se3.integrate(w, v, e, a, durations, int(min(needed.max(), twist_propagation.MAX_STEPS)))
-        turns = rotations.quats_to_rotvecs(rotations.multiply(q, rotations.conjugate(quats)))
-        return np.concatenate([(d - displacements) / radius, turns], axis=-1).reshape(len(batch), -1)
+        steps = int(min(needed.max(), twist_propagation.MAX_STEPS))
+        return se3.differences(se3.integrate(w, v, e, a, durations, steps), (quats, displacements), radius, 1.0)
 
-    x, damping = guess / units, 1e-6
-    for _ in range(20):
-        found = errors(np.concatenate([x[None], x + 1e-6 * np.eye(12)]))
-        jacobian = (found[1:] - found[0]).T / 1e-6
-        step = -np.linalg.solve(jacobian.T @ jacobian + damping * np.eye(12), jacobian.T @ found[0])
-        better = float((errors((x + step)[None]) ** 2).sum()) < float((found[0] ** 2).sum())
-        if better:
-            x, damping = x + step, max(damping / 10, 1e-12)
-        else:
-            damping *= 10
-        if np.abs(step).max() < 1e-9 or damping > 1e3:
-            break
-    return x * units
+    return levenberg_marquardt.solve(errors, guess / units, steps=20).x * units
