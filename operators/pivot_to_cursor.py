@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..r5dgs_addon.motion import duplicate_delete, physics, pivot
+from ..r5dgs_addon.motion import duplicate_delete, motion_fields, physics, pivot
 from ..r5dgs_core import errors
 
 
@@ -27,7 +27,7 @@ class R5DGS_OT_pivot_to_cursor(bpy.types.Operator):
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        physics.write_at_once(anchor.r5dgs_motion, context)
+        motion_fields.write_at_once(anchor.r5dgs_motion, context)
         then = "" if physics.is_written(anchor) else "; Re-Extrapolate writes it to the keys"
         self.report({"INFO"}, f"{anchor.name}: pivot at the 3D cursor{then}")
         return {"FINISHED"}

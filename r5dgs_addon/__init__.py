@@ -3,7 +3,7 @@
 from . import panels, preferences
 from .engine import engine, live_preview, render_notes, render_stats
 from .language import prompt_state
-from .motion import exact_mode, extrapolate, physics, pivot
+from .motion import exact_mode, extrapolate, motion_fields, pivot
 from .scene import click_select, evaluated_points, object_names, object_tint, properties, relink
 from .worker import jobs
 
@@ -12,7 +12,7 @@ MODULES = (
     object_tint,
     object_names,
     prompt_state,
-    physics,
+    motion_fields,
     extrapolate,
     pivot,
     exact_mode,

@@ -102,41 +102,15 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         SceneFileError: The scene has no Gaussians, or is too small for Blender's F-curves.
         ConfigError: The end of extrapolation is too many frames away.
     """
-    if len(scene.gaussians.means) == 0:
-        raise errors.SceneFileError(
-            f"{path}: expected Gaussians, found none; bake a run that was trained, or choose another file"
-        )
-    size = max(scene.extent, float(np.exp(scene.gaussians.log_scales.max())))
-    if size < SMALLEST:
-        factor = 10.0 ** -math.floor(math.log10(size))
-        raise errors.SceneFileError(
-            f"{path}: expected a scene of {SMALLEST:g} units or more, as Blender's animation has no finer steps than "
-            f"1e-7, found {size:.3g}; multiply the positions of the data set's cameras by {factor:g} and train again"
-        )
+    _check_size(scene, path)
     times = timeline.Times.of(scene, options.frame_zero, options.t_end)
     timeline.check_end(path.name, times)
     with loaded_scenes.nothing_left_after_error():
         collection = bpy.data.collections.new(object_names.fit(f"R5DGS {scene.name}"))
         context.scene.collection.children.link(collection)
-        extent = scene.extent
         root = _root(collection, scene, options.world_convention or scene.world_convention)
         _describe(collection, scene, path, root, times)
-        material = point_clouds.material(object_names.fit(f"R5DGS {scene.name}"))
-        parts = ranges(scene)
-        largest: dict[int, Range] = {}
-        for part in parts:
-            largest[part.object_id] = max(largest.get(part.object_id, part), part, key=lambda own: own.count)
-        children = {}
-        for object_id in sorted({part.object_id for part in parts}):
-            children[object_id] = bpy.data.collections.new(object_names.fit(object_name(scene, object_id)))
-            collection.children.link(children[object_id])
-        anchors = {}
-        for part in homes(scene, parts):
-            anchors[_anchor_key(part)] = _anchor(children[part.object_id], root, scene, part, largest, extent)
-        for part, data in zip(parts, compat.new_point_clouds([part.count for part in parts]), strict=True):
-            point_clouds.fill(data, scene, slice(part.start, part.start + part.count), extent, options.sh_degree)
-            data.materials.append(material)
-            _cloud(children[part.object_id], anchors[_anchor_key(part)], scene, part, largest, data)
+        anchors = _objects(collection, root, scene, options.sh_degree)
         viewport_display.show(collection, options.display)
         reaches = keyframes.reaches(scene)
         for (_, motion_id), anchor in anchors.items():
@@ -151,6 +125,44 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
     root.select_set(True)
     context.view_layer.objects.active = root
     return collection
+
+
+def _check_size(scene: Scene, path: Path) -> None:
+    """Raise a SceneFileError if a scene has no Gaussians, or is too small for Blender's F-curves."""
+    if len(scene.gaussians.means) == 0:
+        raise errors.SceneFileError(
+            f"{path}: expected Gaussians, found none; bake a run that was trained, or choose another file"
+        )
+    size = max(scene.extent, float(np.exp(scene.gaussians.log_scales.max())))
+    if size < SMALLEST:
+        factor = 10.0 ** -math.floor(math.log10(size))
+        raise errors.SceneFileError(
+            f"{path}: expected a scene of {SMALLEST:g} units or more, as Blender's animation has no finer steps than "
+            f"1e-7, found {size:.3g}; multiply the positions of the data set's cameras by {factor:g} and train again"
+        )
+
+
+def _objects(
+    collection: bpy.types.Collection, root: bpy.types.Object, scene: Scene, sh_degree: int
+) -> dict[tuple[int, int], bpy.types.Object]:
+    """Create the collections of the objects with their anchors and point clouds. Returns the anchors."""
+    parts, extent = ranges(scene), scene.extent
+    largest: dict[int, Range] = {}
+    for part in parts:
+        largest[part.object_id] = max(largest.get(part.object_id, part), part, key=lambda own: own.count)
+    material = point_clouds.material(object_names.fit(f"R5DGS {scene.name}"))
+    children = {}
+    for object_id in sorted({part.object_id for part in parts}):
+        children[object_id] = bpy.data.collections.new(object_names.fit(object_name(scene, object_id)))
+        collection.children.link(children[object_id])
+    anchors = {}
+    for part in homes(scene, parts):
+        anchors[_anchor_key(part)] = _anchor(children[part.object_id], root, scene, part, largest, extent)
+    for part, data in zip(parts, compat.new_point_clouds([part.count for part in parts]), strict=True):
+        point_clouds.fill(data, scene, slice(part.start, part.start + part.count), extent, sh_degree)
+        data.materials.append(material)
+        _cloud(children[part.object_id], anchors[_anchor_key(part)], scene, part, largest, data)
+    return anchors
 
 
 def object_name(scene: Scene, object_id: int) -> str:

@@ -158,11 +158,7 @@ def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[Ste
         survey = captured_objects.survey(context, plan.frames, overrides)
         objects = captured_objects.choose(context.view_layer, survey, settings.objects, settings.object_collection)
         highest = max(o.id for o in objects)
-        if highest > MAX_OBJECTS:
-            raise errors.ConfigError(
-                f"capture: expected ids up to {MAX_OBJECTS}, Blender's highest pass index, found up to {highest}; "
-                "join objects, or choose fewer by collection"
-            )
+        _check_ids(highest)
         captured_objects.assign_ids(objects, overrides)
         views = cameras.choose(context, settings, captured_objects.bounds(survey, objects), overrides)
         temporary = render.prepare(context, settings, overrides)
@@ -194,6 +190,14 @@ def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[Ste
         objects={o.id: o.name for o in objects},
         unseen=tuple(o.name for o in objects if o.id not in seen),
     )
+
+
+def _check_ids(highest: int) -> None:
+    if highest > MAX_OBJECTS:
+        raise errors.ConfigError(
+            f"capture: expected ids up to {MAX_OBJECTS}, Blender's highest pass index, found up to {highest}; "
+            "join objects, or choose fewer by collection"
+        )
 
 
 def _jobs(plan: TimePlan, views: cameras.Views, test_views: int) -> Iterator[tuple[str, float, cameras.View]]:

@@ -11,7 +11,7 @@ from ...r5dgs_core import errors
 from ...r5dgs_core.motion import confidence, models
 from .. import compat
 from ..scene import timeline
-from . import fcurves, physics
+from . import curve_place, fcurves, physics
 
 _MOST_STEPS = 1 << 16  # maximum integration steps of a path, because its uncertainty takes hundreds of integrations
 STEPS = 32  # number of rings past t_max
@@ -93,7 +93,7 @@ def path(anchor: bpy.types.Object, times: timeline.Times) -> tuple[np.ndarray, n
         ConfigError: The motion is too fast to integrate, or the F-curves cannot be read.
     """
     tau = np.linspace(0.0, times.t_end - times.t_max, STEPS + 1)
-    start, _ = fcurves.pose_at(anchor, fcurves.place(anchor), times.frame(times.t_max))
+    start, _ = fcurves.pose_at(anchor, curve_place.find(anchor), times.frame(times.t_max))
     follow = physics.follow_matrix(anchor.r5dgs_motion)
     model = physics.model(physics.mover(anchor))
     if models.steps_needed(model, tau[-1:])[0] > _MOST_STEPS:

@@ -7,7 +7,7 @@ import numpy as np
 
 from .. import compat
 from ..scene import loaded_scenes
-from . import confidence_tubes, extrapolate, fcurves, physics
+from . import confidence_tubes, curve_place, extrapolate, physics
 
 
 def anchor_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
@@ -67,7 +67,7 @@ def duplicate(
     """
     everyone = [*anchors, *(extrapolate.followers(anchors) if shadows else ())]
     for anchor in everyone:
-        fcurves.check_local(anchor)
+        curve_place.check_local(anchor)
     homes = {anchor: extrapolate.scene_of(anchor) for anchor in everyone}
     copies: dict[bpy.types.Object, bpy.types.Object] = {}
     with loaded_scenes.nothing_left_after_error():
@@ -132,7 +132,7 @@ def delete(context: bpy.types.Context, anchors: list[bpy.types.Object], shadows:
     """
     everyone = [*anchors, *(extrapolate.followers(anchors) if shadows else ())]
     for anchor in everyone:
-        fcurves.check_local(anchor)
+        curve_place.check_local(anchor)
     names = [anchor.name for anchor in everyone]
     removed = [obj for anchor in everyone for obj in (anchor, *clouds_of(anchor))]
     collections = {home for obj in removed for home in obj.users_collection}

@@ -6,31 +6,19 @@ the points. Edits of points are transferred to the bind state. Handlers are inst
 """
 
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
-import numpy as np
 from bpy.app.handlers import persistent
 from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from ...r5dgs_core import errors
-from ...r5dgs_core.editing import point_edits
-from ...r5dgs_core.motion import quaternion_columns
-from ...r5dgs_core.playback import residuals
 from ...r5dgs_core.playback.residuals import Residuals
 from ...r5dgs_core.scene import scene_file
 from ..engine import render_request
-from ..scene import file_cache, loaded_scenes, point_clouds, timeline
-
-BIND = point_clouds.BIND
-PARTS = (
-    ("position", "FLOAT_VECTOR", "vector", 3),
-    ("rotation", "QUATERNION", "value", 4),
-    ("scale", "FLOAT_VECTOR", "vector", 3),
-)
-
-_WRITTEN = "r5dgs_exact_written"  # custom property of point clouds: fingerprints and time of the written attributes
+from ..scene import file_cache, loaded_scenes, timeline
+from . import exact_points
+from .exact_points import File
 
 _log = logging.getLogger(__name__)
 _told: set[str] = set()  # errors already logged
@@ -44,26 +32,17 @@ class R5DGS_PG_exact(bpy.types.PropertyGroup):
     problem: StringProperty(name="Problem", description="Error that prevents the residual motion", options={"HIDDEN"})
 
 
-@dataclass(frozen=True)
-class _File:
-    """Residuals and centres of a scene file. means [N, 3]"""
-
-    bending: Residuals
-    means: np.ndarray
-
-
-def _read_file(path: Path) -> _File:
+def _read_file(path: Path) -> File:
     scene = scene_file.read(path)
-    return _File(residuals.Residuals(scene), scene.gaussians.means)
+    return File(Residuals(scene), scene.gaussians.means)
 
 
 # Quoted: `typing` would keep the class, and thus this module, alive until after Blender's exit, which crashes.
-_files: "file_cache.Remembered[_File]" = file_cache.Remembered(_read_file)
-_turns: dict[int, tuple[str, tuple[np.ndarray, np.ndarray] | None]] = {}  # cache by session_uid, see `_turn_of`
+_files: "file_cache.Remembered[File]" = file_cache.Remembered(_read_file)
 
 
-def residuals_of(collection: bpy.types.Collection, again: bool = False) -> Residuals:
-    """Return the residuals of a loaded scene. The file is read once per version.
+def _file_of(collection: bpy.types.Collection, again: bool = False) -> File:
+    """Return the file of a loaded scene. It is read once per version.
 
     Args:
         collection: Loaded scene.
@@ -72,10 +51,6 @@ def residuals_of(collection: bpy.types.Collection, again: bool = False) -> Resid
     Raises:
         SceneFileError: The file is missing, not trusted (`trust`), unreadable, or that of another scene.
     """
-    return _file_of(collection, again).bending
-
-
-def _file_of(collection: bpy.types.Collection, again: bool = False) -> _File:
     path = render_request.scene_path(collection)
     found = _files.get(path, again)
     if len(found.means) != collection.r5dgs.gaussians:
@@ -95,8 +70,8 @@ def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> i
     """
     if collection.library is not None or any(c.data.library for c in loaded_scenes.members(collection, "CLOUD")):
         raise errors.ConfigError(f"{collection.name}: its points lie in another .blend file; append the scene instead")
-    bending = residuals_of(collection, again=True)
-    if len(bending.rows) == 0:
+    count = len(_file_of(collection, again=True).bending.rows)
+    if not count:
         raise errors.ConfigError(f"{collection.name}: every object moves as a whole; there is nothing more to play")
     state = collection.r5dgs_exact
     if not state.enabled:
@@ -105,14 +80,14 @@ def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> i
     context.scene.render.use_lock_interface = True
     apply(collection, context.scene.frame_current_final)
     listen()
-    return len(bending.rows)
+    return count
 
 
 def switch_off(context: bpy.types.Context, collection: bpy.types.Collection) -> None:
     """Disable Exact Mode: restore the bind state, and remove the handlers if no other scene uses them."""
     state = collection.r5dgs_exact
     for cloud in loaded_scenes.members(collection, "CLOUD"):
-        _give_back(cloud.data)
+        exact_points.give_back(cloud.data)
     if state.enabled and not state.locked:
         context.scene.render.use_lock_interface = False
     state.enabled, state.problem = False, ""
@@ -127,158 +102,9 @@ def apply(collection: bpy.types.Collection, frame: float) -> None:
     """
     file = _file_of(collection)
     t = timeline.of_collection(collection).time(frame)
-    done = set()
-    for cloud in loaded_scenes.members(collection, "CLOUD"):
-        if cloud.data in done or cloud.data.library is not None:
-            continue
-        done.add(cloud.data)
-        rows = _rows(cloud.data)
-        points, part = _bending_points(rows, file.bending)
-        if len(points) == 0:
-            continue
-        bind = _bind_state(cloud.data)
-        _keep_edits(cloud.data, file, rows, points, part, bind)
-        bent = _bend(bind, file.bending, t, points, part, _turn_of(cloud.data, file.means, rows, bind["position"]))
-        for name, _, field, _ in PARTS:
-            cloud.data.attributes[name].data.foreach_set(field, bent[name].ravel())
-        cloud.data[_WRITTEN] = {"t": t, **{name: point_clouds.fingerprint(values) for name, values in bent.items()}}
-        cloud.data.update_tag()
-
-
-def _rows(cloud: bpy.types.PointCloud) -> np.ndarray:
-    """Scene file row of each point, or an empty array if the attribute is missing. [n]"""
-    named = point_clouds.attribute(cloud, point_clouds.ROW, "INT")
-    return np.zeros(0, np.int32) if named is None else point_clouds.read(named, "value", 1, np.int32)[:, 0]
-
-
-def _bending_points(rows: np.ndarray, bending: Residuals) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the points with residuals, and of those residuals. [n], [n]"""
-    if len(bending.rows) == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    part = np.minimum(np.searchsorted(bending.rows, rows), len(bending.rows) - 1)
-    points = np.flatnonzero(bending.rows[part] == rows)
-    return points, part[points]
-
-
-def _bend(
-    values: dict[str, np.ndarray],
-    bending: Residuals,
-    t: float,
-    points: np.ndarray,
-    part: np.ndarray,
-    turn: tuple[np.ndarray, np.ndarray] | None,
-    back: bool = False,
-) -> dict[str, np.ndarray]:
-    """Apply the residual motion at a time to points, or undo it. Returns new arrays."""
-    values, found = {name: array.copy() for name, array in values.items()}, bending.at(t)
-    if found is None:
-        return values
-    offsets, turns, growths = (array[:, part] for array in found)
-    if turn is not None:
-        linear, carried = turn
-        offsets = np.where(carried[points], linear @ offsets, offsets)
-    if back:
-        offsets, turns, growths = -offsets, turns * [[1], [-1], [-1], [-1]], -growths
-    values["position"][points] += offsets.T
-    values["rotation"][points] = quaternion_columns.multiply(turns.astype(np.float32), values["rotation"][points].T).T
-    values["scale"][points] *= np.exp(growths.T)
-    return values
-
-
-def _turn_of(
-    cloud: bpy.types.PointCloud, means: np.ndarray, rows: np.ndarray, position: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Find the linear map that residuals follow after *Apply Transform*, as `point_edits` does for rendering.
-
-    Args:
-        cloud: Point cloud.
-        means: Centres in the scene file. [N, 3]
-        rows: Scene file row of each point. [n]
-        position: Centres in the bind state. [n, 3]
-
-    Returns:
-        Linear map [3, 3] and mask of the transformed points [n], or None if nothing was transformed.
-    """
-    stored = point_clouds.fingerprints(cloud)
-    now = point_clouds.fingerprint(position)
-    if stored.get("position") in (None, now) or not ((rows >= 0) & (rows < len(means))).all():
-        return None
-    shapes = [cloud.attributes[BIND + name] for name in ("rotation", "scale")]
-    for attribute, (name, _, field, width) in zip(shapes, PARTS[1:], strict=True):
-        if point_clouds.fingerprint(point_clouds.view(attribute, field, width)) != stored.get(name):
-            return None
-    if _turns.get(cloud.session_uid, ("",))[0] != now:
-        found = point_edits.affine_between(means[rows], position)
-        linear = None if found is None else found[0][:3, :3]
-        carried = (means[rows] != position).any(-1)
-        _turns[cloud.session_uid] = now, None if linear is None else (linear, carried)
-    return _turns[cloud.session_uid][1]
-
-
-def _is_edited(cloud: bpy.types.PointCloud) -> bool:
-    """Return True if points differ from those written by `apply`."""
-    written = cloud.get(_WRITTEN)
-    if written is None:
-        return False
-    every = ((point_clouds.attribute(cloud, name, kind), name, field, width) for name, kind, field, width in PARTS)
-    return any(
-        found is not None and point_clouds.fingerprint(point_clouds.view(found, field, width)) != written[name]
-        for found, name, field, width in every
-    )
-
-
-def _keep_edits(
-    cloud: bpy.types.PointCloud,
-    file: _File,
-    rows: np.ndarray,
-    points: np.ndarray,
-    part: np.ndarray,
-    bind: dict[str, np.ndarray],
-) -> None:
-    """Transfer edits of the points since `apply` to the bind state ``bind``, in place."""
-    if not _is_edited(cloud):
-        return
-    turn, t = _turn_of(cloud, file.means, rows, bind["position"]), cloud[_WRITTEN]["t"]
-    written = _bend(bind, file.bending, t, points, part, turn)
-    now = {name: point_clouds.read(cloud.attributes[name], field, width) for name, _, field, width in PARTS}
-    back = _bend(now, file.bending, t, points, part, turn, back=True)
-    found = point_edits.affine_between(written["position"], now["position"])
-    if found is not None:  # offsets of the map, too
-        matrix, inside = found
-        back["position"][inside] = bind["position"][inside] @ matrix[:3, :3].T + matrix[:3, 3]
-    for name, _, field, _ in PARTS:
-        changed = (now[name] != written[name]).any(-1)
-        bind[name][changed] = back[name][changed]
-        cloud.attributes[BIND + name].data.foreach_set(field, bind[name].ravel())
-
-
-def _bind_state(cloud: bpy.types.PointCloud) -> dict[str, np.ndarray]:
-    """Bind state of a point cloud's points, stored in attributes on the first call: position, rotation, scale."""
-    result = {}
-    for name, kind, field, width in PARTS:
-        values = np.empty(width * len(cloud.points), np.float32)
-        kept = cloud.attributes.get(BIND + name)
-        if kept is None:
-            cloud.attributes[name].data.foreach_get(field, values)
-            kept = cloud.attributes.new(BIND + name, kind, "POINT")
-            kept.data.foreach_set(field, values)
-        else:
-            kept.data.foreach_get(field, values)
-        result[name] = values.reshape(-1, width)
-    return result
-
-
-def _give_back(cloud: bpy.types.PointCloud) -> None:
-    for name, _, field, width in PARTS:
-        kept = cloud.attributes.get(BIND + name)
-        if kept is None:
-            continue
-        values = np.empty(width * len(cloud.points), np.float32)
-        kept.data.foreach_get(field, values)
-        cloud.attributes[name].data.foreach_set(field, values)
-        cloud.attributes.remove(cloud.attributes[BIND + name])
-    cloud.pop(_WRITTEN, None)
-    cloud.update_tag()
+    for cloud in dict.fromkeys(obj.data for obj in loaded_scenes.members(collection, "CLOUD")):
+        if cloud.library is None:
+            exact_points.write(cloud, file, t)
 
 
 def _exact_scenes() -> list[bpy.types.Collection]:
@@ -299,7 +125,7 @@ def _follow_edits(scene, depsgraph=None):
         return
     for collection in _exact_scenes():
         members = loaded_scenes.members(collection, "CLOUD")
-        if any((one in updated or one.data in updated) and _is_edited(one.data) for one in members):
+        if any((one in updated or one.data in updated) and exact_points.is_edited(one.data) for one in members):
             _try(collection, scene.frame_current_final)
 
 
@@ -362,7 +188,7 @@ def unregister():
         if handler in events:
             events.remove(handler)
     _files.clear()
-    _turns.clear()
+    exact_points.forget()
     _told.clear()
     del bpy.types.Collection.r5dgs_exact
     bpy.utils.unregister_class(R5DGS_PG_exact)

@@ -19,7 +19,7 @@ from ...r5dgs_core.scene import scene_file
 from ...r5dgs_core.scene.scene import Scene
 from .. import compat
 from ..scene import loaded_scenes, timeline
-from . import confidence_tubes, fcurves, keyframes, physics
+from . import confidence_tubes, curve_place, fcurves, keyframes, motion_fields, physics
 
 MOST_STEPS = 1024  # maximum integration steps per observed span; exceeded only by orbits about far-away points
 
@@ -37,7 +37,7 @@ class Plan:
     """
 
     anchor: bpy.types.Object
-    place: fcurves.Place
+    place: curve_place.Place
     times: timeline.Times
     tails: dict[str, Keys]
     too_fast: bool
@@ -86,7 +86,7 @@ def _plans(anchors: list[bpy.types.Object], t_end: float | None) -> list[Plan]:
 
 
 def _plan(anchor: bpy.types.Object, t_end: float | None, most: int) -> Plan:
-    times, place = times_of(anchor, t_end), fcurves.place(anchor)
+    times, place = times_of(anchor, t_end), curve_place.find(anchor)
     location, quat = fcurves.pose_at(anchor, place, times.frame(times.t_max))
     tails, too_fast = {}, False
     if times.t_end > times.t_max:
@@ -104,8 +104,8 @@ def _plan(anchor: bpy.types.Object, t_end: float | None, most: int) -> Plan:
 def _apply(plan: Plan) -> None:
     anchor, place = plan.anchor, plan.place
     if place.strip is None and place.action is not None:
-        fcurves.make_own(anchor)
-        place = fcurves.place(anchor)
+        curve_place.make_own(anchor)
+        place = curve_place.find(anchor)
     fcurves.replace_after(anchor, place, plan.times.frame(plan.times.t_max), plan.tails)
     physics.sign(anchor, plan.times)
     anchor.r5dgs_motion.too_fast = plan.too_fast
@@ -217,7 +217,7 @@ def check(anchors: list[bpy.types.Object], curves: bool = True) -> None:
         curves: True if they keep their curves up to t_max, which must then be possible to split there.
     """
     for anchor in [*anchors, *followers(anchors)]:
-        times, place = times_of(anchor), fcurves.place(anchor)
+        times, place = times_of(anchor), curve_place.find(anchor)
         if curves or anchor not in anchors:
             fcurves.pose_at(anchor, place, times.frame(times.t_max))
         leader = anchor.r5dgs_motion.learned_leader if anchor in anchors else None
@@ -236,7 +236,7 @@ def source(anchors: list[bpy.types.Object], path: Path) -> Scene:
         R5dgsError: The file cannot be read or is that of another scene, or an anchor cannot be written.
     """
     for anchor in anchors:
-        if fcurves.place(anchor).strip is not None:
+        if curve_place.find(anchor).strip is not None:
             raise errors.ConfigError(f"{anchor.name}: its action lies in the NLA; make it active again first")
     scene = scene_file.read(path)
     for anchor in anchors:
@@ -258,8 +258,8 @@ def reload(anchors: list[bpy.types.Object], scene: Scene) -> None:
     """
     for anchor in anchors:
         times = times_of(anchor)
-        fcurves.make_own(anchor)
-        place = fcurves.place(anchor)
+        curve_place.make_own(anchor)
+        place = curve_place.find(anchor)
         clear(anchor, place)
         anchor.location, anchor.rotation_quaternion = anchor.r5dgs.pivot, (1.0, 0.0, 0.0, 0.0)
         allowed, reach = physics.key_error(anchor)
@@ -270,7 +270,7 @@ def reload(anchors: list[bpy.types.Object], scene: Scene) -> None:
         confidence_tubes.refresh(anchor, times)
 
 
-def clear(anchor: bpy.types.Object, place: fcurves.Place) -> None:
+def clear(anchor: bpy.types.Object, place: curve_place.Place) -> None:
     """Remove an anchor's location and rotation curves."""
     curves = place.curves()
     if not curves:
@@ -282,9 +282,9 @@ def clear(anchor: bpy.types.Object, place: fcurves.Place) -> None:
 
 def register():
     """Re-extrapolate an anchor when its fields change."""
-    physics.call_on_change(re_extrapolate)
+    motion_fields.call_on_change(re_extrapolate)
 
 
 def unregister():
     """Undo `register`."""
-    physics.call_on_change(None)
+    motion_fields.call_on_change(None)

@@ -7,7 +7,6 @@ it is split there without changing its shape.
 """
 
 import hashlib
-from dataclasses import dataclass
 
 import bpy
 import numpy as np
@@ -18,88 +17,10 @@ from ...r5dgs_core.motion.key_reduction import Keys
 from .. import compat
 from ..scene import timeline
 from . import keyframes
+from .curve_place import COMPONENTS, Place
 
 AT = 1e-3  # tolerance in frames for a key to count as being at a frame
-COMPONENTS = (("location", 3), ("rotation_quaternion", 4))
 _CUT = ("BEZIER", "LINEAR", "CONSTANT")  # interpolations of segments that can be split
-
-
-@dataclass(frozen=True)
-class Place:
-    """Location of the F-curves that move an anchor.
-
-    Attributes:
-        action: Action with the curves, or None.
-        slot: Slot of the action, or None if actions have no slots.
-        strip: NLA strip that plays the action, or None for the active action.
-    """
-
-    action: bpy.types.Action | None
-    slot: object
-    strip: bpy.types.NlaStrip | None = None
-
-    def curves(self) -> dict[tuple[str, int], bpy.types.FCurve]:
-        """Location and rotation curves by data path and component."""
-        if self.action is None:
-            return {}
-        paths = {path for path, _ in COMPONENTS}
-        found = compat.channels(self.action, self.slot)
-        return {(c.data_path, c.array_index): c for c in found if c.data_path in paths}
-
-
-def place(anchor: bpy.types.Object) -> Place:
-    """Find the curves that currently move an anchor.
-
-    Raises:
-        ConfigError: The curves cannot be written; the message gives the reason and the remedy.
-    """
-    name = anchor.name
-    check_local(anchor)
-    if anchor.rotation_mode != "QUATERNION":
-        raise errors.ConfigError(
-            f"{name}: expected the rotation mode Quaternion (WXYZ), found {anchor.rotation_mode}; switch it back under "
-            "Transform"
-        )
-    animation = anchor.animation_data
-    if animation is None:
-        return Place(None, None)
-    if animation.use_tweak_mode:
-        raise errors.ConfigError(f"{name}: an NLA strip of it is being edited; leave tweak mode (Tab) first")
-    if animation.action is not None:
-        found = Place(animation.action, compat.slot_of(animation))
-    else:
-        strips = [s for track in animation.nla_tracks for s in track.strips if _moves(s)]
-        if not strips:
-            return Place(None, None)
-        strip = strips[0]
-        if len(strips) > 1:
-            raise errors.ConfigError(
-                f"{name}: its motion is {len(strips)} NLA strips; keep one, or make its action the active one again"
-            )
-        found = Place(strip.action, compat.slot_of(strip), strip)
-    if found.action is not None and found.action.library is not None:
-        raise errors.ConfigError(f"{name}: its action comes from another .blend file; make it local first")
-    return found
-
-
-def refusal(anchor: bpy.types.Object) -> str:
-    """Message of the error that `place` raises for an anchor, or ""."""
-    try:
-        place(anchor)
-    except errors.ConfigError as error:
-        return str(error)
-    return ""
-
-
-def check_local(anchor: bpy.types.Object) -> None:
-    """Raise a ConfigError if an anchor belongs to another .blend file."""
-    if anchor.library is not None or anchor.override_library is not None:
-        raise errors.ConfigError(f"{anchor.name}: comes from another .blend file; open that one, or append it here")
-
-
-def _moves(strip: bpy.types.NlaStrip) -> bool:
-    """True if an NLA strip plays location or rotation curves."""
-    return strip.type == "CLIP" and bool(Place(strip.action, compat.slot_of(strip)).curves())
 
 
 def pose_at(anchor: bpy.types.Object, where: Place, frame: float) -> tuple[np.ndarray, np.ndarray]:
@@ -183,7 +104,7 @@ def replace_after(anchor: bpy.types.Object, where: Place, frame: float, tails: d
 
     Args:
         anchor: Anchor.
-        where: Location of its curves, from `place`.
+        where: Location of its curves, from `curve_place.find`.
         frame: Frame after which keys are replaced.
         tails: Keys over frames by data path; the first is at ``frame`` and continues the existing curve. Other paths
             hold
@@ -324,20 +245,6 @@ def _stretch(strip: bpy.types.NlaStrip) -> None:
     strip.action_frame_end = max(last, strip.action_frame_start + 1)
     length = (strip.action_frame_end - strip.action_frame_start) * strip.scale * strip.repeat
     strip.frame_end = strip.frame_start + length
-
-
-def make_own(anchor: bpy.types.Object) -> None:
-    """Give an anchor a copy of its action if other objects use the same one."""
-    animation = anchor.animation_data
-    action = animation.action if animation is not None else None
-    if action is None or action.users - action.use_fake_user <= 1:
-        return
-    slot = compat.slot_of(animation)
-    for other in bpy.data.objects:
-        theirs = other.animation_data
-        if other != anchor and theirs is not None and theirs.action == action and compat.slot_of(theirs) == slot:
-            compat.play(anchor, action.copy(), slot)
-            return
 
 
 def digest(where: Place, frame: float) -> str:

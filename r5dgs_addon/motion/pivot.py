@@ -14,7 +14,7 @@ from mathutils import Vector
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import rotation_centers
 from ...r5dgs_core.motion.models import KINDS, MotionModel
-from . import extrapolate, fcurves, physics
+from . import curve_place, extrapolate, fcurves, motion_fields, physics
 
 _ON_AXIS = 1e-4  # tolerance as a fraction of the point's distance, because rates are float32
 
@@ -87,7 +87,7 @@ def to_parent(anchor: bpy.types.Object, place: Vector) -> np.ndarray:
 def _place(anchor: bpy.types.Object) -> np.ndarray:
     """Position of an anchor at t_max in the axes of its parent. [3]"""
     times = extrapolate.times_of(anchor)
-    location, _ = fcurves.pose_at(anchor, fcurves.place(anchor), times.frame(times.t_max))
+    location, _ = fcurves.pose_at(anchor, curve_place.find(anchor), times.frame(times.t_max))
     return location + np.array(anchor.delta_location, np.float64)
 
 
@@ -157,7 +157,7 @@ def _write_axis(state, value):
 
 
 def _write_at_once(state, context):
-    physics.write_at_once(state.id_data.r5dgs_motion, context)
+    motion_fields.write_at_once(state.id_data.r5dgs_motion, context)
 
 
 class R5DGS_PG_pivot(bpy.types.PropertyGroup):

@@ -9,7 +9,7 @@ from ...r5dgs_core import errors
 from ...r5dgs_core.motion import rotations
 from .. import compat
 from ..scene import timeline
-from . import confidence_tubes, extrapolate, fcurves, physics
+from . import confidence_tubes, curve_place, extrapolate, fcurves, physics
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def prepare(target: bpy.types.Object, source: bpy.types.Object, frame: float, ti
     Raises:
         ConfigError: Curves of an anchor cannot be read or written.
     """
-    here, there = fcurves.place(target), fcurves.place(source)
+    here, there = curve_place.find(target), curve_place.find(source)
     for obj, where in ((target, here), (source, there)):
         if where.strip is not None:
             raise errors.ConfigError(f"{obj.name}: its motion lies in the NLA; make its action active again first")
@@ -104,8 +104,8 @@ def prepare(target: bpy.types.Object, source: bpy.types.Object, frame: float, ti
 def apply(plan: Replacement) -> None:
     """Write the result of `prepare`."""
     target = plan.target
-    fcurves.make_own(target)
-    extrapolate.clear(target, fcurves.place(target))
+    curve_place.make_own(target)
+    extrapolate.clear(target, curve_place.find(target))
     target.location, target.rotation_quaternion = plan.location, plan.quat
     if plan.curves:
         owned = compat.own_fcurves(target, target.name)

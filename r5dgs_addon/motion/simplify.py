@@ -8,7 +8,7 @@ from ...r5dgs_core.motion import bezier, rotations
 from ...r5dgs_core.motion import key_reduction as reduction
 from .. import compat
 from ..scene import timeline
-from . import extrapolate, fcurves, keyframes, physics
+from . import curve_place, extrapolate, fcurves, keyframes, physics
 
 _FRAMES = reduction.FrameTimes(0.0, 1.0)  # the curves' times are frames
 _LIKE = 0.01  # tolerance of slopes that do not form a kink: fraction of the allowed error over the shorter segment
@@ -33,7 +33,7 @@ def simplify(anchors: list[bpy.types.Object], share: float) -> tuple[int, int]:
     before = key_count(anchors)
     for anchor, times, allowed, written in plans:
         if written:
-            fcurves.make_own(anchor)
+            curve_place.make_own(anchor)
             owned = compat.own_fcurves(anchor, anchor.name)
             for path, keys in written.items():
                 keyframes.write(owned, path, _over_time(keys, times), times)
@@ -44,13 +44,13 @@ def simplify(anchors: list[bpy.types.Object], share: float) -> tuple[int, int]:
 
 def key_count(anchors: list[bpy.types.Object]) -> int:
     """Total number of location and rotation keys of anchors."""
-    curves = [curve for anchor in anchors for curve in fcurves.place(anchor).curves().values()]
+    curves = [curve for anchor in anchors for curve in curve_place.find(anchor).curves().values()]
     return sum(len(curve.keyframe_points) for curve in curves)
 
 
 def _plan(anchor: bpy.types.Object, allowed: float) -> tuple[timeline.Times, float, dict[str, reduction.Keys]]:
     """Times, allowed error and new keys over frames of an anchor; no keys if nothing can be removed."""
-    times, place = extrapolate.times_of(anchor), fcurves.place(anchor)
+    times, place = extrapolate.times_of(anchor), curve_place.find(anchor)
     if place.strip is not None:
         raise errors.ConfigError(f"{anchor.name}: its action lies in the NLA; make it active again first")
     curves = {name: curve for name, curve in place.curves().items() if len(curve.keyframe_points)}

@@ -4,7 +4,7 @@ import bpy
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import models
-from ..motion import confidence_tubes, duplicate_delete, fcurves, physics, pivot
+from ..motion import confidence_tubes, curve_place, duplicate_delete, physics, pivot
 from ..scene import loaded_scenes
 from ..ui import status_bar
 from . import sidebar
@@ -40,7 +40,7 @@ def _physics(layout, anchor) -> None:
     """Draw the fields of the motion."""
     state = anchor.r5dgs_motion
     layout.label(text=anchor.name, icon="EMPTY_ARROWS")
-    refused = fcurves.refusal(anchor)
+    refused = curve_place.refusal(anchor)
     if refused:
         status_bar.wrapped(layout, bpy.context, refused, "ERROR")
     layout.prop(state, "leader")

@@ -295,7 +295,7 @@ def test_a_strip_that_was_moved_and_slowed_down_plays_the_new_motion_so_too(blen
 
 def strip_keys(strip, until):
     """Keys of the action of a strip up to a frame."""
-    found = motions.addon("motion.fcurves").Place(strip.action, getattr(strip, "action_slot", None)).curves()
+    found = motions.addon("motion.curve_place").Place(strip.action, getattr(strip, "action_slot", None)).curves()
     return {
         name: [(tuple(p.co), tuple(p.handle_left)) for p in curve.keyframe_points if p.co[0] <= until + 1e-3]
         for name, curve in found.items()

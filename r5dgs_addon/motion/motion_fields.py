@@ -1,0 +1,167 @@
+"""Fields of an anchor's motion past t_max, for the panel *Motion*.
+
+Rates are stored per unit of scene time, as in the core, and shown per second of Blender's time. Vectors are in the
+axes of the anchor's parent, like its location.
+"""
+
+import contextlib
+import math
+from collections.abc import Callable
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, PointerProperty, StringProperty
+
+from ...r5dgs_core import errors
+from ...r5dgs_core.motion import models
+
+_re_extrapolate: Callable[[list[bpy.types.Object]], object] | None = None  # set by `extrapolate`
+
+
+def units_per_second(state: bpy.types.PropertyGroup) -> float:
+    """Units of scene time per second of Blender's time."""
+    render = bpy.context.scene.render
+    return render.fps / render.fps_base / state.frames_per_unit
+
+
+def write_at_once(state: bpy.types.PropertyGroup, _) -> None:
+    """Update callback of the fields: re-extrapolate the anchor if *Write at Once* is on."""
+    if state.at_once and _re_extrapolate is not None:
+        with contextlib.suppress(errors.R5dgsError):  # shown in the panel
+            _re_extrapolate([state.id_data])
+
+
+def call_on_change(re_extrapolate: Callable[[list[bpy.types.Object]], object] | None) -> None:
+    """Set the function that `write_at_once` calls with a list of anchors, or None."""
+    global _re_extrapolate
+    _re_extrapolate = re_extrapolate
+
+
+def _vector(name: str):
+    """Property options with getter and setter of a vector in Blender's units."""
+    power = models.RATES[name].per_time
+
+    def read(state):
+        factor = units_per_second(state) ** power
+        return [factor * value for value in getattr(state, f"stored_{name}")]
+
+    def write(state, values):
+        factor = units_per_second(state) ** power
+        setattr(state, f"stored_{name}", [value / factor for value in values])
+
+    return {"get": read, "set": write, "size": 3, "update": write_at_once, "options": set()}
+
+
+def _read_swing(state):
+    return state.stored_frequency * units_per_second(state) / math.tau
+
+
+def _write_swing(state, value):
+    state.stored_frequency = max(value, 0.0) * math.tau / units_per_second(state)
+
+
+def _stored(**options):
+    return FloatVectorProperty(size=3, options={"HIDDEN"}, **options)
+
+
+class R5DGS_PG_motion(bpy.types.PropertyGroup):
+    """Motion of an anchor past the last observed time."""
+
+    learned: StringProperty(
+        name="Learned Motion", description="Motion stored in the scene file, as JSON", options=set()
+    )
+    taken: StringProperty(
+        name="Taken Motion", description="Motion taken from another object, as JSON", options={"HIDDEN"}
+    )
+    written: StringProperty(name="Written Keys", description="Digest of the last written keys", options={"HIDDEN"})
+    frames_per_unit: FloatProperty(name="Frames per Unit", default=60.0, options={"HIDDEN"})
+    written_motion: StringProperty(
+        name="Written Motion", description="Digest of the motion of the last written keys", options={"HIDDEN"}
+    )
+    too_fast: BoolProperty(
+        name="Too Fast for Keys",
+        description="The motion turns or swings too fast for keys, which are exact only at frames",
+        options={"HIDDEN"},
+    )
+    at_once: BoolProperty(name="Write at Once", description="Re-extrapolate whenever a value changes", options=set())
+    kind: EnumProperty(
+        name="Motion",
+        description="Type of motion past the last observed time",
+        items=[(name, kind.label, kind.tooltip) for name, kind in models.KINDS.items()],
+        update=write_at_once,
+        options=set(),
+    )
+    stored_velocity: _stored()
+    stored_acceleration: _stored()
+    stored_angular_velocity: _stored()
+    stored_angular_acceleration: _stored()
+    stored_center_offset: _stored()
+    stored_frequency: FloatProperty(options={"HIDDEN"})
+    stored_pivot: _stored()  # point chosen on an axis, relative to the anchor
+    velocity: FloatVectorProperty(
+        name="Velocity",
+        description="Velocity at the last observed time, per second, along the axes of the parent",
+        subtype="VELOCITY",
+        **_vector("velocity"),
+    )
+    acceleration: FloatVectorProperty(
+        name="Acceleration",
+        description="Change of the velocity, per second squared",
+        subtype="ACCELERATION",
+        **_vector("acceleration"),
+    )
+    angular_velocity: FloatVectorProperty(
+        name="Spin /s",
+        description="Rotation vector per second: its direction is the axis, its length the angle",
+        subtype="EULER",
+        unit="ROTATION",
+        **_vector("angular_velocity"),
+    )
+    angular_acceleration: FloatVectorProperty(
+        name="Spin /s²",
+        description="Change of the spin, per second squared",
+        subtype="EULER",
+        unit="ROTATION",
+        **_vector("angular_acceleration"),
+    )
+    center_offset: FloatVectorProperty(
+        name="Center",
+        description="Point that the object spins about, relative to the anchor",
+        subtype="TRANSLATION",
+        unit="LENGTH",
+        **_vector("center_offset"),
+    )
+    frequency: FloatProperty(
+        name="Swings /s",
+        description="Oscillations per second; 0 for none",
+        get=_read_swing,
+        set=_write_swing,
+        update=write_at_once,
+        options=set(),
+    )
+    learned_leader: PointerProperty(type=bpy.types.Object, options={"HIDDEN"})
+    tube: PointerProperty(
+        name="Confidence",
+        description="Helper that shows the uncertainty of the path",
+        type=bpy.types.Object,
+        options=set(),
+    )
+    leader: PointerProperty(
+        name="Follows",
+        description="Anchor whose path this one follows past the last observed time, like a shadow; "
+        "empty for a motion of its own",
+        type=bpy.types.Object,
+        poll=lambda state, obj: obj.r5dgs.role == "ANCHOR" and obj != state.id_data,
+        options=set(),
+    )
+
+
+def register():
+    """Register the property group on objects."""
+    bpy.utils.register_class(R5DGS_PG_motion)
+    bpy.types.Object.r5dgs_motion = PointerProperty(type=R5DGS_PG_motion)
+
+
+def unregister():
+    """Undo `register`."""
+    del bpy.types.Object.r5dgs_motion
+    bpy.utils.unregister_class(R5DGS_PG_motion)
