@@ -14,6 +14,7 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 from ..r5dgs_core import errors
+from ..r5dgs_core.color import srgb
 from ..r5dgs_core.scene import cameras
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
 from . import compat
@@ -248,7 +249,7 @@ def _cloud(
     data.name = name = object_names.fit(_part_name(scene, part, largest))
     cloud = bpy.data.objects.new(name, data)
     collection.objects.link(cloud)
-    color = point_clouds.srgb_to_linear(np.asarray(_color(scene, part.object_id), np.float64))
+    color = srgb.to_linear(np.minimum(_color(scene, part.object_id), 1.0))
     cloud.color = (*color, 1.0)
     cloud.parent = anchor
     pivot = Vector(anchor.r5dgs.pivot)

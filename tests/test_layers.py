@@ -34,7 +34,7 @@ ALLOWED = {
     "folder_lock": set(),
     "scene": {"motion"},
     "color": {"scene"},
-    "data": {"motion", "scene"},
+    "data": {"motion", "scene", "color"},
     "raster": {"scene"},
     "search": {"scene"},
     "config": {"data"},

@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core import errors
+from ...r5dgs_core.motion import rotations
 from .overrides import Overrides
 
 CHOICES = ("AUTO", "PASS_INDEX", "COLLECTION", "SELECTED", "ANIMATED")
@@ -179,9 +180,7 @@ def poses(survey: Survey, captured: CapturedObject) -> np.ndarray:
     matrices = survey.matrices[captured.root].copy()
     linear = matrices[:, :3, :3]
     sign = np.where(np.linalg.det(linear) < 0, -1.0, 1.0)[:, None, None]
-    u, _, v = np.linalg.svd(sign * linear)
-    u[:, :, 2] *= np.linalg.det(u @ v)[:, None]
-    matrices[:, :3, :3] = u @ v
+    matrices[:, :3, :3] = rotations.nearest_rotmats(sign * linear)
     return matrices
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 
-from ...r5dgs_core.color import view_inverse
+from ...r5dgs_core.color import srgb, view_inverse
 from .. import compat
 from ..scene import render_settings
 from . import view_transform
@@ -45,10 +45,7 @@ def scene_linear(
     if alpha is not None:
         result[..., 3] = np.clip(alpha, 0, 1)
         straight = straight / np.maximum(result[..., 3:], 1e-6)
-    if inverse is not None:
-        linear = inverse.scene_linear(straight)
-    else:
-        linear = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4)
+    linear = srgb.to_linear(straight) if inverse is None else inverse.scene_linear(straight)
     linear = view_transform.in_space(linear, compat.working_space())
     result[..., :3] = linear if alpha is None else linear * result[..., 3:]
     return result

@@ -10,7 +10,7 @@ import functools
 import bpy
 import numpy as np
 
-from ...r5dgs_core.color import view_inverse
+from ...r5dgs_core.color import srgb, view_inverse
 from ..scene import loaded_scenes, point_clouds
 from ..ui import status_bar
 from . import display_to_linear, view_transform
@@ -97,7 +97,7 @@ def _colors(collections: list[bpy.types.Collection]) -> tuple[np.ndarray, np.nda
     cells = np.clip(cells, -_FARTHEST, _FARTHEST - 1).astype(np.int64) @ (2 * _FARTHEST) ** np.arange(3)
     _, cells = np.unique(cells, return_inverse=True)
     totals = np.bincount(cells.ravel(), weights)
-    shown = point_clouds.linear_to_srgb(colors[:, :3])
+    shown = srgb.from_linear(np.minimum(colors[:, :3], 1))
     means = np.stack([np.bincount(cells.ravel(), weights * shown[:, k]) for k in range(3)], axis=-1)
     seen = totals > 0
     return means[seen] / totals[seen, None], totals[seen]

@@ -6,7 +6,8 @@ A row is an entry of the table. An object may have several point clouds, which a
 import bpy
 import numpy as np
 
-from . import object_names, object_tint, point_clouds, selection
+from ...r5dgs_core.color import srgb
+from . import object_names, object_tint, selection
 
 GREY = (0.5, 0.5, 0.5)
 
@@ -25,7 +26,7 @@ def set_label(entry: bpy.types.PropertyGroup, name: str) -> None:
 def color(entry: bpy.types.PropertyGroup) -> tuple[float, float, float]:
     """Display-referred viewport colour of the object: its tint if tinted, otherwise the table's colour."""
     own = object_names.clouds(entry.id_data, entry.object_id)
-    return tuple(point_clouds.linear_to_srgb(np.array(own[0].color[:3])).tolist()) if own else GREY
+    return tuple(srgb.from_linear(np.minimum(own[0].color[:3], 1)).tolist()) if own else GREY
 
 
 def set_color(entry: bpy.types.PropertyGroup, value) -> None:

@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 from bpy.props import BoolProperty, FloatVectorProperty, PointerProperty
 
+from ...r5dgs_core.color import srgb
 from . import point_clouds
 
 NONE = (1.0, 1.0, 1.0)
@@ -78,7 +79,7 @@ def show(cloud: bpy.types.Object) -> None:
     if is_tinted(cloud):
         if not look.shown:
             look.plain, look.shown = cloud.color, True
-        cloud.color = (*point_clouds.srgb_to_linear(factors), look.plain[3])
+        cloud.color = (*srgb.to_linear(np.minimum(factors, 1)), look.plain[3])
     elif look.shown:
         cloud.color, look.shown = look.plain, False
     if cloud.type != "POINTCLOUD" or cloud.data is None or cloud.data.library is not None:

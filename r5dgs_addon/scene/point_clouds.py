@@ -6,6 +6,7 @@ import hashlib
 import bpy
 import numpy as np
 
+from ...r5dgs_core.color import srgb
 from ...r5dgs_core.scene import spherical_harmonics
 from ...r5dgs_core.scene.scene import Scene
 from .. import compat
@@ -20,18 +21,6 @@ _BLOCK = 2048
 # Display radius of Gaussians in viewports without splats, limited so that large or faint ones hide little.
 DISPLAY_SIGMAS = 1.2
 LARGEST_DISPLAY_RADIUS = 0.012  # as a fraction of the scene's extent
-
-
-def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
-    """Convert display-referred sRGB in [0, 1] to linear light, the space of Blender's colours. Any shape."""
-    srgb = np.clip(srgb, 0.0, 1.0)
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Convert linear light in [0, 1] to display-referred sRGB. Any shape."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.04045 / 12.92, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, sh_degree: int) -> None:
@@ -52,7 +41,7 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     log_scales = scene.gaussians.log_scales[rows]
     opacities = 1.0 / (1.0 + np.exp(-scene.gaussians.opacity_logits[rows].astype(np.float64)))
     base = np.concatenate([sh[:, 0], opacities[:, None]], axis=-1)
-    shown = srgb_to_linear(0.5 + spherical_harmonics.C0 * sh[:, 0].astype(np.float64))
+    shown = srgb.to_linear(np.minimum(0.5 + spherical_harmonics.C0 * sh[:, 0].astype(np.float64), 1))
     radii = DISPLAY_SIGMAS * np.sqrt(opacities) * np.exp(log_scales.mean(-1))
     radii = np.minimum(radii, LARGEST_DISPLAY_RADIUS * extent)
     written = {
@@ -130,7 +119,7 @@ def show_tint(cloud: bpy.types.PointCloud, tint: np.ndarray) -> None:
     base = np.empty(4 * len(cloud.points), np.float32)
     stored.data.foreach_get("color", base)
     colors = base.reshape(-1, 4).astype(np.float64)
-    colors[:, :3] = srgb_to_linear(tint * (0.5 + spherical_harmonics.C0 * colors[:, :3]))
+    colors[:, :3] = srgb.to_linear(np.minimum(tint * (0.5 + spherical_harmonics.C0 * colors[:, :3]), 1))
     _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", colors)
     cloud.update_tag()
 

@@ -12,6 +12,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from .. import atomic_files, errors
+from ..color import srgb
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".tif", ".tiff")
 COMPRESSION_LEVEL = 6
@@ -67,7 +68,7 @@ def read(path: Path) -> np.ndarray:
     if pixels.shape[2] in (2, 4):  # the alpha of linear float files is premultiplied
         alpha = pixels[..., -1:]
         pixels[..., :-1] = np.where(alpha > 0, pixels[..., :-1] / np.maximum(alpha, 1e-8), 0.0)
-    pixels[..., :colors] = linear_to_srgb(pixels[..., :colors])
+    pixels[..., :colors] = srgb.from_linear(pixels[..., :colors])
     return np.clip(pixels, 0.0, 1.0)
 
 
@@ -142,12 +143,6 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 def to_uint8(pixels: np.ndarray) -> np.ndarray:
     """Convert colours in [0, 1] to 8 bits, clipped and rounded to nearest."""
     return np.rint(np.clip(np.nan_to_num(pixels), 0.0, 1.0) * 255.0).astype(np.uint8)
-
-
-def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Apply the sRGB transfer curve (IEC 61966-2-1); negative values are clipped to 0."""
-    linear = np.maximum(linear, 0.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1.0 / 2.4) - 0.055)
 
 
 def to_rgba(pixels: np.ndarray) -> np.ndarray:

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import optimize
 
+from ..motion import rotations
+
 MSE_FLOOR = 1e-10  # limits PSNR to 100 dB, so that means stay finite for equal images
 SSIM_RADIUS, SSIM_SIGMA = 5, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
@@ -186,14 +188,6 @@ def miou_matched(counts: np.ndarray) -> float:
     return total / int(shown.sum()) if shown.any() else math.nan
 
 
-def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to a matrix; for a mean of rotations, the chordal mean. [..., 3, 3]"""
-    u, _, vt = np.linalg.svd(matrix)
-    sign = np.ones((*matrix.shape[:-2], 3))
-    sign[..., 2] = np.sign(np.linalg.det(u @ vt))
-    return (u * sign[..., None, :]) @ vt
-
-
 def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the angle between rotations in degrees, accurate near 0 and 180. [..., 3, 3], [..., 3, 3] -> [...]"""
     between = np.swapaxes(a, -1, -2) @ b
@@ -211,7 +205,8 @@ def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def rigid(matrices: np.ndarray) -> np.ndarray:
     """Return object-to-world matrices without their scale. [..., 4, 4]"""
     out = np.array(matrices, np.float64)
-    out[..., :3, :3] = nearest_rotation(out[..., :3, :3] / np.linalg.norm(out[..., :3, :3], axis=-2, keepdims=True))
+    linear = out[..., :3, :3]
+    out[..., :3, :3] = rotations.nearest_rotmats(linear / np.linalg.norm(linear, axis=-2, keepdims=True))
     return out
 
 
@@ -254,7 +249,7 @@ def true_motion(predicted: np.ndarray, truth: np.ndarray, observed: np.ndarray, 
     poses = rigid(truth)
     offsets = np.linalg.inv(predicted[observed]) @ poses[observed]
     align = np.eye(4)
-    align[:3, :3] = nearest_rotation(offsets[:, :3, :3].mean(axis=0))
+    align[:3, :3] = rotations.nearest_rotmats(offsets[:, :3, :3].mean(axis=0))
     # Average the translation at the center, because the object's origin may be far away.
     p_object = np.einsum("tij,tj->ti", np.linalg.inv(offsets), np.append(center, 1.0)[None].repeat(len(offsets), 0))
     align[:3, 3] = np.asarray(center) - align[:3, :3] @ p_object.mean(axis=0)[:3]

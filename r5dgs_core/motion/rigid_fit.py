@@ -66,19 +66,12 @@ def fit_rigid(
     Returns:
         The fit; det R = +1 always.
 
-    Source: Kabsch 1976, with the sign of the smallest singular vector set for det R = +1; Cauchy weights
-        1 / (1 + (r / s)^2) with s = 2 * 1.4826 * median(r); rotation covariance sigma^2 J^-1 with J = sum w (|r|^2
-        I - r r^T).
+    Source: Kabsch 1976 (`rotations.nearest_rotmats`), reweighted by `robust_weights`; rotation covariance sigma^2 J^-1
+        with J = sum w (|r|^2 I - r r^T).
     """
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
-    if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape or len(source) == 0:
-        raise ValueError(f"expected two equal shapes (n, 3) with n >= 1, got {source.shape} and {target.shape}")
     base = np.ones(len(source)) if weights is None else np.asarray(weights, np.float64)
-    if base.shape != (len(source),) or not (base >= 0).all() or not base.sum() > 0:
-        raise ValueError(f"weights: expected ({len(source)},) numbers >= 0 with a positive sum")
-    if not (np.isfinite(source).all() and np.isfinite(target).all()):
-        raise ValueError("source, target: expected finite points")
-
+    _check(source, target, base)
     current = base / base.sum()
     quat, center, moved, residuals = _kabsch(source, target, current)
     size = float(np.sqrt(np.sum(current * ((source - center) ** 2).sum(-1))))
@@ -103,6 +96,16 @@ def fit_rigid(
             quat = rotations.multiply(shortest_turn(start, end), known)
         residuals = np.linalg.norm(target - moved - rotations.rotate(quat, source - center), axis=-1)
     return RigidFit(quat, moved - center, center, residuals, current, axes, covariance)
+
+
+def _check(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> None:
+    """Raise ValueError for arguments that `fit_rigid` cannot use."""
+    if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape or len(source) == 0:
+        raise ValueError(f"expected two equal shapes (n, 3) with n >= 1, got {source.shape} and {target.shape}")
+    if weights.shape != (len(source),) or not (weights >= 0).all() or not weights.sum() > 0:
+        raise ValueError(f"weights: expected ({len(source)},) numbers >= 0 with a positive sum")
+    if not (np.isfinite(source).all() and np.isfinite(target).all()):
+        raise ValueError("source, target: expected finite points")
 
 
 def aliased_step(times: np.ndarray, quats: np.ndarray) -> tuple[float, float, float] | None:
@@ -141,9 +144,7 @@ def _kabsch(
     """Rotation, both centroids and the residuals, for weights that sum to 1."""
     center, moved = weights @ source, weights @ target
     x, y = source - center, target - moved
-    u, _, vt = np.linalg.svd((y * weights[:, None]).T @ x)
-    u[:, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0
-    rotmat = u @ vt
+    rotmat = rotations.nearest_rotmats((y * weights[:, None]).T @ x)
     return rotations.rotmats_to_quats(rotmat), center, moved, np.linalg.norm(y - x @ rotmat.T, axis=-1)
 
 

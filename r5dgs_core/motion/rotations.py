@@ -210,6 +210,18 @@ def rotmats_to_quats(rotmats: Array) -> Array:
     return xp.where(quats[..., :1] < 0, -quats, quats)
 
 
+def nearest_rotmats(matrices: Array) -> Array:
+    """Rotation matrices nearest to any matrices; for a mean of rotations, the chordal mean. [..., 3, 3]
+
+    Source: Kabsch 1976. For the covariance sum_i w_i y_i x_i^T of centred points it is the rotation of x that fits y
+        best in the sense of least squares. The smallest singular vector is flipped if needed for det = +1.
+    """
+    xp = array_namespace(matrices)
+    u, _, vt = xp.linalg.svd(matrices)
+    sign = xp.where(xp.linalg.det(u @ vt) < 0, -1.0, 1.0)
+    return xp.concatenate([u[..., :2], u[..., 2:] * sign[..., None, None]], -1) @ vt
+
+
 def make_continuous(quats: Array) -> Array:
     """Choose the sign of each quaternion that is nearest to its predecessor along axis 0. [S, ..., 4]
 

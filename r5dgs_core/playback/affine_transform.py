@@ -195,10 +195,8 @@ def nearest_rotation(linear: np.ndarray) -> np.ndarray:
 
     [..., 3, 3] -> [..., 3, 3]
     """
-    u, _, vt = np.linalg.svd(linear)
-    result = u @ vt
-    result[..., :, 0] *= np.sign(np.linalg.det(result))[..., None]
-    return result
+    mirror = np.where(np.linalg.det(linear) < 0, -1.0, 1.0)
+    return rotations.nearest_rotmats(np.concatenate([linear[..., :1] * mirror[..., None, None], linear[..., 1:]], -1))
 
 
 def _even(singular: np.ndarray) -> bool:

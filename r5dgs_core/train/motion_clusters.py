@@ -18,6 +18,8 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
+from ..motion import rotations
+
 SHARE = 0.12  # allowed residual / travel of a point; fields bend rigid motions slightly
 PROPOSALS = 48  # per part
 NEIGHBOURHOOD = 24  # points per proposal
@@ -104,9 +106,7 @@ def fit(paths: np.ndarray, weights: np.ndarray, reference: int) -> RigidPath:
     centers = (share * paths).sum(-3)  # [..., S, 3]
     arms = paths - centers[..., None, :, :]
     spread = np.einsum("...rsi,...rj->...sij", share * arms, arms[..., reference, :])
-    u, _, vt = np.linalg.svd(spread)
-    u[..., 2] *= np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)[..., None]
-    rotmats = u @ vt
+    rotmats = rotations.nearest_rotmats(spread)
     home = centers[..., reference, :]
     return RigidPath(rotmats, centers - np.einsum("...sij,...j->...si", rotmats, home))
 

@@ -121,10 +121,7 @@ def rigid_fits(before: Tensor, after: Tensor, groups: Tensor) -> tuple[Tensor, T
     a, b = mean(before), mean(after)
     outer = (after - b[groups])[:, :, None] * (before - a[groups])[:, None, :]
     spread = torch.zeros(count, 3, 3, dtype=before.dtype).index_add(0, groups, outer)
-    u, _, vt = torch.linalg.svd(spread)
-    flip = torch.ones(count, 3, dtype=before.dtype)
-    flip[:, 2] = torch.sign(torch.linalg.det(u @ vt))
-    quats = rotations.rotmats_to_quats(u @ (flip[:, :, None] * vt))
+    quats = rotations.rotmats_to_quats(rotations.nearest_rotmats(spread))
     return quats, b - rotations.rotate(quats, a), n >= 4
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from ...config.config import Config
 from ...model import group_poses
 from ...model.gaussians import Gaussians
-from ...motion import rotations
+from ...motion import robust_weights, rotations
 from ...raster import shade
 from ...scene import sh_color
 from ...scene.cameras import Camera
@@ -120,7 +120,7 @@ def nothing_moves(views: Sequence[TrainView]) -> bool:
 def _changes(first: np.ndarray, second: np.ndarray) -> bool:
     """True if two images of one camera, as blocks, differ by more than noise in at least one block."""
     difference = np.abs(first - second)
-    noise = max(1.4826 * float(np.median(difference)), NOTHING)
+    noise = max(robust_weights.MEDIAN_TO_SIGMA * float(np.median(difference)), NOTHING)
     return bool((difference > max(CHANGE, NOISE * noise)).any())
 
 

@@ -139,11 +139,6 @@ def test_the_angle_between_rotations_is_accurate_everywhere(seed, angle):
     assert got == pytest.approx(math.degrees(angle), abs=1e-6)
 
 
-def test_the_nearest_rotation_of_a_mirror_is_a_rotation():
-    nearest = metrics.nearest_rotation(np.diag([1.0, 0.9, -0.2]))
-    assert np.linalg.det(nearest) == pytest.approx(1.0)
-
-
 def rigid(rotation: Rotation, translation) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation.as_matrix(), translation

@@ -30,6 +30,28 @@ def test_multiply_composes_rotations(p, q, v):
     np.testing.assert_allclose(rot.rotate(rot.multiply(p, q), v), rot.rotate(p, rot.rotate(q, v)), atol=1e-13)
 
 
+@given(hnp.arrays(np.float64, (2, 3, 3), elements=st.floats(-10, 10)), quats())
+def test_no_rotation_is_nearer_than_the_nearest(matrices, other):
+    nearest = rot.nearest_rotmats(matrices)
+    np.testing.assert_allclose(
+        nearest @ np.swapaxes(nearest, -1, -2), np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(nearest), 1, atol=1e-12)
+    distances = [np.linalg.norm(matrices - rotmats, axis=(1, 2)) for rotmats in (nearest, rot.quats_to_rotmats(other))]
+    assert (distances[0] <= distances[1] + 1e-9).all()
+    torch.testing.assert_close(
+        torch.linalg.norm(rot.nearest_rotmats(torch.from_numpy(matrices)) - torch.from_numpy(matrices), dim=(1, 2)),
+        torch.from_numpy(distances[0]),
+    )
+
+
+@given(quats())
+def test_a_rotation_is_its_own_nearest_even_if_scaled(q):
+    rotmat = rot.quats_to_rotmats(q)
+    for scale in (1e-6, 1.0, 1e6):
+        np.testing.assert_allclose(rot.nearest_rotmats(scale * rotmat), rotmat, atol=1e-12)
+
+
 @given(quats(), vectors())
 def test_rotate_equals_the_matrix_and_keeps_lengths(q, v):
     turned = rot.rotate(q, v)
