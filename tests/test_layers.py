@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import graphlib
 import importlib.util
 import json
@@ -164,7 +165,8 @@ class Import:
     line: int
 
 
-def imports_of(source: str, package: str) -> Iterator[Import]:
+@functools.cache
+def imports_of(source: str, package: str) -> tuple[Import, ...]:
     """All imports of a module that lives in ``package``; ``from a import b`` counts as a.b, as b may be a module."""
 
     def visit(node: ast.AST, late: bool) -> Iterator[Import]:
@@ -182,7 +184,7 @@ def imports_of(source: str, package: str) -> Iterator[Import]:
                     yield Import(f"{base}.{alias.name}", bool(child.level), late, child.lineno)
             yield from visit(child, inside)
 
-    yield from visit(ast.parse(source), False)
+    return tuple(visit(ast.parse(source), False))
 
 
 def modules_in(folder: str) -> Iterator[tuple[Path, str]]:
@@ -197,6 +199,7 @@ def room(module: str) -> str | None:
     return parts[1] if parts[0] == "r5dgs_core" and len(parts) > 1 and parts[1] in ALLOWED else None
 
 
+@functools.cache
 def project_sources() -> dict[str, tuple[str, str]]:
     """Source and package of each module of core, add-on and operators, by its name inside the extension."""
     found = {}

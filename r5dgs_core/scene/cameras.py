@@ -66,14 +66,14 @@ def check(camera: Camera) -> None:
             raise TypeError(f"{place}: {name}: expected an array, got {type(matrix).__name__}; cameras get no gradient")
         if matrix.shape != shape:
             raise ValueError(f"{place}: {name}: expected shape {shape}, got {matrix.shape}")
-        bad = np.argwhere(~(np.abs(matrix) <= FARTHEST))
-        if len(bad):
-            at = tuple(bad[0].tolist())
+        sound = np.abs(matrix) <= FARTHEST
+        if not sound.all():
+            at = tuple(np.argwhere(~sound)[0].tolist())
             raise ValueError(
                 f"{place}: {name}: expected finite values, found {matrix[at]} at index {at} (largest: {FARTHEST:g})"
             )
-        last = np.eye(len(matrix))[-1]
-        if not np.allclose(matrix[-1], last, rtol=0, atol=_ROUNDING):
+        last = np.array([0.0] * (len(matrix) - 1) + [1.0])
+        if not (np.abs(matrix[-1] - last) <= _ROUNDING).all():
             raise ValueError(f"{place}: {name}: expected {last.tolist()} as the last row, found {matrix[-1].tolist()}")
     rotation = camera.T_cam_world[:3, :3]
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()

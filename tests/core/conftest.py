@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from r5dgs_core.bake import bake
+from r5dgs_core.bake import bake, image_evidence
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.train import learning_curves, run
 from tests.support import pictures, scenes, tiny_datasets
@@ -17,6 +17,23 @@ def no_plots():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learning_curves.Curves, "update", lambda self, *, finished=False: None)
         yield update
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_views():
+    """Bake by the evidence of a dozen images; returns the limits left out."""
+    limits = image_evidence.FEWEST, image_evidence.MOST
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(image_evidence, "FEWEST", 8)
+        patch.setattr(image_evidence, "MOST", 12)
+        yield limits
+
+
+@pytest.fixture
+def many_views(few_views, monkeypatch):
+    """Baking uses as many images as it does for users."""
+    monkeypatch.setattr(image_evidence, "FEWEST", few_views[0])
+    monkeypatch.setattr(image_evidence, "MOST", few_views[1])
 
 
 @pytest.fixture

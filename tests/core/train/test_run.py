@@ -2,12 +2,9 @@
 
 import dataclasses
 import json
-import os
 import shlex
 import shutil
 import signal
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -16,7 +13,7 @@ from r5dgs_core import atomic_files
 from r5dgs_core.cli import main
 from r5dgs_core.errors import CheckpointError, Interrupted, TrainingError
 from r5dgs_core.train import checkpoint, finish, run, step_log
-from tests.support import tiny_datasets
+from tests.support import processes, tiny_datasets
 
 STEPS, IDENTITY = 150, 20
 OVERRIDES = (f"train.iterations={STEPS}", f"identity.iterations={IDENTITY}", "train.checkpoint_every=20")
@@ -68,16 +65,27 @@ def test_a_stopped_run_resumes_to_the_same_bits(tiny, unbroken, tmp_path, capsys
     assert log_of(folder) == log_of(unbroken[0])
 
 
+# A command that sends itself a signal when its progress reaches a step.
+SIGNALLED = """
+import json, os, sys
+from r5dgs_core.cli import main as cli
+step, number, write = int(sys.argv[1]), int(sys.argv[2]), sys.stdout.write
+
+def watch(text):
+    written = write(text)
+    if text.startswith("{") and json.loads(text).get("iteration", 0) >= step:
+        os.kill(os.getpid(), number)
+    return written
+
+sys.stdout.write = watch
+sys.exit(cli.main([*sys.argv[3:], "--progress", "json"]))
+"""
+
+
 def stop_at(step, number, options, folder):
-    """Train in a process of its own and send it a signal at a step."""
-    command = [sys.executable, "-m", "r5dgs_core.cli", *options, "--progress", "json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None and process.stderr is not None
-        for line in process.stdout:
-            if json.loads(line).get("iteration", 0) >= step:
-                os.kill(process.pid, number)
-                break
-        _, complaint = process.communicate(timeout=120)
+    """Train in a process of its own that gets a signal at a step."""
+    process = processes.run(SIGNALLED, step, int(number), *options)
+    complaint = process.stderr
     if not (folder / checkpoint.CHECKPOINT_FILE).exists():
         assert process.returncode == -signal.SIGKILL
         return

@@ -6,7 +6,6 @@ Kills and full disks happen to real processes.
 import json
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from r5dgs_core.data import images
 from r5dgs_core.errors import TrainingError
 from r5dgs_core.train import checkpoint, run
 from r5dgs_core.train.trainer import Trainer
-from tests.support import tiny_datasets
+from tests.support import processes, tiny_datasets
 from tests.support.command_line import complaint
 
 OVERRIDES = ("train.iterations=40", "identity.iterations=4", "train.checkpoint_every=10", "train.probe_every=0")
@@ -97,15 +96,10 @@ def assert_equal(ours, theirs):
     assert all(torch.equal(ours.tensors[name], tensor) for name, tensor in theirs.tensors.items())
 
 
-def in_process(code, *given):
-    command = [sys.executable, "-c", code, *map(str, given)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
-
-
 @pytest.mark.parametrize(("moment", "kept"), [("half", 10), ("before", 10), ("between", 10), ("after", 20)])
 def test_a_kill_within_a_write_leaves_a_whole_checkpoint(tiny, reference, tmp_path, moment, kept):
     folder = tmp_path / "run"
-    killed = in_process(KILLED_WITHIN_A_WRITE, moment, *arguments(tiny.root, folder))
+    killed = processes.run(KILLED_WITHIN_A_WRITE, moment, *arguments(tiny.root, folder))
     assert killed.returncode == -signal.SIGKILL
     assert checkpoint.load(folder).iteration == kept
     assert bool(list(folder.glob(".*.part"))) == (moment != "after")
@@ -126,7 +120,7 @@ def test_a_full_disk_stops_a_run_that_goes_on_when_there_is_room(tiny, reference
     path = folder / checkpoint.CHECKPOINT_FILE
     before = path.read_bytes()
     options = ["train", tiny.root, "--out", folder, "--resume", "--progress", "none"]
-    full = in_process(FULL_DISK, len(before) // 2, *options)
+    full = processes.run(FULL_DISK, len(before) // 2, *options)
     assert full.returncode == 3
     assert "checkpoint.pt: cannot be written" in full.stderr and "the checkpoint before it is kept" in full.stderr
     assert "Traceback" not in full.stderr
@@ -136,7 +130,7 @@ def test_a_full_disk_stops_a_run_that_goes_on_when_there_is_room(tiny, reference
 
 @needs_limits
 def test_a_full_disk_at_the_very_start_is_one_line(tiny, tmp_path):
-    full = in_process(FULL_DISK, 100, *arguments(tiny.root, tmp_path / "run"))
+    full = processes.run(FULL_DISK, 1000, *arguments(tiny.root, tmp_path / "run"))
     assert full.returncode == 3 and "Traceback" not in full.stderr
     assert f"{tmp_path / 'run'}: cannot be made or written" in full.stderr
 
