@@ -5,6 +5,7 @@ import shutil
 import pytest
 
 from r5dgs_core.bake import bake, image_evidence
+from r5dgs_core.bench import playback_speed
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.train import learning_curves, run
 from tests.support import pictures, scenes, tiny_datasets
@@ -34,6 +35,14 @@ def many_views(few_views, monkeypatch):
     """Baking uses as many images as it does for users."""
     monkeypatch.setattr(image_evidence, "FEWEST", few_views[0])
     monkeypatch.setattr(image_evidence, "MOST", few_views[1])
+
+
+@pytest.fixture(scope="session", autouse=True)
+def short_playback():
+    """Measure the playback speed over a dozen frames."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(playback_speed, "LEAST_FRAMES", 12)
+        yield
 
 
 @pytest.fixture
