@@ -12,13 +12,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import torch
 from packaging.requirements import Requirement
 from packaging.version import Version
 
 import r5dgs_core
 from r5dgs_core.cli import parser
-from tests.support import pages
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -90,18 +88,6 @@ def test_the_commands_of_the_readme_exist():
     commands = set(re.findall(r"^ {4}(?:.*&& )?r5dgs (\w+)", text, re.MULTILINE))
     known = set(next(a for a in parser.parser()._actions if a.dest == "command").choices)
     assert {"demo", "train", "bake", "evaluate"} <= commands <= known
-
-
-def test_the_python_of_the_readme_runs():
-    blocks = pages.blocks("README.md")
-    assert blocks
-    names: dict = {}
-    for block in blocks:
-        exec(compile(block, "README.md", "exec"), names)
-    assert names["picture"].image.shape == (300, 400, 5) and names["picture"].alpha.max() > 0.1
-    for name in ("means", "quats", "scales", "channels"):
-        gradient = names[name].grad
-        assert torch.isfinite(gradient).all() and gradient.abs().max() > 0
 
 
 def anchors_of(text: str) -> set[str]:

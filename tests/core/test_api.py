@@ -13,7 +13,7 @@ from r5dgs_core.scene import scene_file
 from tests.support import pages, tiny_datasets
 
 PAGE = "docs/reference/python.md"
-PLAY, TRAIN = pages.blocks(PAGE)
+PLAY, TRAIN, RASTERIZE = pages.blocks(PAGE)
 
 
 def test_the_page_plays_a_scene(scene, tmp_path, monkeypatch):
@@ -25,6 +25,17 @@ def test_the_page_plays_a_scene(scene, tmp_path, monkeypatch):
     assert image.shape == (camera.height, camera.width, 3) and image.min() >= 0 and 0.2 < image.max() <= 1
 
 
+def test_the_readme_predicts_a_scene(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demo").mkdir()
+    scene_file.write(scene, tmp_path / "demo" / "demo.r5dgs", exact=True)
+    (code,) = pages.blocks("README.md")
+    names: dict = {}
+    exec(code, names)
+    assert names["image"].ndim == 3 and 0.2 < names["image"].max() <= 1
+    assert all(matrix.shape == (4, 4) for matrix in names["matrices"].values())
+
+
 def test_the_page_trains_and_evaluates_a_scene(tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(tiny.root, tmp_path / "my_images")
@@ -34,6 +45,15 @@ def test_the_page_trains_and_evaluates_a_scene(tiny, tmp_path, monkeypatch):
     exec(TRAIN.replace('["train.iterations=3000"]', repr(few)), names)
     assert r5dgs_core.load("scene.r5dgs").objects == names["scene"].objects
     assert names["result"]["splits"]["test"]["rigid"]["images"] == 4
+
+
+def test_the_page_rasterizes_with_gradients():
+    names: dict = {}
+    exec(RASTERIZE, names)
+    assert names["picture"].image.shape == (300, 400, 5) and names["picture"].alpha.max() > 0.1
+    for name in ("means", "quats", "scales", "channels"):
+        gradient = names[name].grad
+        assert gradient.isfinite().all() and gradient.abs().max() > 0
 
 
 def test_poses_move_the_gaussians_of_their_objects(scene):
