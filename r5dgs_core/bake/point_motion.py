@@ -15,7 +15,7 @@ from ..motion import rotations
 from ..scene.scene import Dynamics, MotionGroup, Residuals
 from ..train.normalization import Normalization
 from ..train.observed_motion import PointMotion
-from ..train.representations import representation
+from ..train.representations import registry
 from .draft import Context, Draft, Need
 
 AT_ONCE = 8192  # Gaussians per block; bounds memory
@@ -33,7 +33,7 @@ def apply(draft: Draft, context: Context) -> Draft:
             points, context.norm, bound.cloud.motion_ids, bound.trained, bound.pivots, draft.order, extent
         )
     bent = draft.bent
-    if context.state.representation != representation.STILL:
+    if registry.by_name(context.state.representation).moves:
         from ..train.representations import residual
 
         found = residual.need(context.tensors, context.dataset.object_names, context.config, bends is not None)

@@ -38,11 +38,12 @@ def observe(context: Context) -> Observed:
     if not all(np.isfinite(a).all() for a in g.values()):
         raise CheckpointError(f"{context.run.folder}: the checkpoint holds values that are not finite; train again")
     present = tensors["object_ids"].numpy()
+    representation = registry.by_name(state.representation)
     if "labels" in tensors:
         labels = tensors["labels"].numpy()
     else:  # an unfinished run has no labels yet
-        labels = registry.group_classes(state.representation, tensors)[g["motion_ids"]]
-    motion = registry.observed_motion(state.representation, tensors, present, state.observed.numpy(), labels, config)
+        labels = representation.group_classes(tensors)[g["motion_ids"]]
+    motion = representation.observed_motion(tensors, present, state.observed.numpy(), labels, config)
     g |= motion.gaussians or {}
     if motion.motion_ids is not None:
         g["motion_ids"] = motion.motion_ids

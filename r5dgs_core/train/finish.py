@@ -12,8 +12,7 @@ import torch
 from ..config import training_needs
 from ..scene.splats import to_opacities
 from . import checkpoint_content, probe
-from .identity import identity_training, label_cleanup, packed_masks
-from .representations import registry
+from .identity import identity_training, label_cleanup, label_votes, packed_masks
 from .representations.fused_posing import Splats
 from .train_views import TrainView
 from .trainer import Trainer
@@ -44,8 +43,8 @@ def outcome(trainer: Trainer, progress: Progress) -> dict[str, torch.Tensor]:
             return trainer.splats(view.camera, view.t)
 
         progress({"event": "prepare", "text": "labels, by a vote of the masks"})
-        votes = identity_training.votes(trainer.views, pose, classes, len(fallback))
-        extra["labels"] = identity_training.elect(votes, fallback)
+        votes = label_votes.votes(trainer.views, pose, classes, len(fallback))
+        extra["labels"] = label_votes.elect(votes, fallback)
         steps = identity_steps(trainer)
         if trainer.identity is not None:
             extra |= trainer.identity.outcome(trainer.gaussians)
@@ -94,8 +93,7 @@ def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dic
     given, ids = labels.numpy(), trainer.gaussians.motion_ids
     params = {name: tensor.detach() for name, tensor in trainer.gaussians.params.items()}
     tensors = {f"gaussians.{name}": tensor for name, tensor in params.items()} | trainer.motion.tensors()
-    motion = registry.observed_motion(
-        trainer.motion.name,
+    motion = trainer.motion.observed_motion(
         tensors | {"gaussians.motion_ids": ids},
         trainer.object_ids,
         trainer.places.measured,

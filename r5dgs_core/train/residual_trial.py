@@ -22,7 +22,7 @@ from ..config.config import Config
 from ..errors import TrainingError
 from ..model import residual_field
 from ..model.residual_field import ResidualField
-from .representations import residual
+from .representations import registry, residual
 from .trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,8 @@ def decision_step(config: Config, all_entered: int) -> int | None:
         all_entered: Step at which the last observed time joins the training.
     """
     wanted = config.needs
-    if config.train.representation != "tracks" or wanted.residuals == "off" or wanted.tracks == "off":
+    takes_residuals = registry.configured(config).takes_residuals
+    if not takes_residuals or wanted.residuals == "off" or wanted.tracks == "off":
         return None
     step = max(int(config.residual.start * config.train.iterations), all_entered, 1)
     return step if step < config.train.iterations else None

@@ -89,3 +89,17 @@ def spread(items: Sequence[Item], limit: int) -> list[Item]:
 def nearest_knot(times: np.ndarray, t: float) -> int:
     """Return the index of the observed time [S] nearest to ``t``."""
     return int(np.argmin(np.abs(times - t)))
+
+
+def by_camera(views: Sequence[TrainView], limit: int) -> list[list[TrainView]]:
+    """Group views by camera (pose, lens and size); ``limit`` cameras spread evenly if there are more."""
+    groups: dict[bytes, list[TrainView]] = {}
+    for view in views:
+        groups.setdefault(camera_key(view.camera), []).append(view)
+    return spread(list(groups.values()), limit)
+
+
+def camera_key(camera: Camera) -> bytes:
+    """Return a key that is equal for cameras of the same pose, lens and image size."""
+    size = np.array([camera.width, camera.height])
+    return np.round(camera.T_cam_world, 5).tobytes() + np.round(camera.intrinsics, 3).tobytes() + size.tobytes()

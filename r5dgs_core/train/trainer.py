@@ -29,9 +29,10 @@ from . import curriculum, losses, normalization, train_views
 from . import optimizer as optimizers
 from .checkpoint import Checkpoint
 from .densification import densifier, gradient
-from .identity import identity_training, packed_masks
-from .initialization import initialize, plane_sweep, sky, thinning
+from .identity import joint_identity, packed_masks
+from .initialization import initialize, sky, thinning
 from .representations import fused_posing, registry, static
+from .representations.representation import Representation
 
 log = logging.getLogger(__name__)
 
@@ -67,12 +68,12 @@ class Trainer:
         self.views = train_views.load(dataset, self.normalization, self.behind)
         self.found = None if found is None else packed_masks.pack(found)
         shown = self.views if found is None else train_views.with_masks(self.views, found)
-        still = static.applies(self.views, config)
-        if still:
+        motion = registry.configured(config, still=static.applies(self.views, config))
+        if not motion.moves:
             self.config = config = config.replace(**{"train.shading": False, "train.shadows": False})
-        start = self._start(shown, still)
+        start = self._start(shown, motion)
         self.gaussians: Gaussians = start.gaussians
-        self.motion = registry.make(start, config, still)
+        self.motion = registry.make(motion, start, config)
         self.times = start.tracks.times
         self.object_ids = start.object_ids
         self.places = start.places
@@ -80,7 +81,7 @@ class Trainer:
         self.background = self._background(start.sky)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         classes = {int(object_id): row for row, object_id in enumerate(self.object_ids)}
-        self.identity = identity_training.joint(self.views, classes, config)
+        self.identity = joint_identity.joint(self.views, classes, config)
         if self.identity is not None:
             self.identity.begin(self.gaussians)
         self.rates = optimizers.Rates(config, {} if self.identity is None else self.identity.rates)
@@ -88,17 +89,17 @@ class Trainer:
         self.running_loss = math.nan
         view_times = np.array([train_views.nearest_knot(self.times, v.t) for v in self.views])
         self.curriculum = curriculum.Curriculum(config, view_times, len(self.times), self.first_time)
-        self.eyes = [group[0].camera for group in plane_sweep.by_camera(self.views, EYES)]
+        self.eyes = [group[0].camera for group in train_views.by_camera(self.views, EYES)]
         self.held = torch.zeros(0, dtype=torch.bool)
         self.optimizer = self._make_optimizer()
         self.growth = gradient.make(config, self._conditions(), len(self.gaussians))
         self._targets: dict[int, Tensor] = {}
 
-    def _start(self, views: Sequence[train_views.TrainView], still: bool) -> initialize.Start:
+    def _start(self, views: Sequence[train_views.TrainView], motion: type[Representation]) -> initialize.Start:
         """Return the initial state. Raises DatasetError if no Gaussian can be placed."""
         config, dataset = self.config, self.dataset
         rng = np.random.default_rng(config.train.seed)
-        start = initialize.start(views, config, self.behind is None, rng, self._cloud(), still)
+        start = initialize.start(views, config, motion, self.behind is None, rng, self._cloud())
         if len(start.gaussians) == 0:
             raise DatasetError(
                 f"{dataset.root}: no Gaussian can be placed: no mask shows an object, and the background is all sky "

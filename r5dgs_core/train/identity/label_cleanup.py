@@ -1,6 +1,6 @@
 """Clean-up of object labels by spatial neighbours, motion and outlier removal.
 
-The vote of the masks (`identity_training.votes`) leaves Gaussians undecided that lie on an outline, are shown by few
+The vote of the masks (`label_votes.votes`) leaves Gaussians undecided that lie on an outline, are shown by few
 masks, or are claimed by wrong masks. Only the labels of undecided Gaussians change, according to their neighbours and
 to the group that they move with. `regrouping` is the corresponding rule for motion groups.
 

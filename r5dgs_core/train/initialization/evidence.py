@@ -17,8 +17,7 @@ from scipy import ndimage
 
 from ...data import masks
 from ...scene import cameras
-from ..train_views import TrainView, nearest_knot, spread
-from .plane_sweep import camera_key
+from ..train_views import TrainView, camera_key, nearest_knot, spread
 from .triangulation import Places
 
 TEXTURE = 0.1  # change of colour per radian (root mean square) that makes rotation observable

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...config.config import Config
+from ...config.sections import InitSection
 from ...model.gaussians import Gaussians
-from ..train_views import TrainView, nearest_knot, spread
-from . import evidence, place_gaussians, plane_sweep, scatter, shadows, triangulation, visual_hull
+from ..representations.representation import Representation
+from ..train_views import TrainView, camera_key, nearest_knot, spread
+from . import background_images, evidence, place_gaussians, plane_sweep, scatter, shadows, triangulation, visual_hull
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +81,7 @@ def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
     """
     of_camera: dict[bytes, set[float]] = {}
     for view in views:
-        of_camera.setdefault(plane_sweep.camera_key(view.camera), set()).add(round(view.t, 9))
+        of_camera.setdefault(camera_key(view.camera), set()).add(round(view.t, 9))
     steps = [np.diff(sorted(found)) for found in of_camera.values() if len(found) > 1]
     times = np.unique([t for found in of_camera.values() for t in found])
     if steps:
@@ -97,34 +99,66 @@ def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
 def start(
     views: Sequence[TrainView],
     config: Config,
+    motion: type[Representation],
     find_sky: bool,
     rng: np.random.Generator,
     cloud: tuple[np.ndarray, np.ndarray] | None = None,
-    still: bool = False,
 ) -> Start:
     """Create the initial Gaussians and tracks.
 
     Args:
         views: Training views in normalised coordinates.
         config: Configuration of the run.
+        motion: Representation that will be trained. If it never moves, all images show one time.
         find_sky: True if the background may contain sky; False if its colour is fixed.
         rng: Random generator.
         cloud: Points and colours in [0, 1] of a reconstruction, normalised coordinates. [P, 3] each
-        still: True if nothing moves, so that all images show one time.
 
     Returns:
         The initial state.
     """
     init = config.init
     times = observed_times(views)
-    if still and len(times) > 1:
+    if not motion.moves and len(times) > 1:
         log.info("nothing moves in any view: training a static scene")
         times = times[-1:]
     places = triangulation.locate(views, times, init.min_mask_pixels)
-    unmasked = all(v.mask is None for v in views)
-    by_field = config.train.representation == "field" and not still
-    if unmasked and not still:
-        if by_field:
+    _warn(views, motion)
+    by_motion = motion.sorts_by_motion and all(v.mask is None for v in views)
+    first = 0 if config.curriculum.start == "first" else _first_time(places, len(times))
+    if by_motion and config.curriculum.start != "first":
+        first = (len(times) - 1) // 2
+    centers, translations, clouds = _bodies(views, times, places, first, init, rng)
+    backgrounds = background_images.compute(_at_once(views, times, first) if by_motion else views)
+    # With random points, the sweep serves only to find the sky and the plane.
+    swept = min(init.background_points, 5000) if init.placement == "random" else init.background_points
+    search = plane_sweep.Sweep(backgrounds, swept, init.sweep_depths)
+    eyes = np.stack([v.camera.center for v in views])
+    plane = supporting_plane(search.distinct_points(), places, eyes, rng)
+    placed = search.place(swept, plane, find_sky, rng)
+    where, shade = _background(views, backgrounds, placed, init, rng, cloud)
+    log.info("background: %d points from %d cameras; %d objects", len(where), len(backgrounds), len(clouds))
+    parts = [place_gaussians.solid([*clouds, (where, shade, 0)], init.opacity)]
+    casters, slope = np.zeros(0, np.int64), np.zeros(3)
+    if plane is not None and config.train.shadows and init.shadow_points > 0 and motion.moves:
+        casters = np.arange(1, len(centers))
+        light = shadows.find_light(views, backgrounds, places, times, plane, rng)
+        slope = shadows.slope(light.direction, plane[0])
+        log.info("light travels along %s (darkening %.3f)", np.round(light.direction, 2), light.darkening)
+        for body in casters:
+            known, group = (centers[body], float(places.radii[body - 1])), len(centers) + int(body) - 1
+            parts.append(place_gaussians.shadow(*known, light.direction, plane, group, init.shadow_points, rng))
+    gaussians = place_gaussians.gaussians_of(parts, config.train.sh_degree)
+    tracks = FirstTracks(times, centers, translations, casters, None if plane is None else plane[0], slope)
+    ids = np.concatenate([[0], places.object_ids])
+    seen = evidence.gather(views, places, times)
+    return Start(gaussians, tracks, ids, places, first, plane, placed.sky, seen)
+
+
+def _warn(views: Sequence[TrainView], motion: type[Representation]) -> None:
+    """Warn if objects or motion cannot be learned from the views."""
+    if motion.moves and all(v.mask is None for v in views):
+        if motion.sorts_by_motion:
             log.warning("no masks: the field moves all Gaussians, and objects are found by their motion. %s", MASKS)
         else:
             log.warning(
@@ -132,61 +166,60 @@ def start(
             )
     elif len({view.t for view in views}) == 1:
         log.warning("only one observed time: motion cannot be learned. Remedy: frames at more times")
-    first = 0 if config.curriculum.start == "first" else _first_time(places, len(times))
-    if unmasked and by_field and config.curriculum.start != "first":
-        first = (len(times) - 1) // 2
+
+
+def _bodies(
+    views: Sequence[TrainView],
+    times: np.ndarray,
+    places: triangulation.Places,
+    first: int,
+    init: InitSection,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray, int]]]:
+    """Place the objects in their visual hulls, each at its reference time.
+
+    Returns:
+        Centres [B, 3] and translations [B, S, 3] of the bodies, row 0 for the pinned group; and points, colours and
+        row of each object.
+    """
     bodies = len(places.object_ids) + 1
     centers = np.zeros((bodies, 3))
     translations = np.zeros((bodies, len(times), 3))
+    count = 0 if init.placement == "random" else init.object_points
     clouds = []
-    at_random = init.placement == "random"
     for row, object_id in enumerate(places.object_ids):
         reference = _reference_time(places.visibility[row], places.measured[row], first)
         centers[row + 1] = places.centers[row, reference]
         translations[row + 1] = places.centers[row] - centers[row + 1]
         then = [v for v in views if v.mask is not None and nearest_knot(times, v.t) == reference]
-        count = 0 if at_random else init.object_points
         carved = visual_hull.carve(then, int(object_id), centers[row + 1], places.radii[row], count, rng)
         clouds.append((*carved, row + 1))
-    scenes = plane_sweep.backdrops(_at_once(views, times, first) if unmasked and by_field else views)
-    # With random points, the sweep serves only to find the sky and the plane.
-    swept = min(init.background_points, 5000) if at_random else init.background_points
-    search = plane_sweep.Sweep(scenes, swept, init.sweep_depths)
-    eyes = np.stack([v.camera.center for v in views])
-    plane = supporting_plane(search.distinct_points(), places, eyes, rng)
-    placed = search.place(swept, plane, find_sky, rng)
+    return centers, translations, clouds
+
+
+def _background(
+    views: Sequence[TrainView],
+    backgrounds: Sequence[background_images.BackgroundImage],
+    placed: plane_sweep.Placed,
+    init: InitSection,
+    rng: np.random.Generator,
+    cloud: tuple[np.ndarray, np.ndarray] | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and colours of the background: random, of a reconstruction, or of the sweep. [P, 3] each"""
     where, shade = placed.points, placed.colors
-    if at_random:
-        where, shade = scatter.everywhere(scenes, init.background_points, rng)
+    if init.placement == "random":
+        where, shade = scatter.everywhere(backgrounds, init.background_points, rng)
     elif cloud is not None:
         known, hues = scatter.behind_objects(*cloud, views, init.background_points, rng)
         fill = rng.permutation(len(where))[: max(0, init.background_points - len(known))]
         where, shade = np.concatenate([known, where[fill]]), np.concatenate([hues, shade[fill]])
-    log.info("background: %d points from %d cameras; %d objects", len(where), len(scenes), bodies - 1)
     if len(where) == 0:
         log.warning(
             "the background cannot be placed: too little of it is visible to two cameras (there %s). Remedy: more "
             "cameras that look at the same place",
-            "is one" if len(scenes) == 1 else f"are {len(scenes)}",
+            "is one" if len(backgrounds) == 1 else f"are {len(backgrounds)}",
         )
-    parts = [place_gaussians.solid([*clouds, (where, shade, 0)], init.opacity)]
-    casters = np.zeros(0, np.int64)
-    shadow_slope = np.zeros(3)
-    if plane is not None and config.train.shadows and init.shadow_points > 0 and not still:
-        casters = np.arange(1, bodies)
-        light = shadows.find_light(views, scenes, places, times, plane, rng)
-        shadow_slope = shadows.slope(light.direction, plane[0])
-        log.info("light travels along %s (darkening %.3f)", np.round(light.direction, 2), light.darkening)
-        for body in casters:
-            radius, group = float(places.radii[body - 1]), bodies + int(body) - 1
-            parts.append(
-                place_gaussians.shadow(centers[body], radius, light.direction, plane, group, init.shadow_points, rng)
-            )
-    gaussians = place_gaussians.gaussians_of(parts, config.train.sh_degree)
-    tracks = FirstTracks(times, centers, translations, casters, None if plane is None else plane[0], shadow_slope)
-    known = evidence.gather(views, places, times)
-    ids = np.concatenate([[0], places.object_ids])
-    return Start(gaussians, tracks, ids, places, first, plane, placed.sky, known)
+    return where, shade
 
 
 def supporting_plane(
@@ -235,7 +268,7 @@ def supporting_plane(
 def _at_once(views: Sequence[TrainView], times: np.ndarray, knot: int) -> Sequence[TrainView]:
     """Return the views of one observed time, in which moving objects have one place; all views if these are too few."""
     then = [v for v in views if nearest_knot(times, v.t) == knot]
-    return then if len({plane_sweep.camera_key(v.camera) for v in then}) >= FEWEST_EYES else views
+    return then if len({camera_key(v.camera) for v in then}) >= FEWEST_EYES else views
 
 
 def _first_time(places: triangulation.Places, count: int) -> int:

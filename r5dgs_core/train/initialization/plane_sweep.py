@@ -1,10 +1,10 @@
 """Plane sweep that places the initial static background.
 
-The images of each camera are reduced to one image without objects (median over time of the unmasked pixels). For a grid
+Each camera has one image without objects (`background_images`). For a grid
 of its rays, a range of depths is compared; at a good depth the other cameras see the same colour. Rays on which
 infinity is as good as any depth show sky and place no points; the learned background represents them.
 
-Notation: B backdrops, [h, w] a grid of rays, D depths.
+Notation: B background images, [h, w] a grid of rays, D depths.
 """
 
 from __future__ import annotations
@@ -19,15 +19,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 from scipy.spatial import ConvexHull, KDTree
 
-from ...data import masks
 from ...scene import cameras
-from ..train_views import TrainView, spread
 from . import sky
+from .background_images import BackgroundImage
 
-MAX_BACKDROPS = 24
 MAX_NEIGHBOURS = 8
-MAX_FRAMES = 31  # frames per camera for the median
-MEDIAN_VALUES = 1 << 23  # colours per sorted band
 COST_VALUES = 1 << 22  # colour differences per compared band
 NEAREST, FARTHEST = 0.4, 60.0  # normalised units; the cameras' focus is at about 4
 INFINITE = 1e5
@@ -35,88 +31,6 @@ PLANE_REACH = 12.0  # largest depth of rays that extend the plane beyond its reg
 SAME = 0.012  # insignificant colour difference
 GOOD = 0.12  # larger colour differences are no match
 CONFIRMATIONS = 2  # other cameras that must agree on a depth
-
-
-@dataclass(frozen=True)
-class Backdrop:
-    """View of one camera without the objects: image [H, W, 3] in [0, 1] and mask of known pixels [H, W]."""
-
-    camera: cameras.Camera
-    image: np.ndarray
-    known: np.ndarray
-
-
-def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
-    """Return the median over time of the unmasked pixels, one per distinct camera."""
-    result = []
-    for group in by_camera(views, MAX_BACKDROPS):
-        frames = spread(group, MAX_FRAMES)
-        free = _free(frames)
-        image = _median([v.image for v in frames], free)
-        result.append(Backdrop(group[0].camera, image, np.asarray(free.any(0))))
-    return result
-
-
-def _median(images: Sequence[np.ndarray], free: np.ndarray) -> np.ndarray:
-    """Return the median of the free pixels, 0 if a pixel is never free; computed in bands to save memory.
-
-    Args:
-        images: F images. [H, W, 3] uint8
-        free: Mask of the pixels that count. [F, H, W] bool
-
-    Returns:
-        Colours in [0, 1]. [H, W, 3] float32
-    """
-    count, height, width = free.shape
-    result = np.zeros((height, width, 3), np.float32)
-    rows = max(1, MEDIAN_VALUES // (3 * count * width))
-    for top in range(0, height, rows):
-        band = slice(top, top + rows)
-        values = np.stack([image[band] for image in images]).astype(np.int16)
-        values[~free[:, band]] = 256  # sorts after all colours
-        values.sort(axis=0)
-        free_count = free[:, band].sum(0)
-        low, high = (
-            np.take_along_axis(values, np.broadcast_to(k[None, ..., None], (1, *values.shape[1:])), 0)[0]
-            for k in (np.maximum(free_count - 1, 0) // 2, np.minimum(free_count // 2, count - 1))
-        )
-        middle = (low + high).astype(np.float32) / np.float32(510)
-        result[band] = np.where((free_count > 0)[..., None], middle, np.float32(0))
-    return result
-
-
-def by_camera(views: Sequence[TrainView], limit: int) -> list[list[TrainView]]:
-    """Group views by camera (pose, lens and size); ``limit`` cameras spread evenly if there are more."""
-    groups: dict[bytes, list[TrainView]] = {}
-    for view in views:
-        groups.setdefault(camera_key(view.camera), []).append(view)
-    return spread(list(groups.values()), limit)
-
-
-def camera_key(camera: cameras.Camera) -> bytes:
-    """Return a key that is equal for cameras of the same pose, lens and image size."""
-    size = np.array([camera.width, camera.height])
-    return np.round(camera.T_cam_world, 5).tobytes() + np.round(camera.intrinsics, 3).tobytes() + size.tobytes()
-
-
-def _free(frames: Sequence[TrainView]) -> np.ndarray:
-    """Mask of the background pixels in each frame of a camera. [F, H, W] bool
-
-    Pixels that are unknown in all masks of the camera count as background.
-    """
-    free = np.ones((len(frames), *frames[0].image.shape[:2]), bool)
-    told = np.zeros(free.shape[1:], bool)
-    for k, view in enumerate(frames):
-        if view.mask is not None:
-            free[k] = np.logical_not(ndimage.binary_dilation(view.mask > 0))
-            told |= view.mask != masks.UNKNOWN
-        else:
-            told[:] = True
-    free |= ~told
-    for k, view in enumerate(frames):
-        if view.alpha is not None:
-            free[k] &= view.alpha > 127
-    return free
 
 
 @dataclass(frozen=True)
@@ -130,10 +44,10 @@ class Placed:
 
 @dataclass(frozen=True)
 class Rays:
-    """Result of the sweep along the rays of one backdrop.
+    """Result of the sweep along the rays of one background image.
 
     Attributes:
-        backdrop: Index of the backdrop.
+        image: Index of the background image.
         directions: Ray directions scaled to depth 1, world. [h, w, 3]
         colors: Colour of each ray. [h, w, 3]
         depths: Best depth of each ray. [h, w]
@@ -141,10 +55,10 @@ class Rays:
         flat: True if most depths are about as good, as on sky and on uniform surfaces. [h, w] bool
         sky: True if infinity is about as good. [h, w] bool
         known: True if the colour is known. [h, w] bool
-        neighbours: Backdrops that it was compared with.
+        neighbours: Background images that it was compared with.
     """
 
-    backdrop: int
+    image: int
     directions: np.ndarray
     colors: np.ndarray
     depths: np.ndarray
@@ -156,30 +70,31 @@ class Rays:
 
 
 class Sweep:
-    """Plane sweep over all backdrops.
+    """Plane sweep over all background images.
 
     Args:
-        scenes: Backdrops of the cameras.
+        backgrounds: Background image of each camera.
         count: Number of points that will be placed; determines the number of rays.
         depths: Depths per ray, evenly spaced in inverse depth.
     """
 
-    def __init__(self, scenes: Sequence[Backdrop], count: int, depths: int):
-        self.scenes = scenes
+    def __init__(self, backgrounds: Sequence[BackgroundImage], count: int, depths: int):
+        self.backgrounds = backgrounds
         self._images = [
-            torch.from_numpy(ndimage.gaussian_filter(b.image, (0.7, 0.7, 0))).permute(2, 0, 1)[None] for b in scenes
+            torch.from_numpy(ndimage.gaussian_filter(b.image, (0.7, 0.7, 0))).permute(2, 0, 1)[None]
+            for b in backgrounds
         ]
-        self._known = [torch.from_numpy(b.known.astype(np.float32))[None, None] for b in scenes]
+        self._known = [torch.from_numpy(b.known.astype(np.float32))[None, None] for b in backgrounds]
         inverse = np.linspace(1 / NEAREST, 1 / FARTHEST, depths)
         self._step = float(inverse[0] - inverse[-1]) / max(1, depths - 1)
         z = np.append(1 / inverse, INFINITE)
-        each = max(256, 5 * count // max(1, len(scenes)))
-        self.rays = [r for i in range(len(scenes)) if (r := self._sweep(i, z, each)) is not None]
+        each = max(256, 5 * count // max(1, len(backgrounds)))
+        self.rays = [r for i in range(len(backgrounds)) if (r := self._sweep(i, z, each)) is not None]
 
     def _sweep(self, i: int, z: np.ndarray, rays_each: int) -> Rays | None:
-        reference = self.scenes[i]
-        centers = np.stack([b.camera.center for b in self.scenes])
-        ahead = np.stack([b.camera.forward for b in self.scenes]) @ reference.camera.forward
+        reference = self.backgrounds[i]
+        centers = np.stack([b.camera.center for b in self.backgrounds])
+        ahead = np.stack([b.camera.forward for b in self.backgrounds]) @ reference.camera.forward
         order = np.argsort(np.linalg.norm(centers - centers[i], axis=1) - 2 * ahead)
         neighbours = tuple(int(j) for j in order if j != i and ahead[j] > -0.2)[:MAX_NEIGHBOURS]
         if not neighbours:
@@ -205,21 +120,21 @@ class Sweep:
         self, i: int, directions: np.ndarray, depths: np.ndarray, colors: np.ndarray, neighbours: Sequence[int]
     ) -> torch.Tensor:
         """Colour difference of rays [h, w, 3] at depths [D] or [h, w, D] to the neighbours, in bands. [h, w, D]"""
-        others = [(self.scenes[j].camera, self._images[j], self._known[j]) for j in neighbours]
+        others = [(self.backgrounds[j].camera, self._images[j], self._known[j]) for j in neighbours]
         height, width = directions.shape[:2]
         rows = max(1, COST_VALUES // (width * depths.shape[-1] * max(1, len(others))))
         bands = []
         for top in range(0, height, rows):
             band = slice(top, top + rows)
             z = depths if depths.ndim == 1 else depths[band]
-            world = self.scenes[i].camera.center + directions[band][:, :, None] * z[..., None]
+            world = self.backgrounds[i].camera.center + directions[band][:, :, None] * z[..., None]
             bands.append(_cost(torch.from_numpy(world).float(), torch.from_numpy(colors[band]), others))
         return torch.cat(bands)
 
     def distinct_points(self) -> np.ndarray:
         """Return points on rays with one distinct depth, for fitting planes. [P, 3]"""
         found = [
-            self.scenes[r.backdrop].camera.center + (r.directions * r.depths[..., None])[good]
+            self.backgrounds[r.image].camera.center + (r.directions * r.depths[..., None])[good]
             for r in self.rays
             if (good := (r.costs < GOOD) & ~r.flat & ~r.sky).any()
         ]
@@ -245,7 +160,7 @@ class Sweep:
         """
         if not self.rays:
             return Placed(np.zeros((0, 3)), np.zeros((0, 3)), None)
-        eyes = [np.broadcast_to(self.scenes[r.backdrop].camera.center, r.directions.shape) for r in self.rays]
+        eyes = [np.broadcast_to(self.backgrounds[r.image].camera.center, r.directions.shape) for r in self.rays]
         origin = _flatten(eyes)
         direction, color = _flatten([r.directions for r in self.rays]), _flatten([r.colors for r in self.rays])
         depth, cost = _flatten([r.depths for r in self.rays]), _flatten([r.costs for r in self.rays])
@@ -289,7 +204,7 @@ class Sweep:
         maps = np.split(depth, np.cumsum([r.depths.size for r in self.rays])[:-1])
         agreed = np.zeros(len(points), int)
         for k, (rays, values) in enumerate(zip(self.rays, maps, strict=True)):
-            camera = self.scenes[rays.backdrop].camera
+            camera = self.backgrounds[rays.image].camera
             height, width = rays.depths.shape
             pixels, z = cameras.project(camera, points)
             column, row = pixels[:, 0] / camera.width * width, pixels[:, 1] / camera.height * height
@@ -302,19 +217,19 @@ class Sweep:
 
     def _up(self) -> np.ndarray:
         """Mean upward direction of the cameras, unit. [3]"""
-        up = -np.stack([b.camera.T_cam_world[1, :3] for b in self.scenes]).mean(0)
+        up = -np.stack([b.camera.T_cam_world[1, :3] for b in self.backgrounds]).mean(0)
         return up / max(float(np.linalg.norm(up)), 1e-9)
 
     def _on_plane(self, rays: Rays, plane: tuple[np.ndarray, float]) -> tuple[np.ndarray, np.ndarray]:
         """Return the depth at which each ray meets a plane, and the colour difference there (infinite if it misses)."""
         normal, height = plane
-        center = self.scenes[rays.backdrop].camera.center
+        center = self.backgrounds[rays.image].camera.center
         slope = rays.directions @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = (height - center @ normal) / slope
         hits = np.isfinite(depth) & (depth > NEAREST) & (depth < FARTHEST)
         depth = np.where(hits, depth, 1.0)
-        compared = self._compare(rays.backdrop, rays.directions, depth[..., None], rays.colors, rays.neighbours)
+        compared = self._compare(rays.image, rays.directions, depth[..., None], rays.colors, rays.neighbours)
         cost = _smooth(compared)[..., 0].numpy()
         return depth, np.where(hits, cost, np.inf)
 

@@ -10,33 +10,35 @@ from ...data import masks
 from ...scene import cameras
 from ..normalization import TARGET_DISTANCE
 from ..train_views import TrainView
-from .plane_sweep import Backdrop
+from .background_images import BackgroundImage
 from .visual_hull import pixel_indices
 
 REACH = 1.5  # half the side of the sampled cube / distance of the cameras from their focus
 BATCHES = 64
 
 
-def everywhere(scenes: Sequence[Backdrop], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def everywhere(
+    backgrounds: Sequence[BackgroundImage], count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Draw random points that at least two cameras see (one if there is only one camera).
 
     Args:
-        scenes: Backdrops of the cameras; normalised coordinates.
+        backgrounds: Background image of each camera; normalised coordinates.
         count: Number of points; fewer are returned if the cameras see little of the space around their focus.
         rng: Random generator.
 
     Returns:
         Points [P, 3] and colours near middle grey [P, 3].
     """
-    needed = min(2, len(scenes))
+    needed = min(2, len(backgrounds))
     kept, found = [np.zeros((0, 3))], 0
     for _ in range(BATCHES):
         points = rng.uniform(-REACH * TARGET_DISTANCE, REACH * TARGET_DISTANCE, (count, 3))
         seen = np.zeros(len(points), np.int64)
-        for scene in scenes:
-            pixels, depth = cameras.project(scene.camera, points)
+        for background in backgrounds:
+            pixels, depth = cameras.project(background.camera, points)
             with np.errstate(invalid="ignore"):
-                inside = (pixels >= 0).all(1) & (pixels < [scene.camera.width, scene.camera.height]).all(1)
+                inside = (pixels >= 0).all(1) & (pixels < [background.camera.width, background.camera.height]).all(1)
             seen += inside & (depth > 0)
         kept.append(points[seen >= needed])
         found += len(kept[-1])

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from ..train_views import TrainView, nearest_knot
-from .plane_sweep import Backdrop, camera_key, plane_axes
+from ..train_views import TrainView, camera_key, nearest_knot
+from .background_images import BackgroundImage
+from .plane_sweep import plane_axes
 from .triangulation import Places
 from .visual_hull import pixel_indices
 
@@ -36,7 +37,7 @@ class Light:
 
 def find_light(
     views: Sequence[TrainView],
-    scenes: Sequence[Backdrop],
+    backgrounds: Sequence[BackgroundImage],
     places: Places,
     times: np.ndarray,
     plane: tuple[np.ndarray, float],
@@ -46,7 +47,7 @@ def find_light(
 
     Args:
         views: Training views.
-        scenes: Usual image of each camera without the objects.
+        backgrounds: Background image of each camera.
         places: Positions of the objects at each time.
         times: The observed times. [S]
         plane: Unit normal and offset of the supporting plane.
@@ -59,13 +60,13 @@ def find_light(
     directions = _directions(normal)
     score = np.zeros(len(directions))
     count = np.zeros(len(directions))
-    backdrop_of = {camera_key(b.camera): b for b in scenes}
+    background_of = {camera_key(b.camera): b for b in backgrounds}
     offsets = _disc(normal, rng)
     for view in views:
-        backdrop = backdrop_of.get(camera_key(view.camera))
-        if backdrop is None:
+        background = background_of.get(camera_key(view.camera))
+        if background is None:
             continue
-        darkening, known = _darkening(view, backdrop)
+        darkening, known = _darkening(view, background)
         s = nearest_knot(times, view.t)
         for row in np.flatnonzero(places.measured[:, s]):
             center = places.centers[row, s]
@@ -117,11 +118,11 @@ def _disc(normal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return points
 
 
-def _darkening(view: TrainView, backdrop: Backdrop) -> tuple[np.ndarray, np.ndarray]:
+def _darkening(view: TrainView, background: BackgroundImage) -> tuple[np.ndarray, np.ndarray]:
     """Return the relative loss of brightness in a view, and a mask of pixels where it is known. [H, W] each"""
-    usual = backdrop.image.mean(-1)
+    usual = background.image.mean(-1)
     now = view.image.mean(-1) / 255
-    known = backdrop.known & (usual > 0.02)
+    known = background.known & (usual > 0.02)
     if view.mask is not None:
         known &= np.logical_not(ndimage.binary_dilation(view.mask > 0))
     return np.where(known, 1 - now / np.maximum(usual, 0.02), 0.0), known

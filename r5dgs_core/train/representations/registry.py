@@ -5,64 +5,15 @@ Each is imported only when it is used; a static scene loads neither tracks nor n
 
 from __future__ import annotations
 
-import numpy as np
-from torch import Tensor
-
 from ...config.config import Config
 from ...errors import CheckpointError
 from ..initialization import initialize
-from ..observed_motion import ObservedMotion
 from . import static
 from .representation import FIELD, STILL, TRACKS, Representation
 
 
-def make(start: initialize.Start, config: Config, still: bool = False) -> Representation:
-    """Create the initial representation: the configured one, or tracks if a field starts from them.
-
-    Args:
-        start: Initial state of training.
-        config: The run's configuration.
-        still: True if nothing moves.
-    """
-    if still:
-        return static.StillRepresentation(start)
-    from . import tracks as tracks_representation
-
-    if config.train.representation == TRACKS or config.field.tracks_share > 0:
-        return tracks_representation.TracksRepresentation(start, config)
-    from . import field
-
-    tracks = tracks_representation.first_tracks(start.tracks)
-    field.bring_together(start.gaussians, tracks, start.first_time)
-    return field.FieldRepresentation(tracks, start.first_time, config)
-
-
-def observed_motion(
-    name: str,
-    tensors: dict[str, Tensor],
-    object_ids: np.ndarray,
-    observed: np.ndarray,
-    labels: np.ndarray,
-    config: Config,
-) -> ObservedMotion:
-    """Call `Representation.observed_motion` of the representation ``name``.
-
-    Raises:
-        CheckpointError: This version does not have the representation.
-    """
-    return _class_of(name).observed_motion(tensors, object_ids, observed, labels, config)
-
-
-def group_classes(name: str, tensors: dict[str, Tensor]) -> np.ndarray:
-    """Call `Representation.group_classes` of the representation ``name``. [G]
-
-    Raises:
-        CheckpointError: This version does not have the representation.
-    """
-    return _class_of(name).group_classes(tensors)
-
-
-def _class_of(name: str) -> type[Representation]:
+def by_name(name: str) -> type[Representation]:
+    """Return the representation of a name in checkpoints. Raises CheckpointError if this version does not have it."""
     if name == STILL:
         return static.StillRepresentation
     if name == TRACKS:
@@ -75,3 +26,29 @@ def _class_of(name: str) -> type[Representation]:
         return FieldRepresentation
     known = ", ".join((TRACKS, FIELD, STILL))
     raise CheckpointError(f"the checkpoint was trained with representation '{name}'; this version knows {known}")
+
+
+def configured(config: Config, still: bool = False) -> type[Representation]:
+    """Return the representation that a run trains, at last; ``still`` if nothing moves."""
+    return by_name(STILL if still else config.train.representation)
+
+
+def make(motion: type[Representation], start: initialize.Start, config: Config) -> Representation:
+    """Create the initial representation: the configured one, or tracks if a field starts from them.
+
+    Args:
+        motion: Result of `configured`.
+        start: Initial state of training.
+        config: The run's configuration.
+    """
+    if not motion.moves:
+        return static.StillRepresentation(start)
+    from . import tracks as tracks_representation
+
+    if motion.name == TRACKS or config.field.tracks_share > 0:
+        return tracks_representation.TracksRepresentation(start, config)
+    from . import field
+
+    tracks = tracks_representation.first_tracks(start.tracks)
+    field.bring_together(start.gaussians, tracks, start.first_time)
+    return field.FieldRepresentation(tracks, start.first_time, config)

@@ -18,9 +18,9 @@ from ...motion import robust_weights, rotations
 from ...raster import shade
 from ...scene import sh_color
 from ...scene.cameras import Camera
-from ..initialization import initialize, plane_sweep
+from ..initialization import initialize
 from ..observed_motion import GroupTrack, ObservedMotion
-from ..train_views import TrainView
+from ..train_views import TrainView, camera_key
 from . import fused_posing
 from .representation import STILL, Representation
 
@@ -107,7 +107,7 @@ def nothing_moves(views: Sequence[TrainView]) -> bool:
         return True
     of_camera: dict[bytes, list[TrainView]] = {}
     for view in views:
-        of_camera.setdefault(plane_sweep.camera_key(view.camera), []).append(view)
+        of_camera.setdefault(camera_key(view.camera), []).append(view)
     if any(len({view.t for view in group}) < 2 for group in of_camera.values()):
         return False
     for first, *others in of_camera.values():

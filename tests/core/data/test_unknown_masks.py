@@ -14,8 +14,8 @@ from r5dgs_core.evaluation import evaluate
 from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.playback import scene_player
 from r5dgs_core.train import normalization, run, train_views
-from r5dgs_core.train.identity import identity_training
-from r5dgs_core.train.initialization import plane_sweep, scatter, triangulation, visual_hull
+from r5dgs_core.train.identity import identity_training, joint_identity, label_votes
+from r5dgs_core.train.initialization import background_images, scatter, triangulation, visual_hull
 from r5dgs_core.train.representations.fused_posing import Splats
 from tests.support import tiny_datasets
 
@@ -60,7 +60,7 @@ def unmasked(view):
 
 def joint(training: str):
     settings = config.load(None, [f"identity.training={training}", "identity.every=1", "identity.weight=1"])
-    return identity_training.JointIdentity(CLASSES, settings, torch.Generator().manual_seed(0))
+    return joint_identity.JointIdentity(CLASSES, settings, torch.Generator().manual_seed(0))
 
 
 def test_unknown_pixels_have_no_gradient(seen):
@@ -76,9 +76,9 @@ def test_unknown_pixels_have_no_gradient(seen):
 
 def test_a_mask_that_knows_nothing_votes_for_nothing(seen, pose):
     count = len(pose(seen[0]).means)
-    assert not identity_training.votes([unknown(v) for v in seen], pose, CLASSES, count).any()
-    several = identity_training.votes([*seen[:6], *(unknown(v) for v in seen[6:])], pose, CLASSES, count)
-    assert torch.equal(several, identity_training.votes(seen[:6], pose, CLASSES, count)) and several.any()
+    assert not label_votes.votes([unknown(v) for v in seen], pose, CLASSES, count).any()
+    several = label_votes.votes([*seen[:6], *(unknown(v) for v in seen[6:])], pose, CLASSES, count)
+    assert torch.equal(several, label_votes.votes(seen[:6], pose, CLASSES, count)) and several.any()
 
 
 def test_missed_masks_that_are_unknown_leave_the_labels_as_they_were(tiny, seen, pose):
@@ -90,7 +90,7 @@ def test_missed_masks_that_are_unknown_leave_the_labels_as_they_were(tiny, seen,
         some = [  # every camera keeps a third of its masks
             v if (k + k // 6) % 3 == 0 else marked(v, v.mask == tiny_datasets.BALL, missed) for k, v in enumerate(seen)
         ]
-        labels = identity_training.elect(identity_training.votes(some, pose, CLASSES, len(truth)), fallback)
+        labels = label_votes.elect(label_votes.votes(some, pose, CLASSES, len(truth)), fallback)
         settings = config.load(None, ["identity.iterations=60"])
         means = torch.from_numpy(tiny.truth.gaussians.means)
         encodings, weight, bias = identity_training.train_encodings(
@@ -132,10 +132,10 @@ def test_a_hull_is_not_cut_where_a_mask_is_unknown(tiny, seen):
     assert spread_of(0) < 0.1
 
 
-def test_what_no_mask_knows_is_background_to_the_backdrops(seen):
+def test_what_no_mask_knows_is_background_to_the_background_images(seen):
     for one, other in zip(
-        plane_sweep.backdrops([unknown(v) for v in seen]),
-        plane_sweep.backdrops([unmasked(v) for v in seen]),
+        background_images.compute([unknown(v) for v in seen]),
+        background_images.compute([unmasked(v) for v in seen]),
         strict=True,
     ):
         np.testing.assert_array_equal(one.image, other.image)
@@ -143,15 +143,15 @@ def test_what_no_mask_knows_is_background_to_the_backdrops(seen):
 
 
 def test_what_some_masks_know_is_taken_from_them_alone(seen):
-    (same,) = plane_sweep.by_camera(seen, 1)
+    (same,) = train_views.by_camera(seen, 1)
     cover = np.zeros(same[0].mask.shape, bool)
     cover[5:15, 5:15] = True
     clean = marked(same[0], True, 0)
     dirty = dataclasses.replace(unknown(same[1]), image=np.full_like(same[1].image, 255))
     hidden = marked(clean, cover, 1)
-    (backdrop,) = plane_sweep.backdrops([hidden, dirty, dirty])
-    assert not backdrop.known[6:14, 6:14].any()  # an object there; what the others show is perhaps the same one
-    np.testing.assert_allclose(backdrop.image[20:], clean.image[20:] / 255, atol=1e-6)
+    (background,) = background_images.compute([hidden, dirty, dirty])
+    assert not background.known[6:14, 6:14].any()  # an object there; what the others show is perhaps the same one
+    np.testing.assert_allclose(background.image[20:], clean.image[20:] / 255, atol=1e-6)
 
 
 def test_points_of_a_reconstruction_are_not_judged_by_unknown_pixels(tiny, seen):

@@ -13,7 +13,7 @@ from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.raster import rasterize_splats
 from r5dgs_core.scene import scene
 from r5dgs_core.scene.cameras import Camera
-from r5dgs_core.train.identity import identity_losses, identity_training
+from r5dgs_core.train.identity import identity_losses, identity_training, joint_identity, label_votes
 from r5dgs_core.train.representations.fused_posing import Splats
 from r5dgs_core.train.train_views import TrainView
 
@@ -37,8 +37,8 @@ CLASSES = {0: 0, 3: 1, 5: 2}
 
 def label(classes, view, splats, fallback):
     """Classes of the Gaussians, by the vote of one view."""
-    weights = identity_training.votes([view], lambda _: splats, classes, len(fallback))
-    return identity_training.elect(weights, torch.tensor(fallback)).tolist()
+    weights = label_votes.votes([view], lambda _: splats, classes, len(fallback))
+    return label_votes.elect(weights, torch.tensor(fallback)).tolist()
 
 
 def test_each_gaussian_gets_the_class_of_the_pixels_that_it_paints():
@@ -54,7 +54,7 @@ def test_gaussians_that_no_mask_shows_keep_what_they_had():
 def test_ids_without_a_class_do_not_vote():
     view, splats = row_of_blobs()
     assert label({0: 0, 3: 1}, view, splats, [1, 0, 0]) == [0, 0, 1]
-    assert identity_training.class_map(view, {0: 0, 3: 1})[0].tolist() == [0] * 10 + [-1] * 10 + [1] * 10
+    assert label_votes.class_map(view, {0: 0, 3: 1})[0].tolist() == [0] * 10 + [-1] * 10 + [1] * 10
 
 
 @pytest.mark.parametrize("steps", [0, 60])
@@ -111,7 +111,7 @@ def posed(gaussians):
 
 def make_joint(view, gaussians, training, **changes):
     settings = {"identity.training": training, "identity.rate": 0.05, "identity.classifier_rate": 0.02}
-    identities = identity_training.joint([view], CLASSES, config.Config().replace(**settings, **changes))
+    identities = joint_identity.joint([view], CLASSES, config.Config().replace(**settings, **changes))
     assert identities is not None
     identities.begin(gaussians)
     return identities
@@ -151,7 +151,7 @@ def accuracy(identities, gaussians, view):
     with torch.no_grad():
         image = blended(identities, gaussians, posed(gaussians), view)
         answers = (image @ identities.params["classifier.weight"].T + identities.params["classifier.bias"]).argmax(-1)
-    return float((answers == identity_training.class_map(view, CLASSES)).float().mean())
+    return float((answers == label_votes.class_map(view, CLASSES)).float().mean())
 
 
 def disagreement(identities, gaussians):
@@ -316,11 +316,11 @@ def test_gaussians_take_only_parameters_that_are_known_and_fit(name, count):
 def test_there_are_no_joint_identities_where_nothing_tells_objects_apart():
     view, _ = row_of_blobs()
     asked = config.Config().replace(**{"identity.training": "joint"})
-    assert identity_training.joint([view], CLASSES, config.Config()) is None
-    assert identity_training.joint([view], CLASSES, asked.replace(**{"identity.iterations": 0})) is None
-    assert identity_training.joint([view], {0: 0}, asked) is None
-    assert identity_training.joint([dataclasses.replace(view, mask=None)], CLASSES, asked) is None
-    assert identity_training.joint([view], CLASSES, asked) is not None
+    assert joint_identity.joint([view], CLASSES, config.Config()) is None
+    assert joint_identity.joint([view], CLASSES, asked.replace(**{"identity.iterations": 0})) is None
+    assert joint_identity.joint([view], {0: 0}, asked) is None
+    assert joint_identity.joint([dataclasses.replace(view, mask=None)], CLASSES, asked) is None
+    assert joint_identity.joint([view], CLASSES, asked) is not None
 
 
 @pytest.mark.parametrize("training", ["joint", "detached"])

@@ -1,4 +1,4 @@
-"""Evidence of a body in images: texture shows its turn, masks how much is seen, backdrops if it is there."""
+"""Evidence of a body in images: texture shows its turn, masks how much is seen, background images if it is there."""
 
 import dataclasses
 

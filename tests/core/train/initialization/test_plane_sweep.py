@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from r5dgs_core.scene import cameras
 from r5dgs_core.train import train_views
-from r5dgs_core.train.initialization import initialize, plane_sweep, triangulation
+from r5dgs_core.train.initialization import background_images, initialize, plane_sweep, triangulation
 from tests.support import scenes
 
 NO_PLACES = triangulation.Places(
@@ -60,14 +60,14 @@ def depth_step(depths):
 
 @pytest.mark.parametrize("depths", [96, 288])
 def test_points_lie_on_a_textured_floor_as_exactly_as_depths_are_tried(floor, depths):
-    points = plane_sweep.Sweep(plane_sweep.backdrops(floor), 150, depths).distinct_points()
+    points = plane_sweep.Sweep(background_images.compute(floor), 150, depths).distinct_points()
     assert len(points) > 200
     assert np.median(np.abs(points[:, 2])) < 0.5 * depth_step(depths)
     assert np.mean(np.abs(points[:, 2]) < 1.5 * depth_step(depths)) > 0.85
 
 
 def test_the_supporting_plane_is_the_floor_and_points_are_put_onto_it(floor):
-    search = plane_sweep.Sweep(plane_sweep.backdrops(floor), 150, 288)
+    search = plane_sweep.Sweep(background_images.compute(floor), 150, 288)
     eyes = np.stack([v.camera.center for v in floor])
     plane = initialize.supporting_plane(search.distinct_points(), NO_PLACES, eyes, np.random.default_rng(0))
     assert plane is not None
@@ -81,13 +81,13 @@ def test_the_supporting_plane_is_the_floor_and_points_are_put_onto_it(floor):
 
 
 def test_the_same_draws_give_the_same_points(floor):
-    search = plane_sweep.Sweep(plane_sweep.backdrops(floor), 150, 48)
+    search = plane_sweep.Sweep(background_images.compute(floor), 150, 48)
     a, b = (search.place(100, None, False, np.random.default_rng(3)).points for _ in range(2))
     np.testing.assert_array_equal(a, b)
 
 
 def test_a_depth_that_no_other_camera_confirms_places_nothing(floor):
-    search = plane_sweep.Sweep(plane_sweep.backdrops(floor), 150, 288)
+    search = plane_sweep.Sweep(background_images.compute(floor), 150, 288)
     found = search.rays[0]
     search.rays[0] = dataclasses.replace(found, depths=0.6 * found.depths, costs=np.zeros_like(found.costs))
     heights = search.place(10**6, None, False, np.random.default_rng(0)).points[:, 2]
@@ -96,14 +96,14 @@ def test_a_depth_that_no_other_camera_confirms_places_nothing(floor):
 
 
 def test_two_cameras_confirm_each_other(floor):
-    search = plane_sweep.Sweep(plane_sweep.backdrops(floor[:2]), 150, 96)
+    search = plane_sweep.Sweep(background_images.compute(floor[:2]), 150, 96)
     points = search.place(10**6, None, False, np.random.default_rng(0)).points
     assert len(points) > 100
     assert np.mean(np.abs(points[:, 2]) < 1.5 * depth_step(96)) > 0.8
 
 
 def test_a_constant_sky_places_nothing():
-    search = plane_sweep.Sweep(plane_sweep.backdrops(constant_views()), 200, 48)
+    search = plane_sweep.Sweep(background_images.compute(constant_views()), 200, 48)
     for find_sky in (False, True):
         placed = search.place(200, None, find_sky, np.random.default_rng(0))
         assert placed.points.shape == placed.colors.shape == (0, 3)
@@ -112,13 +112,13 @@ def test_a_constant_sky_places_nothing():
 
 def test_without_parallax_or_neighbours_nothing_is_placed(floor):
     for seen in (floor[:1], [floor[0]] * 3):
-        placed = plane_sweep.Sweep(plane_sweep.backdrops(seen), 200, 48).place(
+        placed = plane_sweep.Sweep(background_images.compute(seen), 200, 48).place(
             200, None, True, np.random.default_rng(0)
         )
         assert len(placed.points) == 0
 
 
-def test_a_backdrop_is_what_lies_behind_the_objects(floor):
+def test_a_background_image_shows_what_lies_behind_the_objects(floor):
     view = floor[0]
     rng = np.random.default_rng(0)
     seen = []
@@ -127,9 +127,9 @@ def test_a_backdrop_is_what_lies_behind_the_objects(floor):
         mask[5 : 5 + 20, 10 * k : 10 * k + 12] = 1
         image = np.where(mask[..., None] > 0, rng.integers(0, 255, view.image.shape), view.image).astype(np.uint8)
         seen.append(dataclasses.replace(view, image=image, mask=mask, t=0.1 * k))
-    (backdrop,) = plane_sweep.backdrops(seen)
-    assert backdrop.known.all()
-    np.testing.assert_allclose(backdrop.image, view.image / 255, atol=1e-6)
+    (background,) = background_images.compute(seen)
+    assert background.known.all()
+    np.testing.assert_allclose(background.image, view.image / 255, atol=1e-6)
 
 
 def test_pixels_that_objects_always_cover_or_that_are_transparent_are_unknown(floor):
@@ -138,9 +138,9 @@ def test_pixels_that_objects_always_cover_or_that_are_transparent_are_unknown(fl
     mask[10:20, 10:20] = 2
     alpha = np.full(mask.shape, 255, np.uint8)
     alpha[30:, :] = 0
-    (backdrop,) = plane_sweep.backdrops([dataclasses.replace(view, mask=mask, alpha=alpha)] * 2)
-    assert not backdrop.known[10:20, 10:20].any() and not backdrop.known[30:].any()
-    assert backdrop.known[:8].all() and np.isfinite(backdrop.image).all()
+    (background,) = background_images.compute([dataclasses.replace(view, mask=mask, alpha=alpha)] * 2)
+    assert not background.known[10:20, 10:20].any() and not background.known[30:].any()
+    assert background.known[:8].all() and np.isfinite(background.image).all()
 
 
 def test_no_plane_carries_scattered_points():
@@ -171,31 +171,31 @@ def test_too_few_points_support_nothing():
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 8])
-def test_the_backdrop_is_the_median_of_the_free_pixels_however_it_is_cut_into_bands(monkeypatch, count):
+def test_a_background_image_is_the_median_of_the_free_pixels_however_it_is_cut_into_bands(monkeypatch, count):
     rng = np.random.default_rng(count)
     images = rng.integers(0, 256, (count, 11, 7, 3)).astype(np.uint8)
     free = rng.random((count, 11, 7)) < 0.6
-    found = plane_sweep._median(list(images), free)
+    found = background_images._median(list(images), free)
     for y, x in np.ndindex(11, 7):
         seen = images[free[:, y, x], y, x]
         expected = np.median(seen, axis=0) / 255 if len(seen) else np.zeros(3)
         np.testing.assert_allclose(found[y, x], expected, atol=1e-7)
-    monkeypatch.setattr(plane_sweep, "MEDIAN_VALUES", 1)
-    assert (plane_sweep._median(list(images), free) == found).all()
+    monkeypatch.setattr(background_images, "MEDIAN_VALUES", 1)
+    assert (background_images._median(list(images), free) == found).all()
 
 
 def test_depths_are_found_the_same_however_rays_are_cut_into_bands(floor, monkeypatch):
-    whole = plane_sweep.Sweep(plane_sweep.backdrops(floor), 150, 48)
+    whole = plane_sweep.Sweep(background_images.compute(floor), 150, 48)
     monkeypatch.setattr(plane_sweep, "COST_VALUES", 1)
-    cut = plane_sweep.Sweep(plane_sweep.backdrops(floor), 150, 48)
+    cut = plane_sweep.Sweep(background_images.compute(floor), 150, 48)
     for ours, theirs in zip(cut.rays, whole.rays, strict=True):
         np.testing.assert_allclose(ours.costs, theirs.costs, rtol=1e-5)
         assert (ours.depths == theirs.depths).mean() > 0.99
 
 
-def test_images_of_another_size_have_a_backdrop_of_their_own(floor):
+def test_images_of_another_size_have_a_background_image_of_their_own(floor):
     view = floor[0]
     cut = dataclasses.replace(view, camera=dataclasses.replace(view.camera, height=20), image=view.image[:20])
-    found = plane_sweep.backdrops([view, cut, view])
+    found = background_images.compute([view, cut, view])
     assert [b.image.shape[:2] for b in found] == [(48, 64), (20, 64)]
     np.testing.assert_array_equal(found[1].image, found[0].image[:20])

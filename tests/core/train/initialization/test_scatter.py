@@ -11,7 +11,7 @@ from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError
 from r5dgs_core.scene import cameras
-from r5dgs_core.train.initialization import plane_sweep, scatter
+from r5dgs_core.train.initialization import background_images, scatter
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
@@ -28,7 +28,7 @@ RANDOM = (
 
 def test_every_point_is_seen_by_two_cameras(tiny):
     trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings(*RANDOM))
-    scenes = plane_sweep.backdrops(trainer.views)
+    scenes = background_images.compute(trainer.views)
     points, colors = scatter.everywhere(scenes, 200, np.random.default_rng(0))
     assert points.shape == colors.shape == (200, 3)
     assert colors.min() >= 0 and colors.max() <= 1

@@ -4,7 +4,7 @@ import numpy as np
 
 from r5dgs_core.scene import cameras
 from r5dgs_core.train import train_views
-from r5dgs_core.train.initialization import plane_sweep, shadows, triangulation
+from r5dgs_core.train.initialization import background_images, shadows, triangulation
 from tests.support import scenes
 
 PLANE = (np.array([0.0, 0, 1]), 0.0)
@@ -33,7 +33,7 @@ def shadowed_views(light, darkness=0.4, radius=0.25):
 
 
 def find(seen, places):
-    return shadows.find_light(seen, plane_sweep.backdrops(seen), places, TIMES, PLANE, np.random.default_rng(0))
+    return shadows.find_light(seen, background_images.compute(seen), places, TIMES, PLANE, np.random.default_rng(0))
 
 
 def test_the_direction_of_the_light_is_found():

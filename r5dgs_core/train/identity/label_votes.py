@@ -1,0 +1,54 @@
+"""Label of each Gaussian by a vote of the masks.
+
+Notation: N Gaussians, C classes: class 0 is the background, class k the k-th object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...render.segment_weights import segment_weights
+from ..representations.fused_posing import Splats
+from ..train_views import TrainView, spread
+
+VOTE_VIEWS = 80
+
+
+def votes(views: list[TrainView], pose: Callable[[TrainView], Splats], classes: dict[int, int], count: int) -> Tensor:
+    """Return the contribution of each Gaussian to the mask pixels of each class.
+
+    Args:
+        views: Training views; at most `VOTE_VIEWS` with a mask are used, spread evenly.
+        pose: Returns the splats of a view.
+        classes: Class of each object id; other ids do not vote.
+        count: Number of Gaussians, N.
+
+    Returns:
+        Sums of blending weights, pixels. [N, C]
+    """
+    kinds = max(classes.values(), default=0) + 1
+    weights = torch.zeros(count, kinds)
+    for view in spread([v for v in views if v.mask is not None], VOTE_VIEWS):
+        target = class_map(view, classes)
+        with torch.no_grad():
+            splats = pose(view)
+        given = (splats.means, splats.quats, splats.scales, splats.opacities)
+        weights += torch.from_numpy(segment_weights(*given, view.camera, target, kinds).T.toarray())
+    return weights
+
+
+def elect(weights: Tensor, fallback: Tensor) -> Tensor:
+    """Return the class with most `votes` for each Gaussian, or its ``fallback`` [N] without votes. [N] int64"""
+    return torch.where(weights.amax(1) > 1e-3, weights.argmax(1), fallback)
+
+
+def class_map(view: TrainView, classes: dict[int, int]) -> Tensor:
+    """Return the class of each pixel, -1 for ids without a class. [H, W] int64"""
+    assert view.mask is not None
+    table = np.full(max(int(view.mask.max(initial=0)), *classes) + 1, -1, np.int64)
+    table[list(classes)] = list(classes.values())
+    return torch.from_numpy(table[view.mask])
