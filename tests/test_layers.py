@@ -94,12 +94,17 @@ ALLOWED = {
         "error_vs_time",
     },
 }
+# Commands that import numpy or torch.
+COMMANDS = (
+    *("associate", "bake", "bench", "demo", "evaluate", "export", "import_run", "info", "lookup", "masks", "name"),
+    *("objects", "query", "report", "train", "warm_up"),
+)
 # Modules that may import modules of the project inside functions: the command line and the public functions, which
 # start fast, and the worker, which answers before torch is there and if it is missing.
 LATE_MODULES = {
     "api",
-    *("cli.main", "cli.runs", "cli.associate", "cli.bench", "cli.export", "cli.info", "cli.masks"),
-    *("cli.objects", "cli.language", "check", "check.run", "cli.demo", "stability.training"),
+    *("cli.inputs", "cli.options", "cli.pictures", *(f"cli.commands.{name}" for name in COMMANDS)),
+    *("check", "check.run", "stability.training"),
     *("worker.server", "worker.warming"),
 }
 # Further modules of the core, and what each may import inside functions.

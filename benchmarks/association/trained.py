@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from r5dgs_core.bake import bake
-from r5dgs_core.cli import associate
+from r5dgs_core.cli.commands import associate
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import mask_notes, masks, view_masks

@@ -1,4 +1,4 @@
-"""Options shared by several commands of ``r5dgs``, and converters of their values."""
+"""Options shared by several commands: their arguments, converters and values."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import argparse
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-from ..playback import modes
+from .. import errors, input_paths
+from ..config import config
 
 _KEYS = {  # options that set one key of the configuration
     "iterations": "train.iterations",
@@ -29,8 +31,8 @@ def add_settings(p: argparse.ArgumentParser) -> None:
     """Add the options that configure training."""
     named = "named settings: fast (a first look), cpu or paper (deformation field); --config and --set override them"
     p.add_argument("--preset", metavar="NAME", help=named)
-    config = "TOML configuration file; 'r5dgs config' lists all keys"
-    p.add_argument("--config", type=Path, metavar="FILE", help=config)
+    shown = "TOML configuration file; 'r5dgs config' lists all keys"
+    p.add_argument("--config", type=Path, metavar="FILE", help=shown)
     add_overrides(p, "SECTION.KEY=VALUE", "override a key")
     steps = "optimisation steps; same as train.iterations (default: 6000)"
     p.add_argument("--iterations", type=at_least(1), metavar="N", help=steps)
@@ -55,16 +57,6 @@ def add_progress(p: argparse.ArgumentParser) -> None:
     """Add ``--progress``."""
     shown = "progress output (default: auto, which is bars in a terminal and plain lines elsewhere)"
     p.add_argument("--progress", choices=("auto", "json", "none"), default="auto", help=shown)
-
-
-def add_picture(p: argparse.ArgumentParser) -> None:
-    """Add the options of a picture of the scene."""
-    p.add_argument("--camera", metavar="N", help="name or number of the camera (default: the best view)")
-    p.add_argument("--time", type=float, metavar="T", help="scene time of the picture; may exceed t_max")
-    kinds = f"playback mode, one of {', '.join(modes.every())} (default: rigid)"
-    p.add_argument("--mode", default="rigid", metavar="MODE", help=kinds)
-    p.add_argument("--size", type=int, metavar="PIXELS", help="pixels along the longer side of the picture")
-    add_threads(p)
 
 
 def at_least(least: int) -> Callable[[str], int]:
@@ -98,13 +90,49 @@ def _number(text: str, good: Callable[[float], bool], expected: str) -> float:
     return value
 
 
-def overrides(args: argparse.Namespace) -> Sequence[str]:
+def overrides(args: argparse.Namespace) -> list[str]:
     """Return ``section.key=value`` of ``--set`` and of the options that set one key; the latter win."""
-    found = list(getattr(args, "set", []))
+    found = list(args.set)
     for option, key in _KEYS.items():
         value = getattr(args, option, None)
         if value is not None:
             found.append(f"{key}={value}")
-    if args.command == "train" and args.masks is not None:
-        found.append(f"data.masks={args.masks if args.masks == 'none' else str(Path(args.masks).resolve())}")
     return found
+
+
+def training(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the values of the options of `add_training`, by the names of the arguments of `run_train`."""
+    return {
+        "config_path": args.config,
+        "overrides": overrides(args),
+        "preset": args.preset,
+        "resume": args.resume,
+        "overwrite": args.overwrite,
+        "threads": args.threads,
+        "progress_kind": args.progress,
+    }
+
+
+def training_settings(
+    folder: Path, config_path: Path | None, overrides: Sequence[str], *, preset: str | None, resume: bool
+) -> config.Config:
+    """Return the configuration of a new run; a resumed run keeps its own.
+
+    Raises:
+        UsageError: A run is resumed with options that change its configuration.
+        ConfigError: A key or value is invalid.
+    """
+    if resume and (config_path or overrides or preset) and (Path(folder) / input_paths.RUN_FILE).exists():
+        raise errors.UsageError(
+            "--resume continues with the configuration of the run; leave out --preset, --config, --set, --iterations, "
+            "--seed and --max-gaussians"
+        )
+    return config.load(config_path, tuple(overrides), preset)
+
+
+def use_threads(count: int | None) -> None:
+    """Set the number of threads of the kernels; None keeps NUMBA_NUM_THREADS, or else all usable cores."""
+    if count is not None:
+        from ..raster import compilation
+
+        compilation.set_threads(count)

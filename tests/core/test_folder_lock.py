@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from r5dgs_core import folder_lock
-from r5dgs_core.cli import associate, language, runs
+from r5dgs_core.cli.commands import associate, bake, evaluate, import_run, lookup, name
 from r5dgs_core.errors import CheckpointError
 from r5dgs_core.train import checkpoint, run
 from tests.support import tiny_datasets
@@ -154,13 +154,13 @@ def test_a_folder_that_another_training_made_in_the_meantime_is_not_trained_over
 
 
 WRITERS = {
-    "bake": lambda folder: runs.run_bake(folder, folder / "a.r5dgs", None),
-    "import": lambda folder: runs.run_import(folder, folder / "a.r5dgs"),
-    "evaluate a run": lambda folder: runs.run_evaluate(folder, None, modes=["rigid"], json_path=None),
-    "evaluate a scene": lambda folder: runs.run_evaluate(folder / "a.r5dgs", None, modes=["rigid"], json_path=None),
+    "bake": lambda folder: bake.run_bake(folder, folder / "a.r5dgs", None),
+    "import": lambda folder: import_run.run_import(folder, folder / "a.r5dgs"),
+    "evaluate a run": lambda folder: evaluate.run_evaluate(folder, None, modes=["rigid"], json_path=None),
+    "evaluate a scene": lambda folder: evaluate.run_evaluate(folder / "a.r5dgs", None, modes=["rigid"], json_path=None),
     "associate": lambda folder: associate.run_associate(folder),
-    "lookup": lambda folder: language.run_lookup(folder / "a.r5dgs", "text"),
-    "name": lambda folder: language.run_name(folder / "a.r5dgs", "1", "mug"),
+    "lookup": lambda folder: lookup.run_lookup(folder / "a.r5dgs", "text"),
+    "name": lambda folder: name.run_name(folder / "a.r5dgs", "1", "mug"),
 }
 
 
@@ -183,5 +183,5 @@ def test_what_is_written_elsewhere_and_what_is_read_needs_no_lock(tmp_path, trai
     with folder_lock.hold(trained.folder):
         assert checkpoint.open_run(trained.folder).digest == trained.digest
         assert checkpoint.load(trained.folder).finished
-        runs.run_bake(trained.folder, tmp_path / "a.r5dgs", None)
+        bake.run_bake(trained.folder, tmp_path / "a.r5dgs", None)
     assert (tmp_path / "a.r5dgs").exists()

@@ -6,7 +6,7 @@ import importlib
 import numpy as np
 import pytest
 
-from r5dgs_core.cli import export as export_command
+from r5dgs_core.cli.commands import export as export_command
 from r5dgs_core.formats import ply
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer

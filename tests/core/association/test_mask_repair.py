@@ -10,8 +10,8 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.association import associate, mask_repair, render_segments
-from r5dgs_core.cli import associate as cli_associate
 from r5dgs_core.cli import main
+from r5dgs_core.cli.commands import associate as cli_associate
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import mask_notes, masks, view_masks
 from r5dgs_core.scene import scene_file

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from r5dgs_core.cli import demo
+from r5dgs_core.cli.commands import demo
 
 ROOT = Path(__file__).parents[3]
 

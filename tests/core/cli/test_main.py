@@ -17,7 +17,8 @@ import pytest
 
 from r5dgs_core import __version__, atomic_files, errors, progress
 from r5dgs_core.bench import variants
-from r5dgs_core.cli import demo, main, parser, runs
+from r5dgs_core.cli import inputs, main, parser, registry
+from r5dgs_core.cli.commands import demo, info
 from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.config import presets
 from r5dgs_core.data import dataset as datasets
@@ -27,7 +28,7 @@ from r5dgs_core.raster import compilation
 from r5dgs_core.scene import scene_file
 from r5dgs_core.time_left import Timed
 from r5dgs_core.train import checkpoint
-from tests.support import tiny_datasets
+from tests.support import pages, tiny_datasets
 from tests.support.command_line import complaint
 
 OPTIONS = [
@@ -206,9 +207,19 @@ def test_help_of_bench_names_every_variant(capsys):
     assert f"(default: {' '.join(variants.DEFAULT_VARIANTS)})" in " ".join(shown.split())
 
 
-def test_the_module_of_the_command_line_names_every_command():
-    named = " ".join(main.__doc__.split("\n\n")[0].split()).partition(": ")[2].rstrip(".").split(", ")
-    assert sorted(named) == sorted(sub_parsers()) == sorted(main._RUN)
+def test_the_registry_lists_every_module_of_the_commands():
+    modules = {path.stem for path in (Path(registry.__file__).parent / "commands").glob("*.py")} - {"__init__"}
+    assert sorted(registry.MODULES) == sorted(modules) and len(sub_parsers()) == len(modules)
+
+
+def test_the_developers_page_adds_a_command(made, monkeypatch, capsys):
+    pages.load("Command", "r5dgs_core.cli.commands.duration", monkeypatch)
+    monkeypatch.setattr(registry, "MODULES", (*registry.MODULES, "duration"))
+    assert main.main(["duration", str(made[1])]) == 0
+    scene = scene_file.read(made[1])
+    assert capsys.readouterr().out == f"{scene.t_max * scene.frames_per_unit:g} frames\n"
+    assert "nowhere" in complaint(capsys, "duration", "nowhere")
+    assert "print the duration of a scene" in parser.parser().format_help()
 
 
 def test_the_bundled_data_is_found_and_small():
@@ -220,7 +231,7 @@ def test_the_bundled_data_is_found_and_small():
 
 
 def test_missing_bundled_data_is_said(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(demo, "NAME", "nothing")
+    monkeypatch.setattr(demo, "DATASET", "nothing")
     assert "install r5dgs again" in complaint(capsys, "demo", "--out", tmp_path / "demo")
 
 
@@ -273,7 +284,7 @@ def test_only_the_data_of_a_run_bakes_it_and_measuring_on_others_is_said(made, t
     for target in made:
         caplog.clear()
         assert main.main(["evaluate", str(target), "--data", str(other.root), "--json", str(tmp_path / "e.json")]) == 0
-        assert [r.getMessage() for r in caplog.records if r.name == runs.__name__] == [
+        assert [r.getMessage() for r in caplog.records if r.name == inputs.__name__] == [
             f"{other.root}: differs from the data that {target} was trained on; it is used anyway"
         ]
 
@@ -290,7 +301,7 @@ def test_evaluate_counts_its_images(made, tmp_path, capsys):
 @pytest.fixture
 def small_demo(tiny, monkeypatch):
     """Makes the demo run on the tiny data set; returns its arguments without --out."""
-    monkeypatch.setattr(demo, "NAME", tiny.root.name)
+    monkeypatch.setattr(demo, "DATASET", tiny.root.name)
     monkeypatch.setattr(demo, "bundled_data", lambda: tiny.root)
     return ["demo", *OPTIONS, "--progress", "json"]
 
@@ -311,7 +322,7 @@ def test_the_demo_may_be_run_twice_and_leaves_other_runs_alone(small_demo, made,
         assert all((out / name).stat().st_size > 0 for name in ("demo.r5dgs", "evaluation.json", "contact_sheet.png"))
     line = complaint(capsys, *small_demo, "--out", out, "--resume", status=ExitStatus.USAGE)
     assert "leave out --preset, --config, --set, --iterations" in line
-    monkeypatch.setattr(demo, "NAME", "another data set")
+    monkeypatch.setattr(demo, "DATASET", "another data set")
     line = complaint(capsys, *small_demo, "--out", made[0])
     assert "add --resume to go on, or --overwrite" in line
 
@@ -486,7 +497,7 @@ def test_every_kind_of_error_has_its_status(monkeypatch, capsys, error, status):
     def fail(args):
         raise error
 
-    monkeypatch.setitem(main._RUN, "info", fail)
+    monkeypatch.setattr(info, "run", fail)
     assert main.main(["info", "x.r5dgs"]) == status
     shown = capsys.readouterr().err
     assert ("Traceback" in shown) == (status == 70) and ("usage: r5dgs info" in shown) == (status == 2)

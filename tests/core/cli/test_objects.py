@@ -6,7 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from r5dgs_core.cli import main, objects
+from r5dgs_core.cli import main, pictures
+from r5dgs_core.cli.commands import query
 from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.data import images
 from r5dgs_core.errors import ConfigError
@@ -54,7 +55,7 @@ def test_the_legend_is_of_the_camera_time_and_size_that_were_asked_for(path, cap
 def test_a_query_reads_its_scene_once(path, tmp_path, monkeypatch):
     read, opened = scene_file.read, []
     monkeypatch.setattr(scene_file, "read", lambda *given: opened.append(given) or read(*given))
-    objects.run_query(path, "mug", {}, render=tmp_path / "mug.png", camera="0", t=0.4)
+    query.run_query(path, "mug", render=tmp_path / "mug.png", camera="0", t=0.4)
     assert len(opened) == 1 and (tmp_path / "mug.png").exists()
 
 
@@ -77,7 +78,7 @@ def test_an_object_moves_in_its_pictures_and_goes_on_past_t_max(path, tmp_path):
     scene = scene_file.read(path)
     places = []
     for k, t in enumerate((0.2, scene.t_max, 1.1)):
-        objects.render_objects(scene, [2], tmp_path / f"{k}.png", camera="0", t=t)
+        pictures.draw(scene, [2], tmp_path / f"{k}.png", camera="0", t=t)
         alpha = images.read(tmp_path / f"{k}.png")[..., 3]
         places.append(alpha.sum(0) @ np.arange(alpha.shape[1]) / alpha.sum())
     assert abs(places[1] - places[0]) > 2 and abs(places[2] - places[1]) > 2
@@ -120,6 +121,6 @@ def test_an_object_without_gaussians_cannot_be_drawn(path, tmp_path):
     ghost = dataclasses.replace(scene.objects[-1], id=9, name="ghost", start=len(scene.gaussians.means), count=0)
     haunted = dataclasses.replace(scene, objects=(*scene.objects, ghost))
     with pytest.raises(ConfigError, match="ghost: no Gaussians"):
-        objects.render_objects(haunted, [9], tmp_path / "g.png")
-    objects.render_objects(haunted, [9, 1], tmp_path / "g.png")
+        pictures.draw(haunted, [9], tmp_path / "g.png")
+    pictures.draw(haunted, [9, 1], tmp_path / "g.png")
     assert images.read(tmp_path / "g.png")[..., 3].max() > 0.5

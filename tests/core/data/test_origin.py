@@ -9,7 +9,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.bake import bake
-from r5dgs_core.cli import runs
+from r5dgs_core.cli import inputs
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images, origin
 from r5dgs_core.evaluation import evaluate
@@ -163,7 +163,7 @@ def test_scenes_from_before_the_origin_are_measured_in_the_world_that_they_are_i
     path = scene_file.write(older, tmp_path / "older.r5dgs")
     with zipfile.ZipFile(path) as archive:
         assert json.loads(archive.read("scene.json"))["format_version"] == 1
-    scene, found = runs.open_target(path, data.root)
+    scene, found = inputs.open_target(path, data.root)
     assert "Bake its run again" in caplog.text
     assert found is not None and not found.origin.any()
     view = found.val[0]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.cli import language, main
+from r5dgs_core.cli import main
+from r5dgs_core.cli.commands import lookup
 from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.language import best_views, build_table, calibration, common_nouns, query
 from r5dgs_core.language.encoders import encoder_base, registry
@@ -258,7 +259,7 @@ def test_pictures_make_the_table_of_an_encoder_that_sees(seen):
 def test_tiny_encoders_go_all_the_way(kind, seen, tmp_path):
     folder = getattr(encoder_folders, kind)(tmp_path / kind)
     path = scene_file.write(seen, tmp_path / "seen.r5dgs")
-    language.run_lookup(path, str(folder))
+    lookup.run_lookup(path, str(folder))
     stored = scene_file.read(path)
     assert stored.lookup.encoder.name == kind
     encoder = registry.open_encoder(folder)
@@ -291,7 +292,7 @@ def content(tmp_path_factory):
     before = scene_file.read(scene_file.write(named("lemon", "apple", "donut", "hammer"), path, exact=True))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(registry, "open_encoder", by_name)
-        language.run_lookup(path, "plain")
+        lookup.run_lookup(path, "plain")
     after = scene_file.read(path)
     for field in ("means", "quats", "log_scales", "opacity_logits", "sh", "track_poses"):
         np.testing.assert_array_equal(after.arrays()[field], before.arrays()[field])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.cli import masks as cli_masks
+from r5dgs_core.cli.commands import masks as cli_masks
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images, mask_notes, masks
 from r5dgs_core.masks import make_masks, mask_folders, videos

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from r5dgs_core import errors
-from r5dgs_core.cli import masks as cli_masks
+from r5dgs_core.cli.commands import masks as cli_masks
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import mask_notes, masks
 from r5dgs_core.masks import make_masks, sam2_masks, sam2_model, sam2_segments, sam2_tracking, videos

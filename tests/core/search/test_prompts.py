@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.cli import language
+from r5dgs_core.cli.commands import query as query_command
 from r5dgs_core.language import query
 from r5dgs_core.scene import scene_file
 from r5dgs_core.search import object_search, prompts
@@ -138,6 +138,6 @@ def test_unknown_phrases_that_are_left_out_are_asked_of_the_encoder(scene):
 
 def test_the_command_says_that_no_object_is_asked_for(scene, tmp_path, capsys):
     path = scene_file.write(scene, tmp_path / "scene.r5dgs")
-    assert language.run_query(path, "none")[1] == []
+    assert query_command.run_query(path, "none") == []
     assert "'none' asks for no object" in capsys.readouterr().out
-    assert len(language.run_query(path, "not the mug")[1]) == len(ALL) - 1
+    assert len(query_command.run_query(path, "not the mug")) == len(ALL) - 1

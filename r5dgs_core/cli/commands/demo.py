@@ -2,21 +2,48 @@
 
 from __future__ import annotations
 
+import argparse
 import shlex
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .. import errors, folder_lock, strict_json, terminal
-from ..time_left import Phase
-from . import runs
+from ... import errors, folder_lock, strict_json, terminal
+from ...time_left import Phase
+from .. import options
 
-NAME = "tabletop"
+if TYPE_CHECKING:
+    from ...data.dataset import Dataset
+    from ...scene.scene import Scene
+    from ...train.checkpoint import Run
+
+NAME = "demo"
+SHORT = "train, bake and evaluate the bundled data set"
+LONG = (
+    "Train the bundled data set, bake a scene file, evaluate it on held-out views and draw a contact sheet.\n"
+    "Takes about two minutes on two cores."
+)
+EXAMPLE = "--out demo"
+PAGE = "user/training.md"
+
+DATASET = "tabletop"
 # Mean PSNR of a normal run, dB; the test split lies past t_max. Rounding differences between processors change val as
 # much as another seed does: seeds 0, 1 and 2 gave 42.1, 43.3 and 42.1 dB on one machine.
 EXPECTED = {"val": 42.0, "test": 37.0}
 TOLERANCE = 1.0  # dB; `.ci/run` fails if PSNR is lower than `EXPECTED` by more than this
 AFTER = (Phase("bake", 1, 150), Phase("evaluate", 60, 4))  # phases after training, with measured costs
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    p.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="run folder (default: demo)")
+    options.add_training(p)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the command."""
+    run_demo(args.out, **options.training(args))
 
 
 def bundled_data() -> Path:
@@ -25,18 +52,20 @@ def bundled_data() -> Path:
     Raises:
         DatasetError: It is missing in both places.
     """
-    here = Path(__file__).resolve().parents[1]
-    for candidate in (here / "examples" / NAME, here.parent / "examples" / NAME):
+    here = Path(__file__).resolve().parents[2]
+    for candidate in (here / "examples" / DATASET, here.parent / "examples" / DATASET):
         if (candidate / "transforms_train.json").exists():
             return candidate
-    raise errors.DatasetError(f"the bundled data set 'examples/{NAME}' is missing; install r5dgs again from its source")
+    raise errors.DatasetError(
+        f"the bundled data set 'examples/{DATASET}' is missing; install r5dgs again from its source"
+    )
 
 
 def run_demo(
     out: Path,
     *,
     config_path: Path | None,
-    overrides: list[str],
+    overrides: Sequence[str],
     preset: str | None = None,
     resume: bool,
     overwrite: bool = False,
@@ -53,16 +82,13 @@ def run_demo(
     """
     began = time.monotonic()
     data = bundled_data()
-    settings = runs.training_settings(out, config_path, overrides, preset=preset, resume=resume)
+    settings = options.training_settings(out, config_path, overrides, preset=preset, resume=resume)
 
-    from ..bake import bake
-    from ..data import dataset as datasets
-    from ..evaluation import contact_sheet, evaluate, evaluation_table
-    from ..progress import make
-    from ..scene import scene_file
-    from ..train import checkpoint, interrupt, run
+    from ...evaluation import contact_sheet, evaluate, evaluation_table
+    from ...progress import make
+    from ...train import checkpoint, interrupt, run
 
-    runs.use_threads(threads)
+    options.use_threads(threads)
     go_on = shlex.join(["r5dgs", "demo", "--out", str(out), "--resume"])
     with make(progress_kind) as progress:
         progress.estimate.add(*AFTER)
@@ -76,17 +102,8 @@ def run_demo(
             progress=progress,
         )
         with interrupt.at_once(f"stopped after training; go on with: {go_on}"), folder_lock.hold(out):
-            progress({"event": "bake", "text": "motion models and scene file"})
-            dataset = datasets.read(data)
-            scene = bake.bake(trained, dataset)
-            scene_path = scene_file.write(scene, out / "demo.r5dgs")
-            progress.estimate.finish("bake")
-            result = evaluate.evaluate(
-                scene,
-                dataset,
-                train=scene.provenance["train"],
-                progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
-            )
+            scene_path = out / "demo.r5dgs"
+            scene, dataset, result = _bake_and_evaluate(trained, data, scene_path, progress)
     if progress_kind != "json":
         terminal.console().print(evaluation_table.make(result))
     stopped = f"stopped before the contact sheet; go on with: {go_on}"
@@ -101,6 +118,27 @@ def run_demo(
         print(f"{time.monotonic() - began:.0f} s in all; open the scene in Blender: File > Import > R5DGS scene")
         print(expectation())
     return result
+
+
+def _bake_and_evaluate(trained: Run, data: Path, path: Path, progress: Any) -> tuple[Scene, Dataset, dict[str, Any]]:
+    """Write the scene file of a run; returns the scene, its data set and the evaluation."""
+    from ...bake import bake
+    from ...data import dataset as datasets
+    from ...evaluation import evaluate
+    from ...scene import scene_file
+
+    progress({"event": "bake", "text": "motion models and scene file"})
+    dataset = datasets.read(data)
+    scene = bake.bake(trained, dataset)
+    scene_file.write(scene, path)
+    progress.estimate.finish("bake")
+    result = evaluate.evaluate(
+        scene,
+        dataset,
+        train=scene.provenance["train"],
+        progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
+    )
+    return scene, dataset, result
 
 
 def expectation() -> str:
@@ -121,6 +159,6 @@ def shortfalls(evaluation: dict[str, Any]) -> list[str]:
 def _is_demo(run_file: Path) -> bool:
     """Return True if the run was trained on the bundled data set, of this or an earlier version."""
     try:
-        return Path(strict_json.read(run_file, errors.CheckpointError)["dataset"]).name == NAME
+        return Path(strict_json.read(run_file, errors.CheckpointError)["dataset"]).name == DATASET
     except (errors.CheckpointError, KeyError, TypeError):
         return False

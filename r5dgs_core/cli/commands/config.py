@@ -2,24 +2,52 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
 import textwrap
 from pathlib import Path
 
-from .. import errors, input_paths, strict_json, user_settings
-from ..config import config as configs
-from ..config import config_keys
+from ... import errors, input_paths, strict_json, user_settings
+from ...config import config as configs
+from ...config import config_keys
 
 WIDTH = 80  # columns
+
+
+NAME = "config"
+SHORT = "print all training keys, or the user's settings"
+LONG = (
+    "Print every training key with its meaning, unit, default and value, for a run, a TOML file or the defaults.\n"
+    "With --user, print the user's settings (paths of weights), or change one of them."
+)
+EXAMPLE = "RUN\n  r5dgs config --user set encoder ~/models/clip"
+PAGE = "reference/command_line.md"
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    where = p.add_mutually_exclusive_group()
+    where.add_argument("target", type=Path, nargs="?", metavar="RUN|FILE.toml", help="run folder or TOML file")
+    user = "print the user's settings; 'set KEY VALUE' changes one, 'set KEY \"\"' removes it"
+    where.add_argument("--user", nargs="*", metavar="set KEY VALUE", help=user)
+    p.add_argument("--json", action="store_true", help="print JSON instead of text")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the command."""
+    if args.user is not None:
+        run_user_config(args.user, as_json=args.json)
+    else:
+        run_config(args.target, as_json=args.json)
 
 
 def run_config(target: Path | None, *, as_json: bool = False) -> configs.Config:
     """Print every training key with its meaning, unit, default and value in force.
 
     Args:
-    target: Run folder, TOML file, or None for the defaults.
-    as_json: Print JSON instead of text.
+        target: Run folder, TOML file, or None for the defaults.
+        as_json: Print JSON instead of text.
 
     Returns:
         The configuration.

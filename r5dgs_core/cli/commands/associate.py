@@ -2,16 +2,42 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .. import errors, folder_lock, input_paths
-from . import runs
+from ... import errors, folder_lock, input_paths
+from .. import inputs, options
 
 if TYPE_CHECKING:
-    from ..association.mask_repair import Repair
+    from ...association.mask_repair import Repair
 
 SHOWN = 12  # printed changes
+
+
+NAME = "associate"
+SHORT = "make mask ids consistent across images and videos"
+LONG = "Correct masks whose ids are switched, split or numbered per video, by the geometry and motion of a run."
+EXAMPLE = "RUN --masks FOLDER"
+PAGE = "user/associate.md"
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    target = "run folder (best trained without masks) or .r5dgs file"
+    p.add_argument("target", type=Path, metavar="RUN|SCENE", help=target)
+    p.add_argument("--data", type=Path, metavar="DIR", help="data set (default: the run's own)")
+    incoming = "masks to correct (default: those of the run, or DATA/object_mask if it was trained without masks)"
+    p.add_argument("--masks", type=Path, metavar="FOLDER", help=incoming)
+    p.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: RUN/object_mask)")
+    options.add_threads(p)
+    options.add_progress(p)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the command."""
+    given = {"masks": args.masks, "out": args.out, "threads": args.threads, "progress_kind": args.progress}
+    run_associate(args.target, args.data, **given)
 
 
 @folder_lock.writes("out", "target")
@@ -32,7 +58,7 @@ def run_associate(
         masks: Folder of the incoming masks; those of the run if None, or ``DATA/object_mask`` if it was trained without
             masks.
         out: Folder to write; ``RUN/object_mask`` if None.
-        threads: Threads of the kernels; see `runs.use_threads`.
+        threads: Threads of the kernels; see `options.use_threads`.
         progress_kind: Form of progress output (`progress.make`).
 
     Returns:
@@ -41,19 +67,19 @@ def run_associate(
     Raises:
         ConfigError, DatasetError, CheckpointError, SceneFileError: An input cannot be used.
     """
-    runs.check_target(target, data)
+    inputs.check_target(target, data)
     if target.is_file() and (data is None or out is None):
         raise errors.UsageError(f"associate {target}: a scene file requires the options --data and --out")
     if out is not None:
         input_paths.check_output_folder("--out", out)
-    from ..association import mask_repair
-    from ..data import dataset as datasets
-    from ..progress import make
+    from ...association import mask_repair
+    from ...data import dataset as datasets
+    from ...progress import make
 
-    runs.use_threads(threads)
+    options.use_threads(threads)
     with make(progress_kind) as progress:
         progress({"event": "prepare", "text": "the scene"})
-        scene, dataset = runs.open_target(target, data)
+        scene, dataset = inputs.open_target(target, data)
         assert dataset is not None
         folder = (Path(out) if out is not None else target / datasets.MASKS).resolve()
         if masks is not None or dataset.mask_folder is None:
@@ -77,7 +103,7 @@ def run_associate(
 
 def _tell(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> None:
     """Print a summary of the changes and the next step."""
-    from ..association import mask_repair
+    from ...association import mask_repair
 
     counted = ("segments", "images", "relabelled", "unknown", "kept")
     segments, images, relabelled, unknown, kept = (summary[key] for key in counted)

@@ -7,12 +7,19 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .. import errors, folder_lock, input_paths
-from ..formats import registry
-from . import options
+from ... import errors, folder_lock, input_paths
+from ...formats import registry
+from .. import options
 
 if TYPE_CHECKING:
-    from ..scene.scene import Scene
+    from ...scene.scene import Scene
+
+
+NAME = "export"
+SHORT = "write a scene in a format of other programs"
+LONG = "Write the Gaussians of a scene at a time or for a range of frames as PLY, or its cameras as transforms.json."
+EXAMPLE = "scene.r5dgs --to ply --out frame.ply --frames 1:60"
+PAGE = "user/export.md"
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
@@ -79,15 +86,11 @@ def run_export(
         raise errors.UsageError(f"--out {out}: expected a name that ends in {chosen.suffix}")
     if t is not None and not math.isfinite(t):
         raise errors.UsageError(f"--time {t}: expected a finite number")
-    from ..progress import make
-    from ..scene import scene_file
+    from ...progress import make
+    from ...scene import scene_file
 
     scene = scene_file.read(path)
-    numbers = None if frames is None else tuple(range(frames[0], frames[1] + 1))
-    times = (scene.t_max if t is None else t,)
-    if numbers is not None:
-        times = tuple((number - 1) / scene.frames_per_unit for number in numbers)
-    what = registry.Options(times, numbers, None if words is None else object_ids(scene, words))
+    what = _selection(scene, t, frames, words)
     targets = chosen.paths(out, what)
     present = [target for target in targets if target.exists()]
     if present and not overwrite:
@@ -103,6 +106,15 @@ def run_export(
         print(f"written: {written[0]}" + (f" to {written[-1].name}" if len(written) > 1 else ""))
         print(f"not kept: {chosen.loses}")
     return written
+
+
+def _selection(scene: Scene, t: float | None, frames: tuple[int, int] | None, words: str | None) -> registry.Options:
+    """Return the part of the scene that the arguments of `run_export` choose."""
+    numbers = None if frames is None else tuple(range(frames[0], frames[1] + 1))
+    times = (scene.t_max if t is None else t,)
+    if numbers is not None:
+        times = tuple((number - 1) / scene.frames_per_unit for number in numbers)
+    return registry.Options(times, numbers, None if words is None else object_ids(scene, words))
 
 
 def frame_range(text: str) -> tuple[int, int]:
@@ -122,8 +134,8 @@ def object_ids(scene: Scene, words: str) -> frozenset[int]:
     Raises:
         ConfigError: Nothing matches one of the phrases.
     """
-    from ..language import query
-    from ..search import object_search
+    from ...language import query
+    from ...search import object_search
 
     found = object_search.search(scene, words)
     missing = query.unanswered(scene, words) if found else [words]

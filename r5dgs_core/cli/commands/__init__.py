@@ -1,0 +1,1 @@
+"""Commands of ``r5dgs``, one per module; `cli.registry` lists them."""

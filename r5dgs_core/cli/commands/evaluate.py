@@ -1,0 +1,92 @@
+"""The command ``r5dgs evaluate``: measure a run or scene on held-out views."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ... import errors, folder_lock, input_paths, terminal
+from ...playback import modes
+from .. import inputs, options
+
+NAME = "evaluate"
+SHORT = "measure a run or scene on held-out views"
+LONG = "Render the held-out views of a run or scene, compare them with the images, and write evaluation.json."
+EXAMPLE = "RUN --mode rigid --mode standard"
+PAGE = "reference/evaluation.md"
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    p.add_argument("target", type=Path, help="run folder or .r5dgs file")
+    p.add_argument("--data", type=Path, metavar="DIR", help="data set (default: the run's own)")
+    kinds = f"playback mode, one of {', '.join(modes.every())} (default: rigid); may be repeated"
+    p.add_argument("--mode", action="append", metavar="MODE", help=kinds)
+    p.add_argument("--json", type=Path, metavar="FILE", help="file to write instead of evaluation.json")
+    options.add_threads(p)
+    options.add_progress(p)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the command."""
+    given = {"modes": args.mode or ["rigid"], "json_path": args.json, "threads": args.threads}
+    run_evaluate(args.target, args.data, **given, progress_kind=args.progress)
+
+
+@folder_lock.writes("json_path", "target")
+def run_evaluate(
+    target: Path,
+    data: Path | None,
+    *,
+    modes: list[str],
+    json_path: Path | None,
+    threads: int | None = None,
+    progress_kind: str = "none",
+) -> dict[str, Any]:
+    """Measure a run or scene file on the held-out views of its data set, and write ``evaluation.json`` beside it.
+
+    Args:
+        target: Run folder or ``.r5dgs`` file.
+        data: Data set; the one that the run was trained on if None.
+        modes: Playback modes.
+        json_path: File to write instead.
+        threads: Threads of the kernels; see `options.use_threads`.
+        progress_kind: Form of progress output (`progress.make`).
+
+    Returns:
+        The evaluation, in the form of ``evaluation.json``.
+    """
+    for mode in modes:
+        inputs.check_mode(mode)
+    inputs.check_target(target, data)
+    input_paths.check_output("--json", json_path)
+    if data is None and not target.is_dir():
+        raise errors.UsageError(f"{target}: a scene file requires a data set: r5dgs evaluate {target} --data DIR")
+
+    from ...evaluation import evaluate, evaluation_table
+    from ...progress import make
+    from ...train import checkpoint
+
+    options.use_threads(threads)
+    default = target / checkpoint.EVALUATION_FILE if target.is_dir() else target.with_suffix(".evaluation.json")
+    with make(progress_kind) as progress:
+        progress({"event": "prepare", "text": "the scene"})
+        scene, dataset = inputs.open_target(target, data)
+        assert dataset is not None
+        for mode in modes:
+            inputs.check_mode(mode, scene, target)
+        result = evaluate.evaluate(
+            scene,
+            dataset,
+            modes=modes,
+            train=scene.provenance.get("train"),
+            progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
+        )
+    path = json_path or default
+    if progress_kind != "json":
+        terminal.console().print(evaluation_table.make(result))
+    evaluate.write(result, path)
+    if progress_kind != "json":
+        print(f"written: {path}")
+    return result

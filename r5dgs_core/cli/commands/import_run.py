@@ -1,0 +1,74 @@
+"""The command ``r5dgs import``: convert a run of another program to a scene file."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ... import folder_lock, input_paths
+from .. import inputs, options
+
+NAME = "import"
+SHORT = "convert a run of 3DGS or a related program to a scene file"
+LONG = "Read a run folder of 3DGS, Gaussian Grouping, Deformable-3DGS, TRACE or FreeGave and write a scene file."
+EXAMPLE = "OUTPUT --data DATA --out scene.r5dgs"
+PAGE = "user/import.md"
+
+WORLDS = ("blender", "colmap", "opengl")  # of `scene.cameras`
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    p.add_argument("run", type=Path, help="run folder of the other program")
+    p.add_argument("--out", type=Path, required=True, metavar="FILE.r5dgs", help="scene file to write")
+    p.add_argument("--iteration", type=options.at_least(0), metavar="N", help="iteration to read (default: last)")
+    data = "data set of the run, which provides cameras, times and axes"
+    p.add_argument("--data", type=Path, metavar="DIR", help=data)
+    knots = "number of times at which motion is sampled (default: those of the data set)"
+    p.add_argument("--knots", type=options.at_least(2), metavar="N", help=knots)
+    p.add_argument("--t-max", type=options.positive, metavar="T", help="last observed time (default: the run's)")
+    p.add_argument("--world", choices=WORLDS, help="world axes (default: those of the data set)")
+    still = "largest motion that counts as rest, as a share of the extent"
+    p.add_argument("--still", type=options.not_negative, metavar="SHARE", help=still)
+    options.add_progress(p)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the command."""
+    names = ("iteration", "data", "knots", "t_max", "world", "still")
+    run_import(args.run, args.out, progress_kind=args.progress, **{name: getattr(args, name) for name in names})
+
+
+@folder_lock.writes("out")
+def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **fields: Any) -> None:
+    """Convert a run folder of another program to a scene file (see `importing.importer.import_run`).
+
+    Args:
+        run_folder: Run folder of the other program.
+        out: Scene file to write.
+        progress_kind: Form of progress output (`progress.make`).
+        **fields: Fields of `importing.importer.Options`.
+    """
+    input_paths.check_scene_output(out)
+    input_paths.check_foreign_run(run_folder)
+    if fields.get("data") is not None:
+        inputs.check_dataset(fields["data"])
+    from ...importing import importer
+    from ...progress import make
+    from ...scene import scene_file
+
+    chosen = importer.Options(**{name: value for name, value in fields.items() if value is not None})
+    with make(progress_kind) as progress:
+        scene = importer.import_run(
+            run_folder,
+            chosen,
+            lambda done, total: progress({"event": "import", "done": done, "total": total, "unit": "Gaussians"}),
+        )
+        scene_file.write(scene, out)
+        if progress_kind == "json":
+            progress({"event": "imported", "path": str(out), "gaussians": len(scene.gaussians.means)})
+    if progress_kind != "json":
+        count = sum(o.id > 0 for o in scene.objects)
+        objects = "1 object" if count == 1 else f"{count} objects"
+        print(f"{out}: {len(scene.gaussians.means)} Gaussians, {objects}, t_max {scene.t_max:g}")

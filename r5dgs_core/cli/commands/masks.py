@@ -1,0 +1,236 @@
+"""The command ``r5dgs masks``: make masks for the training images of a data set, or check existing ones."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ... import errors, user_settings
+from .. import inputs, options
+
+if TYPE_CHECKING:
+    from ...data.dataset import Dataset
+    from ...data.views import View
+    from ...masks.make_masks import Made
+
+NAME = "masks"
+SHORT = "make or check the masks of the training images"
+LONG = "Make object masks with SAM2, convert masks of another program, or check the masks of a data set."
+EXAMPLE = "DATA --backend sam2 --model SAM2_FOLDER"
+PAGE = "user/masks.md"
+
+BACKENDS = ("precomputed", "blender", "sam2")
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    p.add_argument("data", type=Path, help="data set folder")
+    made = "source of the masks: precomputed (a folder; default), blender (a captured data set) or sam2"
+    p.add_argument("--backend", default="precomputed", metavar="NAME", help=made)
+    source = "folder of the masks (precomputed), or captured data set (blender)"
+    p.add_argument("--from", dest="source", type=Path, metavar="FOLDER", help=source)
+    model = "folder of the SAM2 weights (default: sam2 of 'r5dgs config --user')"
+    p.add_argument("--model", type=Path, metavar="DIR", help=model)
+    p.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: DATA/object_mask)")
+    key_frames = "images per video in which sam2 searches for all objects (default: 3)"
+    p.add_argument("--key-frames", type=int, metavar="N", help=key_frames)
+    points = "points along each side of the prompt grid of sam2 (default: 32)"
+    p.add_argument("--points", type=int, metavar="N", help=points)
+    score = "minimum quality that sam2 predicts for a mask, 0 to 1 (default: 0.8)"
+    p.add_argument("--score", type=float, metavar="SHARE", help=score)
+    stability = "minimum IoU of a mask at two thresholds, 0 to 1 (default: 0.95)"
+    p.add_argument("--stability", type=float, metavar="SHARE", help=stability)
+    max_area = "maximum area of an object as a share of the image; larger masks are background (default: 0.4)"
+    p.add_argument("--max-area", type=float, metavar="SHARE", help=max_area)
+    p.add_argument("--device", metavar="NAME", help="device that runs sam2: cpu (default) or cuda")
+    unknown = "mask value of pixels whose object is unknown, for example 255"
+    p.add_argument("--unknown", type=int, metavar="VALUE", help=unknown)
+    p.add_argument("--overwrite", action="store_true", help="replace existing masks")
+    options.add_progress(p)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the command."""
+    given = {field.name: getattr(args, field.name) for field in dataclasses.fields(Options)}
+    run_masks(args.data, progress_kind=args.progress, **given)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `run_masks`; None stands for the default.
+
+    Attributes:
+        backend: Source of the masks, from `BACKENDS`.
+        model: Folder of the SAM2 weights; that of the user's settings if None.
+        source: Folder of masks (``precomputed``) or of a captured data set (``blender``); the data set itself if None.
+        out: Folder to write; ``DATA/object_mask`` if None.
+        key_frames: Images per video in which ``sam2`` searches for all objects.
+        points: Side length of SAM2's grid of point prompts.
+        score: Minimum quality that SAM2 predicts for a mask.
+        stability: Minimum stability score of a mask.
+        max_area: Maximum area of an object, as a share of the image; larger masks are background.
+        device: Device that runs SAM2, "cpu" or "cuda".
+        unknown: Source value of pixels whose object is unknown.
+        overwrite: Replace existing masks.
+    """
+
+    backend: str = "precomputed"
+    model: Path | None = None
+    source: Path | None = None
+    out: Path | None = None
+    key_frames: int | None = None
+    points: int | None = None
+    score: float | None = None
+    stability: float | None = None
+    max_area: float | None = None
+    device: str | None = None
+    unknown: int | None = None
+    overwrite: bool = False
+
+    def segmentation(self) -> dict[str, int | float]:
+        """Return the fields of `masks.sam2_segments.SegmentSettings` that are given."""
+        names = ("points", "score", "stability", "max_area")
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
+
+
+def run_masks(data: Path, *, progress_kind: str = "none", **fields: Any) -> Made:
+    """Write masks of the training images; if source and output are the same folder, check them instead.
+
+    Args:
+        data: The data set.
+        progress_kind: Form of progress output (`progress.make`).
+        **fields: Fields of `Options`.
+
+    Returns:
+        Summary of the written or checked masks.
+
+    Raises:
+        ConfigError, DatasetError, BackendError: An input cannot be used.
+        Interrupted: Ctrl-C; finished videos are kept.
+    """
+    given = Options(**fields)
+    if given.backend == "sam2" and given.model is None:
+        given = dataclasses.replace(given, model=_user_model())
+    _check(given)
+    inputs.check_dataset(data)
+    from ...data import dataset as datasets
+    from ...data import view_masks
+    from ...progress import make
+
+    dataset = datasets.read(data, view_masks.NO_MASKS, min_registered=0.0)
+    folder = dataset.root / datasets.MASKS if given.out is None else Path(given.out)
+    maker = _maker(dataset, given)
+    in_place = given.backend != "sam2" and maker.folder.resolve() == folder.resolve()
+    if in_place:
+        _check_unknown(given.unknown, folder)
+    with make(progress_kind) as progress:
+        made = _make(dataset.train, maker, folder, in_place, given.overwrite, progress)
+        if progress_kind == "json":
+            progress({"event": "masked", "path": str(folder), "images": made.images, "objects": made.objects})
+    if progress_kind != "json":
+        print(_summary(made, len(dataset.train), in_place, dataset.root))
+    return made
+
+
+def _maker(dataset: Dataset, given: Options) -> Any:
+    """Return the `masks.make_masks.MaskBackend` of the options."""
+    if given.backend == "sam2":
+        from ...masks import sam2_masks, sam2_segments
+        from ...masks.sam2_model import Sam2
+
+        assert given.model is not None
+        keys = {} if given.key_frames is None else {"key_frames": given.key_frames}
+        segment = sam2_segments.SegmentSettings(**given.segmentation())  # type: ignore[arg-type]
+        return sam2_masks.Sam2Masks(Sam2(given.model, given.device or "cpu"), segment, sam2_masks.TrackSettings(**keys))
+    from ...data import dataset as datasets
+    from ...masks import mask_folders
+
+    if given.backend == "blender":
+        return mask_folders.Captured(given.source or dataset.root, dataset.train)
+    source = given.source or dataset.root / datasets.MASKS
+    return mask_folders.Precomputed(source, dataset.train, given.unknown)
+
+
+def _make(views: Sequence[View], maker: Any, folder: Path, in_place: bool, overwrite: bool, progress: Any) -> Made:
+    """Make masks, or check them if they are in place."""
+    from ...masks import make_masks
+
+    if in_place:
+        return make_masks.check(views, maker, folder, progress=progress)
+    try:
+        return make_masks.make(views, maker, folder, overwrite=overwrite, progress=progress)
+    except KeyboardInterrupt as stop:
+        raise errors.Interrupted(
+            f"stopped; finished videos are kept in {folder}, run the same command again to continue"
+        ) from stop
+
+
+def _check_unknown(unknown: int | None, folder: Path) -> None:
+    """Raise ConfigError for a value of unknown pixels that the notes of the checked masks do not have."""
+    from ...data import mask_notes
+
+    if unknown is not None and unknown != mask_notes.read(folder).unknown:
+        raise errors.ConfigError(
+            f"--unknown {unknown}: nothing would be written here, so training would not know this value. Remedy: "
+            f"write to another folder with --out, or record it in {folder / mask_notes.FILE}: "
+            f'{{"format_version": 1, "unknown": {unknown}}}'
+        )
+
+
+def _user_model() -> Path | None:
+    found = user_settings.read().get("sam2")
+    return None if found is None else Path(found)
+
+
+def _check(given: Options) -> None:
+    """Raise UsageError for options that do not fit the backend, and for values out of range."""
+    if given.backend not in BACKENDS:
+        raise errors.UsageError(f"--backend {given.backend}: expected one of {', '.join(BACKENDS)}")
+    tuned = {"key_frames": given.key_frames, **given.segmentation()}
+    tuned = {"--" + name.replace("_", "-"): value for name, value in tuned.items() if value is not None}
+    if given.backend == "sam2":
+        if given.model is None:
+            raise errors.UsageError(
+                "--backend sam2: name the folder of the model with --model DIR, or once with "
+                "'r5dgs config --user set sam2 DIR' (docs/user/masks.md)"
+            )
+        misplaced = {"--from": given.source, "--unknown": given.unknown}
+    else:
+        misplaced = {"--model": given.model, "--device": given.device, **tuned}
+        if given.backend == "blender":
+            misplaced["--unknown"] = given.unknown
+    for option, value in misplaced.items():
+        if value is not None:
+            raise errors.UsageError(f"{option}: is not for --backend {given.backend}")
+    for option, value in tuned.items():
+        if option in ("--key-frames", "--points"):
+            if not 1 <= value <= 1024:
+                raise errors.UsageError(f"{option} {value}: expected a number from 1 to 1024")
+        elif not 0 <= value <= 1:
+            raise errors.UsageError(f"{option} {value}: expected a share from 0 to 1")
+
+
+def _summary(made: Made, wanted: int, in_place: bool, root: Path) -> str:
+    """Return the summary of the masks and the next step."""
+    from ...data import dataset as datasets
+    from ...data import mask_notes
+
+    objects = "1 object" if made.objects == 1 else f"{made.objects} objects"
+    lines = [f"{made.folder}: masks of {made.images} of {wanted} training images, {objects}"]
+    if made.kept:
+        lines[0] += f"; {made.kept} of {made.videos} videos were done before"
+    if made.unknown:
+        lines.append(f"{100 * made.unknown:.1f} % of the pixels are unknown")
+    if in_place:
+        lines.append("all masks can be read; nothing was written")
+    if made.numbering == mask_notes.VIDEO and made.videos > 1:
+        own = "" if made.folder == root / datasets.MASKS else f" --masks {made.folder}"
+        lines.append(
+            f"ids are valid within each of {made.videos} videos only. Next: r5dgs train {root} --masks none --out RUN, "
+            f"then r5dgs associate RUN{own}"
+        )
+    return "\n".join(lines)

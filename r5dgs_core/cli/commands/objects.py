@@ -1,0 +1,94 @@
+"""The command ``r5dgs objects``: list the objects of a run or scene, in a table and a picture."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from ... import terminal
+from .. import inputs, options, pictures
+
+NAME = "objects"
+SHORT = "list the objects of a run or scene, in a table and a picture"
+LONG = "List ids, names and sizes of the objects of a run or scene, and draw a picture labelled with them."
+EXAMPLE = "scene.r5dgs --legend legend.png"
+PAGE = "user/objects.md"
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    p.add_argument("target", type=Path, metavar="RUN|SCENE", help="run folder or .r5dgs file")
+    data = "data set in whose views pixels are counted (default: that of the run)"
+    p.add_argument("--data", type=Path, metavar="DIR", help=data)
+    legend = "write a picture of the scene labelled with ids and names"
+    p.add_argument("--legend", type=Path, metavar="FILE.png", help=legend)
+    p.add_argument("--json", action="store_true", help="print JSON instead of the table")
+    pictures.add_arguments(p)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the command."""
+    run_objects(args.target, args.data, legend=args.legend, as_json=args.json, **pictures.chosen(args))
+
+
+def run_objects(
+    target: Path,
+    data: Path | None = None,
+    *,
+    legend: Path | None = None,
+    camera: str | None = None,
+    t: float | None = None,
+    mode: str = "rigid",
+    size: int | None = None,
+    threads: int | None = None,
+    as_json: bool = False,
+) -> dict[str, Any]:
+    """Print the table of a scene's objects, and optionally draw a picture labelled with them.
+
+    Args:
+        target: Run folder or ``.r5dgs`` file.
+        data: Data set whose views are used to count pixels and whose masks are compared; that of the run if None.
+        legend: PNG file of the picture, or None.
+        camera: Name or number of the picture's camera; the one that sees most objects if None.
+        t: Scene time of the picture; if None, the best of the first, middle and last observed time.
+        mode: Playback mode past t_max.
+        size: Pixels of the picture along its longer side.
+        threads: Threads of the kernels; see `options.use_threads`.
+        as_json: Print JSON instead of the table.
+
+    Returns:
+        The content printed by ``--json`` (`evaluation.object_table.to_json`).
+    """
+    pictures.check("--legend", legend, camera, t, size)
+    inputs.check_mode(mode)
+    inputs.check_target(target, data)
+    from ...evaluation import object_table
+    from ...render import viewpoints
+
+    options.use_threads(threads)
+    scene, dataset = inputs.open_target(target, data)
+    inputs.check_mode(mode, scene, target)
+    standpoint = None
+    if legend is not None:
+        object_ids = [item.id for item in scene.objects if item.id > 0]
+        standpoint = pictures.best_standpoint(scene, object_ids, camera, t, mode)
+    if dataset is None:
+        views: list[Any] = object_table.own_views(scene)
+    else:
+        views = viewpoints.spread((*dataset.val, *dataset.test) or dataset.train, object_table.MOST_VIEWS)
+    rows = object_table.measure(scene, views, mode)
+    result = object_table.to_json(scene, rows, len(views))
+    if as_json:
+        print(json.dumps(result, indent=2))
+    else:
+        terminal.console().print(object_table.table(scene, rows, len(views)))
+    if legend is not None and standpoint is not None:
+        from ...data import images
+        from ...evaluation import legend as legends
+
+        images.write_png(legend, legends.draw(scene, standpoint, mode, longest=size))
+        if not as_json:
+            print(f"written: {legend} (camera {standpoint.camera.name}, t = {standpoint.t:g})")
+    return result
