@@ -19,10 +19,11 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Which rooms of the core a room may import, itself and `GROUND` aside, lower rooms first.
 # All rooms may import `GROUND`.
-GROUND = {"atomic_files", "errors", "findings", "folder_lock", "input_paths", "strict_json", "time_left"}
+GROUND = {"atomic_files", "errors", "extras", "findings", "folder_lock", "input_paths", "strict_json", "time_left"}
 ALLOWED = {
     "atomic_files": set(),
     "errors": set(),
+    "extras": set(),
     "motion": set(),
     "terminal": set(),
     "time_left": set(),

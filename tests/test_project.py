@@ -17,10 +17,13 @@ from packaging.version import Version
 
 import r5dgs_core
 from r5dgs_core.cli import parser
+from r5dgs_core.formats import registry as export_formats
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 MANIFEST = tomllib.loads((ROOT / "blender_manifest.toml").read_text())
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+NOT_RUN = {"all", "test", "dev", "docs", "blender"}  # extras that bring no package of the core
 # Extras that this project does not test; what they bring is not pinned.
 UNTESTED_EXTRAS = {"open_clip", "cuda"}
 
@@ -36,9 +39,9 @@ def normal(name: str) -> str:
 
 
 def requirements() -> list[Requirement]:
-    extras = PROJECT["project"]["optional-dependencies"]
-    tested = [line for name, lines in extras.items() if name not in UNTESTED_EXTRAS for line in lines]
-    return [Requirement(line) for line in PROJECT["project"]["dependencies"] + tested]
+    tested = [line for name, lines in EXTRAS.items() if name not in UNTESTED_EXTRAS for line in lines]
+    found = [Requirement(line) for line in PROJECT["project"]["dependencies"] + tested]
+    return [requirement for requirement in found if requirement.name != "r5dgs"]
 
 
 def test_the_extension_and_the_package_have_one_version_and_licence():
@@ -54,6 +57,43 @@ def test_what_was_tested_lies_in_the_ranges_and_everything_needed_is_pinned():
     for requirement in requirements():
         assert normal(requirement.name) in tested, f"{requirement.name} is not in constraints.txt"
         assert requirement.specifier.contains(tested[normal(requirement.name)]), requirement
+
+
+def test_the_extra_all_has_every_extra_that_runs_on_a_cpu():
+    (own,) = [Requirement(line) for line in EXTRAS["all"]]
+    assert own.name == "r5dgs" and own.extras == set(EXTRAS) - UNTESTED_EXTRAS - NOT_RUN
+
+
+def named_extras(tree: ast.AST) -> set[str]:
+    """Extras that calls of `r5dgs_core.extras` in a module name literally."""
+    position = {"required": 1, "command": 0}
+    calls = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
+        if isinstance(node.func.value, ast.Name) and node.func.value.id == "extras"
+    ]
+    given = [call.args[position[call.func.attr]] for call in calls]
+    return {argument.value for argument in given if isinstance(argument, ast.Constant)}
+
+
+def test_every_extra_in_a_message_exists_and_only_one_module_writes_the_command():
+    named, by_hand = set(), []
+    for path in (ROOT / "r5dgs_core").rglob("*.py"):
+        text = path.read_text()
+        named |= named_extras(ast.parse(text))
+        if "'r5dgs[" in text and path.name != "extras.py":
+            by_hand.append(path)
+    named |= {export_formats.get(name).extra for name in export_formats.MODULES} - {None}
+    assert {"encoders", "open_clip", "cuda"} <= named <= set(EXTRAS) and not by_hand
+
+
+def test_every_extra_in_the_documentation_exists_and_the_page_of_the_installation_lists_all():
+    text = "\n".join(path.read_text() for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")))
+    named = {name for found in re.findall(r"(?:r5dgs|\.)\[([\w,]+)\]['\"]", text) for name in found.split(",")}
+    assert {"encoders", "test"} <= named <= set(EXTRAS)
+    rows = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/user/install.md").read_text(), re.MULTILINE)
+    assert sorted(rows) == sorted(EXTRAS)
 
 
 def dependencies() -> set[str]:

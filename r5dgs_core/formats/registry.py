@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .. import errors
+from .. import errors, extras
 
 if TYPE_CHECKING:
     from ..scene.scene import Scene
@@ -72,8 +72,8 @@ class Format:
         if not missing:
             return None
         return (
-            f"{self.label} ({self.suffix}): {', '.join(missing)} is not installed; remedy: pip install "
-            f"'r5dgs[{self.extra}]', then use the command r5dgs export"
+            f"{self.label} ({self.suffix}): {', '.join(missing)} is not installed; remedy: "
+            f"{extras.command(str(self.extra))}, then use the command r5dgs export"
         )
 
     def paths(self, path: Path, options: Options) -> list[Path]:

@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .. import errors
+from .. import errors, extras
 from ..language.encoders import encoder_base
 
 KIND = "sam2_video"
@@ -79,14 +79,11 @@ def _device(name: str) -> torch.device:
 
 def _transformers() -> Any:
     try:
-        import safetensors  # noqa: F401  # transformers imports it only on loading
-        import transformers
+        with extras.required("SAM2 (transformers 5 or later)", "encoders", also=(AttributeError,)):
+            import safetensors  # noqa: F401  # transformers imports it only on loading
+            import transformers
 
-        _ = transformers.Sam2VideoModel, transformers.Sam2Model
-    except (ImportError, AttributeError) as error:
-        raise errors.BackendError(
-            f"SAM2 needs transformers 5 or later: pip install 'r5dgs[encoders]' ({error})"
-        ) from error
+            _ = transformers.Sam2VideoModel, transformers.Sam2Model
     except RuntimeError as error:  # transformers imports other installed packages
         raise errors.BackendError(
             f"transformers cannot be imported ({error}). Remedy: if the installed torchvision does not fit "

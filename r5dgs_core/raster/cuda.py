@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import torch
 
-from .. import errors
+from .. import errors, extras
 from ..scene.cameras import Camera
 from . import reference
 from .backend import Backend
@@ -111,7 +111,7 @@ def find_kernels() -> Kernels | str:
             from gsplat.cuda import _backend
     except Exception as error:  # compiler, linker and loader raise many types
         if isinstance(error, ModuleNotFoundError) and error.name == "gsplat":
-            return "gsplat is not installed; remedy: pip install 'r5dgs[cuda]'"
+            return f"gsplat is not installed; remedy: {extras.command('cuda')}"
         what = (str(error).splitlines() or [""])[0]
         return (
             f"gsplat {version} does not load ({type(error).__name__}: {what}); remedy: check that nvcc of CUDA "

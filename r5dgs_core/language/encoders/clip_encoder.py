@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ... import errors
+from ... import errors, extras
 from ...scene.lookup_table import EncoderCard
 from . import encoder_base
 
@@ -35,11 +35,9 @@ class ClipEncoder:
     """
 
     def __init__(self, folder: Path, kind: str):
-        try:
+        with extras.required("encoder", "encoders"):
             import torch
             from transformers import AutoImageProcessor, AutoModel, AutoTokenizer
-        except ImportError as error:
-            raise encoder_base.missing_package(error) from error
         encoder_base.quieten()
         self._torch = torch
         encoder_base.read_json(folder / "preprocessor_config.json")

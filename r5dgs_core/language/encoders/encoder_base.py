@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ... import errors, strict_json
+from ... import errors, extras, strict_json
 from ...scene.lookup_table import EncoderCard
 
 CANONICAL = ("object", "things", "stuff", "texture")  # phrases of LERF
@@ -82,10 +82,8 @@ def read_json(path: Path, of: str = "an encoder") -> dict[str, Any]:
 
 def weights_of(folder: Path, pattern: str = "model*.safetensors") -> list[Path]:
     """Return the weight files of a model, after checking that each can be opened. Raises `BackendError`."""
-    try:
+    with extras.required("encoder", "encoders"):
         import safetensors
-    except ImportError as error:
-        raise missing_package(error) from error
     paths = sorted(folder.glob(pattern))
     if not paths:
         raise errors.BackendError(
@@ -125,13 +123,6 @@ def model_type(folder: Path) -> object:
     """Return ``model_type`` of a folder's config.json, or None if there is no such file. Raises `BackendError`."""
     path = folder / "config.json"
     return read_json(path).get("model_type") if path.is_file() else None
-
-
-def missing_package(error: ImportError) -> errors.BackendError:
-    """Error for a missing optional package."""
-    return errors.BackendError(
-        f"encoder: cannot import {error.name or error}; install what encoders need: pip install 'r5dgs[encoders]'"
-    )
 
 
 def check_loaded(folder: Path, info: dict[str, Any], unused: Sequence[str] = ()) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import errors
+from ... import errors, extras
 from ...scene.lookup_table import EncoderCard
 from . import encoder_base
 from .clip_encoder import TEMPLATES
@@ -35,15 +35,11 @@ class OpenClipEncoder:
 
     def __init__(self, folder: Path):
         config = encoder_base.read_json(folder / CONFIG)
-        try:
+        remedy = "install a torchvision that fits this torch; or use a CLIP or SigLIP folder of transformers"
+        # A torchvision for another torch raises RuntimeError.
+        with extras.required(f"{folder}", "open_clip", remedy, also=(RuntimeError,)):
             import open_clip
             import torch
-        except (ImportError, RuntimeError) as error:  # a torchvision for another torch raises RuntimeError
-            name = getattr(error, "name", None) or error
-            raise errors.BackendError(
-                f"{folder}: open_clip cannot be imported ({name}); install it with a torchvision that fits this torch: "
-                "pip install 'r5dgs[open_clip]'; or use a CLIP or SigLIP folder of transformers, which needs neither"
-            ) from error
         self._torch = torch
         paths = encoder_base.weights_of(folder, "open_clip_model*.safetensors")
         where = f"local-dir:{folder.resolve()}"

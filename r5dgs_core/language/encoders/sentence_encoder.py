@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import errors
+from ... import errors, extras
 from ...scene.lookup_table import EncoderCard
 from . import encoder_base
 
@@ -37,11 +37,9 @@ class SentenceEncoder:
     """
 
     def __init__(self, folder: Path):
-        try:
+        with extras.required("encoder", "encoders"):
             import torch
             from transformers import AutoModel, AutoTokenizer
-        except ImportError as error:
-            raise encoder_base.missing_package(error) from error
         encoder_base.quieten()
         self._torch = torch
         config = encoder_base.read_json(folder / "config.json")

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from r5dgs_core.cli import export as export_command
+from r5dgs_core.cli.commands import export as export_command
 from r5dgs_core.formats import ply, registry
 from r5dgs_core.scene import scene_file
 from tests.support import layouts, motions, pages, scenes

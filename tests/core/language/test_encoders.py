@@ -234,7 +234,7 @@ def perception(tmp_path):
 
 def test_open_clip_needs_its_package(monkeypatch, perception):
     monkeypatch.setitem(sys.modules, "open_clip", None)
-    with pytest.raises(errors.BackendError, match=r"open_clip cannot be imported.*torchvision.*r5dgs\[open_clip\]"):
+    with pytest.raises(errors.BackendError, match=r"cannot import open_clip.*r5dgs\[open_clip\].*torchvision"):
         registry.open_encoder(perception)
 
 
