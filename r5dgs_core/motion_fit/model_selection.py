@@ -16,15 +16,13 @@ import numpy as np
 
 from ..motion import free_top, models, rotations
 from . import candidates as families
-from . import rest_detection
+from . import fitted_motion, rest_detection
 from .candidates import Candidate, Solution, Track
 
 logger = logging.getLogger(__name__)
 
 HELD_OUT = 0.2
 WITHIN = 1.5
-FADE_PER_SPAN = 0.1 / 0.75
-_RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration")
 _FREE_AXIS = families.BY_NAME["ballistic + spin, free axis"]
 _LARGEST = families.BY_NAME["full, free centre"]
 FREQUENCY_ERROR = 0.25  # largest relative standard deviation of a determined frequency
@@ -107,9 +105,7 @@ def fit(
     Source: selection by held-out error (the simplest within 1.5 times the best), rest test, band from the covariance
         inflated for correlated residuals and from the spread of the near-best candidates.
     """
-    times = np.asarray(times, np.float64)
-    quats = np.asarray(quats, np.float64)
-    displacements = np.asarray(displacements, np.float64)
+    times, quats, displacements = (np.asarray(x, np.float64) for x in (times, quats, displacements))
     weights = np.ones(len(times)) if weights is None else np.asarray(weights, np.float64)
     _check(times, quats, displacements, weights, radius)
     family = families.FAMILY if candidates is None else tuple(_named(name, inertia) for name in candidates)
@@ -123,51 +119,74 @@ def fit(
         displacements[used] / radius,
         weights[used] / weights[used].mean(),
     )
-    middle, frequencies = float(0.5 * (track.tau[0] + track.tau[-1])), _frequencies(track)
-    family = tuple(replace(c, tau_mid=middle, frequencies=frequencies) for c in family)
-    family = tuple(c for c in family if not c.oscillates or frequencies[0] < frequencies[1])
+    family = _observable(family, track)
     if len(track.tau) < 4:
         return _few(track, family, radius, span)
+    return _select(track, family, inertia, (least_noise[0] / radius, least_noise[1]), radius, span)
 
+
+def _select(
+    track: Track,
+    family: tuple[Candidate, ...],
+    inertia: np.ndarray | None,
+    least_noise: tuple[float, float],
+    radius: float,
+    span: float,
+) -> Fit:
+    """Fit four or more poses. ``least_noise`` is in radii and rad; the other arguments are those of `fit`."""
     tried = tuple(c for c in family if not c.oscillates or families.may_swing(c, track))
     sigmas, outliers = _noise(track, tried)
-    sigmas = (max(sigmas[0], least_noise[0] / radius), max(sigmas[1], least_noise[1]))
+    sigmas = (max(sigmas[0], least_noise[0]), max(sigmas[1], least_noise[1]))
+    scores, solutions = _score(family, tried, track, sigmas, outliers)
+    fits = {name: math.sqrt(solution.chi2) for name, solution in solutions.items()}
+    table = [Score(c.name, c.parameters, scores[c.name], fits.get(c.name, math.nan)) for c in family]
+    solution, evidence = min(solutions.values(), key=lambda s: s.candidate.parameters), track
+    tail = rest_detection.poses_at_rest(solution, track, sigmas)
+    if tail:
+        evidence, solutions = track.rows(slice(-tail, None)), {}
+        solution = families.solve(rest_detection.STATIC, evidence, sigmas)
+        wider = math.sqrt(2.0)  # a resting body may move again: twice the variance
+    else:
+        if inertia is not None and any(_may_tumble(s, inertia) for s in solutions.values()):
+            free = replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64))
+            held, top = _held_out(free, track, sigmas, outliers), families.solve(free, track, sigmas)
+            table.append(Score(free.name, free.parameters, held, math.sqrt(top.chi2)))
+            # A simpler motion is replaced only if clearly worse; one with a free angular acceleration has more
+            # parameters.
+            if held * (1.0 if "eps" in solution.candidate.blocks else WITHIN) < scores[solution.candidate.name]:
+                solution, solutions[free.name], scores[free.name] = top, top, held
+        missed = scores[solution.candidate.name]  # assume that the extrapolation errs like the held-out poses
+        wider = max(1.0, missed if math.isfinite(missed) else 1.0)
+    model = fitted_motion.to_model(solution, radius, span, evidence, sigmas)
+    band_tau, band = fitted_motion.band(solution, list(solutions.values()), evidence, sigmas, radius, span)
+    return Fit(
+        model,
+        tuple(table),
+        chosen=solution.candidate.name,
+        rested=tail > 0,
+        sigma_t=sigmas[0] * radius,
+        sigma_r=sigmas[1],
+        band_tau=band_tau,
+        band=wider * band,
+    )
+
+
+def _score(
+    family: tuple[Candidate, ...],
+    tried: tuple[Candidate, ...],
+    track: Track,
+    sigmas: tuple[float, float],
+    outliers: np.ndarray,
+) -> tuple[dict[str, float], dict[str, Solution]]:
+    """Held-out errors of all candidates, and fits to all poses of those near the best, by name."""
     scores = {c.name: _held_out(c, track, sigmas, outliers) if c in tried else math.inf for c in family}
     solutions = {c.name: families.solve(c, track, sigmas) for c in _near(family, scores)}
     # Reject oscillations with an undetermined frequency; other candidates may then be near the best.
-    for name, solution in list(solutions.items()):
+    for name, solution in solutions.items():
         if not _determined(solution, track, sigmas):
             scores[name] = math.inf
     near = _near(family, scores)
-    solutions = {c.name: solutions.get(c.name) or families.solve(c, track, sigmas) for c in near}
-    chosen = min(near, key=lambda c: c.parameters)
-    tail = rest_detection.poses_at_rest(solutions[chosen.name], track, sigmas)
-    rested = tail > 0
-    tops: list[Score] = []
-    if not rested and inertia is not None and any(_may_tumble(s, inertia) for s in solutions.values()):
-        free = replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64))
-        held, whole = _held_out(free, track, sigmas, outliers), families.solve(free, track, sigmas)
-        tops = [Score(free.name, free.parameters, held, math.sqrt(whole.chi2))]
-        # A simpler motion is replaced only if clearly worse; one with a free angular acceleration has more parameters.
-        if held * (1.0 if "eps" in chosen.blocks else WITHIN) < scores[chosen.name]:
-            chosen, solutions[free.name] = free, whole
-    solution, evidence = solutions[chosen.name], track
-    if rested:
-        evidence = track.rows(slice(-tail, None))
-        solution = families.solve(rest_detection.STATIC, evidence, sigmas)
-    table = tuple(
-        Score(c.name, c.parameters, scores[c.name], math.sqrt(solutions[c.name].chi2) if c in near else math.nan)
-        for c in family
-    )
-    model = _to_model(solution, radius, span, evidence, sigmas)
-    near_solutions = [] if rested else list(solutions.values())
-    band_tau, band = _band(solution, near_solutions, evidence, sigmas, radius, span)
-    if rested:  # a resting body may move again: twice the variance
-        band = math.sqrt(2.0) * band
-    else:  # assume that the extrapolation errs like the held-out poses
-        missed = next(row.held_out for row in (*tops, *table) if row.name == chosen.name)
-        band = max(1.0, missed if math.isfinite(missed) else 1.0) * band
-    return Fit(model, (*table, *tops), solution.candidate.name, rested, sigmas[0] * radius, sigmas[1], band_tau, band)
+    return scores, {c.name: solutions.get(c.name) or families.solve(c, track, sigmas) for c in near}
 
 
 def _may_tumble(picked: Solution, inertia: np.ndarray) -> bool:
@@ -187,9 +206,16 @@ def _near(family: Sequence[Candidate], scores: dict[str, float]) -> list[Candida
     return [c for c in family if scores[c.name] <= WITHIN * best and finite] or [family[0]]
 
 
-def _frequencies(track: Track) -> tuple[float, float]:
-    """Observable frequencies: from a quarter of a period in the window to four poses per period."""
-    return 0.5 * math.pi / float(track.tau[-1] - track.tau[0]), 0.5 * math.pi / float(np.median(np.diff(track.tau)))
+def _observable(family: tuple[Candidate, ...], track: Track) -> tuple[Candidate, ...]:
+    """Candidates adapted to the window, without oscillations if it is too short for any.
+
+    Frequencies range from a quarter of a period in the window to four poses per period.
+    """
+    low = 0.5 * math.pi / float(track.tau[-1] - track.tau[0])
+    high = 0.5 * math.pi / float(np.median(np.diff(track.tau)))
+    middle = float(0.5 * (track.tau[0] + track.tau[-1]))
+    adapted = (replace(c, tau_mid=middle, frequencies=(low, high)) for c in family)
+    return tuple(c for c in adapted if not c.oscillates or low < high)
 
 
 def _determined(solution: Solution, track: Track, sigmas: tuple[float, float]) -> bool:
@@ -200,7 +226,7 @@ def _determined(solution: Solution, track: Track, sigmas: tuple[float, float]) -
     low, high = candidate.frequencies
     frequency = float(candidate.unpack(solution.theta)["frequency"][0])
     index = candidate.index("pace")
-    variance = _covariance(solution, track, sigmas)[index, index]
+    variance = fitted_motion.covariance(solution, track, sigmas)[index, index]
     share = (frequency - low) / (high - low)
     sigma = math.sqrt(max(variance, 0.0)) * share * (1 - share) * (high - low)
     return 0.01 < share < 0.99 and sigma < FREQUENCY_ERROR * frequency
@@ -246,8 +272,8 @@ def _few(track: Track, family: tuple[Candidate, ...], radius: float, span: float
     index = next((i for i, root in enumerate(roots) if root <= 1.0), int(np.argmin(roots)))
     chosen = solutions[index]
     table = tuple(Score(c.name, c.parameters, math.inf, r) for c, r in zip(allowed, roots, strict=True))
-    model = _to_model(chosen, radius, span, track, sigmas)
-    band_tau, band = _band(chosen, solutions, track, sigmas, radius, span)
+    model = fitted_motion.to_model(chosen, radius, span, track, sigmas)
+    band_tau, band = fitted_motion.band(chosen, solutions, track, sigmas, radius, span)
     return Fit(model, table, chosen.candidate.name, False, sigmas[0] * radius, sigmas[1], band_tau, band)
 
 
@@ -301,87 +327,3 @@ def _held_out(candidate: Candidate, track: Track, sigmas: tuple[float, float], o
     weights = (tail.weights * np.maximum(outliers[count - held :], 1e-6))[:, None]
     score = math.sqrt(float((weights * values**2).sum() / (6 * weights.sum())))
     return score if math.isfinite(score) else math.inf
-
-
-def _rates(solution: Solution, theta: np.ndarray, radius: float, span: float) -> dict[str, np.ndarray]:
-    """Parameters converted to world units and units of time. [..., P] -> [..., 3] each"""
-    p = solution.candidate.unpack(theta)
-    return {
-        "velocity": p["v"] * radius / span,
-        "acceleration": p["a"] * radius / span**2,
-        "angular_velocity": p["w"] / span,
-        "angular_acceleration": p["eps"] / span**2,
-        "center_offset": p["u"] * radius,
-        "offset_rotvec": p["r"],
-        "offset_displacement": p["e"] * radius,
-        "frequency": p["frequency"] / span,
-    }
-
-
-def _to_model(
-    solution: Solution, radius: float, span: float, track: Track, sigmas: tuple[float, float]
-) -> models.MotionModel:
-    rates = _rates(solution, solution.theta, radius, span)
-    step = 1e-6
-    shifted = solution.theta + step * np.eye(len(solution.theta))
-    moved = _rates(solution, shifted, radius, span)
-    names = (*_RATES, *(["frequency"] if solution.candidate.oscillates else []))
-    slopes = np.concatenate([(moved[name] - rates[name]) / step for name in names], axis=-1).T
-    frequency = float(rates.pop("frequency")[0])
-    inertia = None
-    if solution.candidate.inertia is not None and models.KINDS[solution.candidate.kind].needs_inertia:
-        turn = rotations.quats_to_rotmats(rotations.rotvecs_to_quats(rates["offset_rotvec"]))
-        inertia = turn @ solution.candidate.inertia @ turn.T
-    covariance = slopes @ _covariance(solution, track, sigmas) @ slopes.T
-    return models.MotionModel(
-        kind=solution.candidate.kind,
-        **rates,
-        frequency=frequency,
-        inertia=inertia,
-        fade_time=FADE_PER_SPAN * span,
-        radius=radius,
-        covariance=0.5 * (covariance + covariance.T),
-        covariance_names=(*(f"{name}.{axis}" for name in _RATES for axis in "xyz"), *names[len(_RATES) :]),
-    )
-
-
-def _covariance(solution: Solution, track: Track, sigmas: tuple[float, float]) -> np.ndarray:
-    """Covariance of the parameters, inflated for residuals that are correlated in time (AR(1)). [P, P]"""
-    size, count = len(solution.theta), len(track.tau)
-    values = families.residuals(solution.candidate, solution.theta[None], track, sigmas)[0]
-    s2 = max(solution.chi2 * 6 * count / max(6 * count - size, 1), 1e-12)
-    energy = float((values**2).sum())
-    lag = float((values[1:] * values[:-1]).sum()) / energy if energy > 0 else 0.0
-    rho = min(max(lag + (size / 6 + 1) / count, 0.0), 0.9)
-    return s2 * (1 + rho) / (1 - rho) * np.linalg.pinv(solution.normal, hermitian=True)
-
-
-def _band(
-    chosen: Solution,
-    near: list[Solution],
-    track: Track,
-    sigmas: tuple[float, float],
-    radius: float,
-    span: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Two standard deviations of the position of a surface point, up to one observed span past t_max."""
-    tau = np.linspace(0.0, 1.0, 17)
-    candidate, theta = chosen.candidate, chosen.theta
-    quats, displacements = (x[0] for x in candidate.poses(theta[None], tau))
-    step = 1e-5
-    moved_quats, moved = candidate.poses(theta + step * np.eye(len(theta)), tau)
-    turns = rotations.quats_to_rotvecs(rotations.multiply(moved_quats, rotations.conjugate(quats)))
-    slopes = np.concatenate([moved - displacements, turns], axis=-1) / step  # [P, H, 6]
-    covariance = _covariance(chosen, track, sigmas)
-    spread = np.einsum("phc,pq,qhc->hc", slopes, covariance, slopes)
-    # Mean over a sphere of |dd + dtheta x r|^2, r of length one radius: |dd|^2 + 2/3 |dtheta|^2. The bind state is one
-    # of the poses and as noisy as the others, hence the last two terms.
-    variance = spread[:, :3].sum(-1) + 2 / 3 * spread[:, 3:].sum(-1) + 3 * sigmas[0] ** 2 + 2 * sigmas[1] ** 2
-    others = [s for s in near if s.candidate.name != candidate.name]
-    total = sum(1 / s.candidate.parameters**2 for s in near) or 1.0
-    for other in others:
-        other_quats, other_displacements = (x[0] for x in other.candidate.poses(other.theta[None], tau))
-        angle = rotations.angle_between(other_quats, quats)
-        distance2 = ((other_displacements - displacements) ** 2).sum(-1) + 2 / 3 * angle**2
-        variance = variance + distance2 / (other.candidate.parameters**2 * total)
-    return tau * span, 2 * radius * np.sqrt(variance)
