@@ -14,7 +14,7 @@ import numpy as np
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import key_reduction as reduction
 from ...r5dgs_core.motion import models, rotations
-from ...r5dgs_core.motion.key_reduction import Keys
+from ...r5dgs_core.motion.cubic_curves import Keys
 from ...r5dgs_core.scene import scene_file
 from ...r5dgs_core.scene.scene import Scene
 from .. import compat

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import bezier
-from ...r5dgs_core.motion.key_reduction import Keys
+from ...r5dgs_core.motion.cubic_curves import Keys
 from .. import compat
 from ..scene import timeline
 from . import keyframes

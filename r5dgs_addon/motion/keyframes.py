@@ -11,9 +11,9 @@ import math
 import bpy
 import numpy as np
 
+from ...r5dgs_core.motion import cubic_curves, rotations
 from ...r5dgs_core.motion import key_reduction as reduction
-from ...r5dgs_core.motion import rotations
-from ...r5dgs_core.motion.key_reduction import Curves, Keys
+from ...r5dgs_core.motion.cubic_curves import Curves, Keys
 from ...r5dgs_core.playback import scene_player
 from ...r5dgs_core.scene import row_runs
 from ...r5dgs_core.scene.scene import Scene
@@ -82,7 +82,7 @@ def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float
         return observed
     most = share(len(scene.groups))
     sample = _future(scene, motion_id, most)
-    return reduction.join(observed, few(sample, scene.t_max, times, allowed, reach, most))
+    return cubic_curves.join(observed, few(sample, scene.t_max, times, allowed, reach, most))
 
 
 def share(objects: int) -> int:
@@ -170,7 +170,8 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
         for u in (0.2, 0.4, 0.6, 0.8):
             truth, _ = _cubic(keys, t0 + u * (t1 - t0))
             # To first order, quaternions at distance e move a point at radius r by at most 2 r e.
-            worst = np.maximum(worst, reach * np.linalg.norm(reduction.hermite(v0, v1, m0, m1, h, u) - truth, axis=-1))
+            missed = cubic_curves.hermite(v0, v1, m0, m1, h, u) - truth
+            worst = np.maximum(worst, reach * np.linalg.norm(missed, axis=-1))
         if (worst <= allowed).mean() > 0.05:
             return True
     return False
@@ -199,7 +200,7 @@ def _cubic(keys: Keys, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     u = (at - keys.times[k])[:, None] / h
     start, stop, leave, arrive = keys.values[k], keys.values[k + 1], keys.right_slopes[k], keys.left_slopes[k + 1]
     slopes = 6 * (u - u * u) * (stop - start) / h + (1 - 4 * u + 3 * u * u) * leave + (3 * u * u - 2 * u) * arrive
-    return reduction.hermite(start, stop, leave, arrive, h, u), slopes
+    return cubic_curves.hermite(start, stop, leave, arrive, h, u), slopes
 
 
 def write(fcurves, data_path: str, curve: Keys, times: timeline.Times) -> None:

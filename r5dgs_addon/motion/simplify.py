@@ -4,7 +4,7 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core import errors
-from ...r5dgs_core.motion import bezier, rotations
+from ...r5dgs_core.motion import bezier, cubic_curves, rotations
 from ...r5dgs_core.motion import key_reduction as reduction
 from .. import compat
 from ..scene import timeline
@@ -48,7 +48,7 @@ def key_count(anchors: list[bpy.types.Object]) -> int:
     return sum(len(curve.keyframe_points) for curve in curves)
 
 
-def _plan(anchor: bpy.types.Object, allowed: float) -> tuple[timeline.Times, float, dict[str, reduction.Keys]]:
+def _plan(anchor: bpy.types.Object, allowed: float) -> tuple[timeline.Times, float, dict[str, cubic_curves.Keys]]:
     """Times, allowed error and new keys over frames of an anchor; no keys if nothing can be removed."""
     times, place = extrapolate.times_of(anchor), curve_place.find(anchor)
     if place.strip is not None:
@@ -83,7 +83,7 @@ def _segments(name: str, curve: bpy.types.FCurve) -> np.ndarray:
 
 def _reduced(
     anchor: bpy.types.Object, parts: dict[tuple[str, int], np.ndarray], last: float, allowed: float, reach: float
-) -> reduction.Curves:
+) -> cubic_curves.Curves:
     """Reduced keys over frames, computed between kinks and joined there."""
     start = min(float(part[0, 0, 0]) for part in parts.values())
     stop = max(float(part[-1, 3, 0]) for part in parts.values())
@@ -95,7 +95,7 @@ def _reduced(
     for a, b in zip(cuts[:-1], cuts[1:], strict=True):
         sample = _sampler(anchor, parts, a, b)
         some = reduction.reduce(sample, float(a), float(b), allowed, reach, nearest=keyframes.NEAREST, frames=_FRAMES)
-        joined = some if joined is None else reduction.join(joined, some)
+        joined = some if joined is None else cubic_curves.join(joined, some)
     assert joined is not None
     return joined
 
@@ -142,7 +142,7 @@ def _sampler(
     return sample
 
 
-def _over_time(keys: reduction.Keys, times: timeline.Times) -> reduction.Keys:
+def _over_time(keys: cubic_curves.Keys, times: timeline.Times) -> cubic_curves.Keys:
     """Convert keys over frames to keys over scene time."""
     per = times.frames_per_unit
-    return reduction.Keys(times.time(keys.times), keys.values, keys.left_slopes * per, keys.right_slopes * per)
+    return cubic_curves.Keys(times.time(keys.times), keys.values, keys.left_slopes * per, keys.right_slopes * per)

@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..motion import key_reduction, rotations
-from ..playback import scene_player
+from ..motion import cubic_curves, rotations
 from .group_poses import GroupPoses
 
 
@@ -85,8 +84,8 @@ class Tracks:
         window = np.arange(max(k - 1, 0), min(k + 3, len(self.times)))
         one = np.eye(len(window))
         at = k - window[0]
-        slopes = scene_player.slopes(self.times[window], one)
-        weights = key_reduction.hermite(
+        slopes = cubic_curves.slopes(self.times[window], one)
+        weights = cubic_curves.hermite(
             one[at], one[at + 1], slopes[at], slopes[at + 1], span, np.asarray((t - self.times[k]) / span)
         )
         return {int(s): float(w) for s, w in zip(window, weights, strict=True) if w != 0.0}

@@ -1,7 +1,5 @@
-"""Keyframe reduction: few keys that reproduce a rigid motion within a tolerance, for cubic Bezier interpolation.
+"""Keyframe reduction: few keys of `cubic_curves` that reproduce a rigid motion within a tolerance.
 
-Between two keys each component is the cubic with the given values and slopes at both ends; in Blender: BEZIER keys with
-free handles at a third of the interval. Quaternions are interpolated by component and normalised, as Blender does.
 Location and rotation have their own key times.
 """
 
@@ -14,9 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import models, rotations
+from . import cubic_curves, models, rotations
 
-_ROUNDING = 1e-9  # largest relative change of a curve by a dropped key
 MAX_STEP_RAD = math.radians(120.0)
 MAX_FRAME_TURN_RAD = math.radians(160.0)  # per frame; near half a turn, frames no longer show the direction
 FEWEST_INTERVALS = 64  # first grid between two forced times
@@ -30,38 +27,6 @@ _PER_STRIPE = 32  # keys per stripe; each stripe adds at most one
 
 Samples = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 Sampler = Callable[[np.ndarray], Samples]
-
-
-@dataclass(frozen=True)
-class Keys:
-    """Keys of one curve with C components.
-
-    Attributes:
-        times: Increasing. [K]
-        values: Values at these times. [K, C]
-        left_slopes: Incoming slopes per unit of time. [K, C]
-        right_slopes: Outgoing slopes; they differ from the incoming ones at a kink. [K, C]
-    """
-
-    times: np.ndarray
-    values: np.ndarray
-    left_slopes: np.ndarray
-    right_slopes: np.ndarray
-
-
-@dataclass(frozen=True)
-class Curves:
-    """Keys of a rigid motion.
-
-    Attributes:
-        location: Displacements of the pivot. [K, 3]
-        rotation: Unit wxyz with continuous signs. [K', 4]
-        followed: False if the motion is too fast for keys, so that the curve is exact only at the keys.
-    """
-
-    location: Keys
-    rotation: Keys
-    followed: bool = True
 
 
 @dataclass(frozen=True)
@@ -95,7 +60,7 @@ def reduce(
     nearest: float = 0.0,
     frames: FrameTimes | None = None,
     most: int = MOST_INTERVALS,
-) -> Curves:
+) -> cubic_curves.Curves:
     """Choose keys so that every point of the body stays within ``tolerance`` of the motion.
 
     The number of samples is bounded by a constant times ``most``; with ``frames``, also by a constant times the number
@@ -129,8 +94,35 @@ def reduce(
             f"tolerance, radius, nearest, most: expected > 0, >= 0, >= 0 and >= {FEWEST_INTERVALS}, got {tolerance}, "
             f"{radius}, {nearest} and {most}"
         )
-    cuts = sorted({float(t) for t in forced_times if t0 < t < t1})
-    bounds = [t0, *cuts, t1]
+    bounds = [t0, *sorted({float(t) for t in forced_times if t0 < t < t1}), t1]
+    curves, followed, intervals = _sampled(sample, bounds, tolerance, radius, nearest, frames, most)
+    possible = np.arange(0, len(curves[0].times), _FINER)
+    every_frame = None if all(followed) or frames is None else _at_frames(sample, t0, t1, frames, nearest, most)
+    keys = [
+        framed if framed is not None and not holds else curve.greedy(possible, possible[::intervals])
+        for curve, holds, framed in zip(curves, followed, every_frame or (None, None), strict=True)
+    ]
+    return cubic_curves.Curves(keys[0], keys[1], all(followed))
+
+
+def _sampled(
+    sample: Sampler,
+    bounds: Sequence[float],
+    tolerance: float,
+    radius: float,
+    nearest: float,
+    frames: FrameTimes | None,
+    most: int,
+) -> tuple[tuple[_Curve, _Curve], tuple[bool, bool], int]:
+    """Sample on ever finer grids until single intervals are within the tolerance, or the limits of `reduce` are met.
+
+    Args:
+        bounds: First time, forced times and last time.
+
+    Returns:
+        Location and rotation; for each, True if single intervals follow it; number of intervals between two bounds.
+    """
+    t0, t1 = bounds[0], bounds[-1]
     shortest = min(b - a for a, b in itertools.pairwise(bounds))
     intervals = min(FEWEST_INTERVALS, max(1, int(shortest / nearest))) if nearest > 0 else FEWEST_INTERVALS
     limit = most
@@ -138,30 +130,21 @@ def reduce(
         limit = int(min(limit, max(FEWEST_INTERVALS, _PER_FRAME * (t1 - t0) / frames.duration)))
     while True:
         grid = np.concatenate(
-            [np.linspace(a, b, intervals * _FINER + 1)[:-1] for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-            + [np.array([t1])]
+            [np.linspace(a, b, intervals * _FINER + 1)[:-1] for a, b in itertools.pairwise(bounds)] + [np.array([t1])]
         )
         location, rotation = _Curve.pair(sample(grid), grid, tolerance, radius)
         possible = np.arange(0, len(grid), _FINER)
         too_fast = frames is not None and rotation.turn(min(frames.duration, t1 - t0)) > MAX_FRAME_TURN_RAD
-        followed = [location.holds_steps(possible), not too_fast and rotation.holds_steps(possible)]
-        if followed[0] and (followed[1] or too_fast):
-            break
-        if 2 * intervals > limit or shortest < 2 * intervals * nearest:
-            break
+        followed = location.holds_steps(possible), not too_fast and rotation.holds_steps(possible)
+        settled = followed[0] and (followed[1] or too_fast)
+        if settled or 2 * intervals > limit or shortest < 2 * intervals * nearest:
+            return (location, rotation), followed, intervals
         intervals *= 2
-    forced = possible[::intervals]
-    every_frame = None if all(followed) or frames is None else _at_frames(sample, t0, t1, frames, nearest, most)
-    keys = [
-        framed if framed is not None and not holds else curve.greedy(possible, forced)
-        for curve, holds, framed in zip((location, rotation), followed, every_frame or (None, None), strict=True)
-    ]
-    return Curves(keys[0], keys[1], all(followed))
 
 
 def _at_frames(
     sample: Sampler, t0: float, t1: float, frames: FrameTimes, nearest: float, most: int
-) -> tuple[Keys, Keys]:
+) -> tuple[cubic_curves.Keys, cubic_curves.Keys]:
     """Location and rotation keys at t0, t1 and the frames between them, or every n-th frame if more than ``most``."""
     first, last = math.ceil((t0 - frames.zero) / frames.duration), math.floor((t1 - frames.zero) / frames.duration)
     stride = 1 + max(last - first, 0) // most
@@ -171,116 +154,9 @@ def _at_frames(
     quats, displacements, _, _ = sample(times)
     curves = []
     for values in (displacements, rotations.make_continuous(np.asarray(quats, np.float64))):
-        between = slopes(times, values)
-        curves.append(Keys(times, values, between, between))
+        between = cubic_curves.slopes(times, values)
+        curves.append(cubic_curves.Keys(times, values, between, between))
     return curves[0], curves[1]
-
-
-def join(first: Curves, second: Curves) -> Curves:
-    """Join the curves of two motions, the second starting where the first ends; a kink between them is kept.
-
-    A curve of one key is constant. It is held until the second motion starts, and remains one key if that is constant
-    too. The key at the joint is dropped if it changes nothing, so a straight line at constant speed has two keys in
-    total.
-    """
-
-    def chain(a: Keys, b: Keys, flip: float) -> Keys:
-        if len(a.times) == 1 and a.times[0] < b.times[0]:
-            if len(b.times) == 1:
-                return a
-            still = np.zeros_like(a.values[[0, 0]])
-            a = Keys(np.array([a.times[0], b.times[0]]), a.values[[0, 0]], still, still)
-        values, left, right = b.values * flip, b.left_slopes * flip, b.right_slopes * flip
-        if a.times[-1] != b.times[0]:
-            return Keys(
-                np.concatenate([a.times, b.times]),
-                np.concatenate([a.values, values]),
-                np.concatenate([a.left_slopes, left]),
-                np.concatenate([a.right_slopes, right]),
-            )
-        return Keys(
-            np.concatenate([a.times, b.times[1:]]),
-            np.concatenate([a.values, values[1:]]),
-            np.concatenate([a.left_slopes, left[1:]]),
-            np.concatenate([a.right_slopes[:-1], right]),
-        )
-
-    flip = -1.0 if float(first.rotation.values[-1] @ second.rotation.values[0]) < 0 else 1.0
-    joint = float(second.location.times[0])
-    location = _without(chain(first.location, second.location, 1.0), joint)
-    rotation = _without(chain(first.rotation, second.rotation, flip), joint)
-    return Curves(location, rotation, first.followed and second.followed)
-
-
-def _without(keys: Keys, time: float) -> Keys:
-    """Drop the key at a time if the cubic between its neighbours is the same curve up to rounding."""
-    k = int(np.searchsorted(keys.times, time))
-    if not 0 < k < len(keys.times) - 1 or keys.times[k] != time:
-        return keys
-    rows = np.delete(np.arange(len(keys.times)), k)
-    fewer = Keys(keys.times[rows], keys.values[rows], keys.left_slopes[rows], keys.right_slopes[rows])
-    between = np.linspace(keys.times[k - 1], keys.times[k + 1], 17)
-    sides = np.abs(keys.left_slopes[k] - keys.right_slopes[k]).max() * (between[-1] - between[0])
-    change = max(float(np.abs(evaluate(fewer, between) - evaluate(keys, between)).max()), float(sides))
-    return fewer if change <= _ROUNDING * max(float(np.abs(keys.values).max()), 1e-300) else keys
-
-
-def evaluate(keys: Keys, times: np.ndarray, *, unit: bool = False) -> np.ndarray:
-    """Curve values as Blender evaluates them; constant before the first and after the last key.
-
-    Args:
-        keys: The keys.
-        times: Any shape. [...]
-        unit: Normalise the values, for quaternions.
-
-    Returns:
-        [..., C]
-    """
-    times = np.clip(np.asarray(times, np.float64), keys.times[0], keys.times[-1])
-    if len(keys.times) == 1:
-        values = np.broadcast_to(keys.values[0], (*times.shape, keys.values.shape[1])).copy()
-    else:
-        k = np.clip(np.searchsorted(keys.times, times, side="right") - 1, 0, len(keys.times) - 2)
-        h = (keys.times[k + 1] - keys.times[k])[..., None]
-        u = (times - keys.times[k])[..., None] / h
-        values = hermite(keys.values[k], keys.values[k + 1], keys.right_slopes[k], keys.left_slopes[k + 1], h, u)
-    return rotations.normalize(values) if unit else values
-
-
-def slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Slopes at knots, from the parabola through each knot and its neighbours, or the nearest three knots at the ends.
-
-    Args:
-        times: Increasing. [S]
-        values: Values at these times. [..., S, C]
-
-    Returns:
-        Slopes per unit of time; the secant for S = 2, zero for S = 1. [..., S, C]
-    """
-    if len(times) < 2:
-        return np.zeros_like(values)
-    h = np.diff(times)[:, None]
-    secants = np.diff(values, axis=-2) / h
-    if len(times) == 2:
-        return np.repeat(secants, 2, axis=-2)
-    inner = (h[1:] * secants[..., :-1, :] + h[:-1] * secants[..., 1:, :]) / (h[:-1] + h[1:])
-    first = 2 * secants[..., :1, :] - inner[..., :1, :]
-    last = 2 * secants[..., -1:, :] - inner[..., -1:, :]
-    return np.concatenate([first, inner, last], axis=-2)
-
-
-def hermite(
-    left: np.ndarray, right: np.ndarray, left_slope: np.ndarray, right_slope: np.ndarray, h: np.ndarray, u: np.ndarray
-) -> np.ndarray:
-    """Cubic Hermite interpolation over an interval of length h, at fraction u. All arguments broadcast."""
-    u2 = u * u
-    u3 = u2 * u
-    return (
-        (2 * u3 - 3 * u2 + 1) * left
-        + (u3 - 2 * u2 + u) * h * left_slope
-        + (3 * u2 - 2 * u3) * right
-        + (u3 - u2) * h * right_slope
-    )
 
 
 class _Curve:
@@ -327,13 +203,13 @@ class _Curve:
         h = (self.times[stop] - self.times[start])[:, None, None]
         u = (self.times[inside] - self.times[start][:, None])[..., None] / h
         left, right = self.values[start][:, None], self.values[stop][:, None]
-        cubic = hermite(left, right, self.slopes[start][:, None], self.slopes[stop][:, None], h, u)
+        cubic = cubic_curves.hermite(left, right, self.slopes[start][:, None], self.slopes[stop][:, None], h, u)
         good = np.all(self.error(cubic, self.values[inside]) <= self.tolerance, axis=-1)
         if self.radius is not None:
             good &= (self.values[start] * self.values[stop]).sum(-1) >= math.cos(0.5 * MAX_STEP_RAD)
         return good
 
-    def greedy(self, possible: np.ndarray, forced: np.ndarray) -> Keys:
+    def greedy(self, possible: np.ndarray, forced: np.ndarray) -> cubic_curves.Keys:
         """Greedy keys: each is as far as possible from the previous one, found by galloping and bisection.
 
         If no interval is within the tolerance, the next key is one candidate step away.
@@ -344,7 +220,7 @@ class _Curve:
                 chosen.extend(possible[self._walk(start, stop)].tolist())
         rows = np.array(chosen)
         slopes = np.zeros_like(self.slopes[rows]) if self.constant else self.slopes[rows]
-        return Keys(self.times[rows], self.values[rows].copy(), slopes.copy(), slopes.copy())
+        return cubic_curves.Keys(self.times[rows], self.values[rows].copy(), slopes.copy(), slopes.copy())
 
     def _walk(self, start: int, stop: int) -> list[int]:
         """Key positions after ``start`` up to and including ``stop``."""

@@ -12,7 +12,7 @@ import functools
 import numpy as np
 
 from ..motion import (
-    key_reduction,
+    cubic_curves,
     levenberg_marquardt,
     models,
     rigid_fit,
@@ -75,8 +75,8 @@ class GroupMotion:
         self._scene, self._source = scene, source
         self._quats, self._displacements = knots(scene)
         self._slopes = (
-            key_reduction.slopes(self._times, self._quats),
-            key_reduction.slopes(self._times, self._displacements),
+            cubic_curves.slopes(self._times, self._quats),
+            cubic_curves.slopes(self._times, self._displacements),
         )
         self._followers = [
             (g, group.follows, group.follow_matrix)
@@ -114,7 +114,7 @@ class GroupMotion:
         h = times[k + 1] - times[k]
         u = (t - times[k]) / h
         q, d = (
-            key_reduction.hermite(values[:, k], values[:, k + 1], slopes[:, k], slopes[:, k + 1], h, u)
+            cubic_curves.hermite(values[:, k], values[:, k + 1], slopes[:, k], slopes[:, k + 1], h, u)
             for values, slopes in zip((self._quats, self._displacements), self._slopes, strict=True)
         )
         return rotations.normalize(q), d

@@ -2,14 +2,14 @@
 
 Notation: R rows with residuals, S knots. A residual changes a Gaussian in the bind state, x -> x + offset, q -> turn q,
 log scale -> log scale + growth; its group moves the result. Between knots each component is a cubic with the slopes of
-`key_reduction.slopes`, as for the tracks.
+`cubic_curves.slopes`, as for the tracks.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..motion import key_reduction, point_dynamics, quaternion_columns, rk2_cache, rotations, twist_propagation
+from ..motion import cubic_curves, point_dynamics, quaternion_columns, rk2_cache, rotations, twist_propagation
 from ..scene.row_runs import runs
 from ..scene.scene import Scene
 from . import group_dynamics
@@ -59,7 +59,7 @@ class Residuals:
         h = times[k + 1] - times[k]
         u = (t - times[k]) / h
         offsets, turns, growths = (
-            key_reduction.hermite(a, b, left, right, h, u) for a, b, left, right in self._interval[1]
+            cubic_curves.hermite(a, b, left, right, h, u) for a, b, left, right in self._interval[1]
         )
         return offsets, _unit(turns), growths
 
@@ -75,7 +75,7 @@ def _cubic(times: np.ndarray, values: np.ndarray, k: int) -> Cubic:
     near = values[:, window].astype(np.float64)
     if len(values) == 4:
         near[:, 1:] *= np.cumprod(np.where((near[:, 1:] * near[:, :-1]).sum(0) < 0, -1.0, 1.0), axis=0)
-    rates, i = key_reduction.slopes(times[window], near), k - window.start
+    rates, i = cubic_curves.slopes(times[window], near), k - window.start
     return near[:, i], near[:, i + 1], rates[:, i], rates[:, i + 1]
 
 

@@ -23,8 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..motion import quaternion_columns, rotations
-from ..motion.key_reduction import slopes
+from ..motion import cubic_curves, quaternion_columns, rotations
 from ..scene.scene import Scene
 from . import group_dynamics, posing
 from .group_dynamics import knots
@@ -34,7 +33,7 @@ from .residuals import Literal, OwnMotion, Residuals, unexplained
 
 __all__ = (
     "MODES", "VARIANTS", "Frame", "Player", "available", "every", "frame", "group_poses", "knot_slopes", "knots",
-    "modes", "move_points", "pose", "rest_factors", "sh_rotations", "slopes", "split", "turn_quats",
+    "modes", "move_points", "pose", "rest_factors", "sh_rotations", "split", "turn_quats",
 )  # fmt: skip
 
 
@@ -250,7 +249,8 @@ def frame(scene: Scene, t: float, mode: str = "rigid", *, origin: np.ndarray | N
 def knot_slopes(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
     """Slopes at the knots of `knots`, per unit of scene time: quaternions [G, S, 4] and displacements [G, S, 3]."""
     quats, displacements = knots(scene, groups)
-    return slopes(scene.tracks.times, quats), slopes(scene.tracks.times, displacements)
+    times = scene.tracks.times
+    return cubic_curves.slopes(times, quats), cubic_curves.slopes(times, displacements)
 
 
 def group_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:

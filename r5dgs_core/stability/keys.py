@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from ..motion import key_reduction, rotations
+from ..motion import cubic_curves, key_reduction, rotations
 from .cases import RADIUS, Case, body, largest, model_of, moved
 from .scenes import MOTIONS, T_MAX
 
@@ -15,7 +15,7 @@ _KEYED = 1.0  # units past t_max that get keys
 _SHARE = 1e-3  # of the body's size: tolerance of keys
 
 
-def _reduced(name: str) -> tuple[key_reduction.Curves, key_reduction.Sampler]:
+def _reduced(name: str) -> tuple[cubic_curves.Curves, key_reduction.Sampler]:
     sample = key_reduction.model_sampler(MOTIONS[name], T_MAX)
     return key_reduction.reduce(sample, T_MAX, T_MAX + _KEYED, _SHARE * 2 * RADIUS, RADIUS), sample
 
@@ -25,7 +25,7 @@ def _keys(name: str) -> float:
     curves, sample = _reduced(name)
     times = np.linspace(T_MAX, T_MAX + _KEYED, 961)
     quats, displacements, _, _ = sample(times)
-    found = key_reduction.evaluate(curves.rotation, times, unit=True), key_reduction.evaluate(curves.location, times)
+    found = cubic_curves.evaluate(curves.rotation, times, unit=True), cubic_curves.evaluate(curves.location, times)
     return _key_error(found, (quats, displacements)) / (_SHARE * 2 * RADIUS)
 
 
@@ -59,7 +59,7 @@ def _static_keys() -> float:
     return float(len(curves.location.times) + len(curves.rotation.times) - 2)
 
 
-def blender_values(keys: key_reduction.Keys, frames: np.ndarray, frames_per_unit: float = 60.0) -> np.ndarray:
+def blender_values(keys: cubic_curves.Keys, frames: np.ndarray, frames_per_unit: float = 60.0) -> np.ndarray:
     """Evaluate a curve like Blender's Bezier keys with free handles: float32 control points, a cubic solved for time.
 
     Args:

@@ -7,8 +7,7 @@ import torch
 from hypothesis import strategies as st
 
 from r5dgs_core.model.tracks import Tracks
-from r5dgs_core.motion import key_reduction, rotations
-from r5dgs_core.playback import scene_player
+from r5dgs_core.motion import cubic_curves, rotations
 
 TIMES = np.array([0.0, 0.1, 0.25, 0.3, 0.7])
 
@@ -109,8 +108,8 @@ def test_between_knots_tracks_follow_the_curve_of_playback(t):
         axis=1,
     )
     k = int(np.searchsorted(TIMES, t)) - 1
-    rates, h = scene_player.slopes(TIMES, values), TIMES[k + 1] - TIMES[k]
-    expected = key_reduction.hermite(values[k], values[k + 1], rates[k], rates[k + 1], h, (t - TIMES[k]) / h)
+    rates, h = cubic_curves.slopes(TIMES, values), TIMES[k + 1] - TIMES[k]
+    expected = cubic_curves.hermite(values[k], values[k + 1], rates[k], rates[k + 1], h, (t - TIMES[k]) / h)
     poses = tracks.poses(t)
     np.testing.assert_allclose(poses.displacements[1].detach().numpy(), expected[4:], atol=1e-5)
     rotmat = rotations.quats_to_rotmats(rotations.normalize(expected[:4]))

@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from r5dgs_core.motion import key_reduction, models, rotations, se3
+from r5dgs_core.motion import cubic_curves, key_reduction, models, rotations, se3
 from r5dgs_core.motion.models import MotionModel
 from tests.support.problems import MOTIONS, RADIUS, SIZE
 
@@ -42,8 +42,8 @@ def reduced(model, tolerance=TOLERANCE, t1=2.0, **options):
 
 def largest_error(curves, model, times):
     quats, displacements = models.evaluate(model, times)
-    shift = np.linalg.norm(key_reduction.evaluate(curves.location, times) - displacements, axis=-1)
-    angle = rotations.angle_between(key_reduction.evaluate(curves.rotation, times, unit=True), quats)
+    shift = np.linalg.norm(cubic_curves.evaluate(curves.location, times) - displacements, axis=-1)
+    angle = rotations.angle_between(cubic_curves.evaluate(curves.rotation, times, unit=True), quats)
     return float((shift + 2 * RADIUS * np.sin(0.5 * angle)).max())
 
 
@@ -136,24 +136,24 @@ def test_joined_curves_keep_the_kink_and_both_sides():
 
     left = key_reduction.reduce(first, 0.0, 1.0, TOLERANCE, RADIUS)
     right = key_reduction.reduce(key_reduction.model_sampler(after, 1.0), 1.0, 2.0, TOLERANCE, RADIUS)
-    joined = key_reduction.join(left, right)
+    joined = cubic_curves.join(left, right)
     assert joined.location.times.tolist() == [0, 1, 2]
     np.testing.assert_allclose(joined.location.left_slopes[1], [1, 0, 0])
     np.testing.assert_allclose(joined.location.right_slopes[1], [0, 2, 0])
-    np.testing.assert_allclose(key_reduction.evaluate(joined.location, np.array([0.5, 1.5])), [[-0.5, 0, 0], [0, 1, 0]])
-    assert key_reduction.evaluate(joined.location, np.array([-1.0, 9.0])).tolist() == [[-1, 0, 0], [0, 2, 0]]
+    np.testing.assert_allclose(cubic_curves.evaluate(joined.location, np.array([0.5, 1.5])), [[-0.5, 0, 0], [0, 1, 0]])
+    assert cubic_curves.evaluate(joined.location, np.array([-1.0, 9.0])).tolist() == [[-1, 0, 0], [0, 2, 0]]
 
 
 def test_what_rests_before_it_moves_rests_until_the_join():
     moving = MotionModel("ballistic_spin", velocity=[1, 0, 0], angular_velocity=[0, 0, 2.0])
     rest = key_reduction.reduce(key_reduction.model_sampler(models.STATIC, 0.0), 0.0, 1.0, TOLERANCE, RADIUS)
-    joined = key_reduction.join(
+    joined = cubic_curves.join(
         rest, key_reduction.reduce(key_reduction.model_sampler(moving, 1.0), 1.0, 2.0, TOLERANCE, RADIUS)
     )
     times = np.linspace(0, 1, 31)
-    assert (key_reduction.evaluate(joined.location, times) == 0).all()
-    assert (key_reduction.evaluate(joined.rotation, times, unit=True) == [1, 0, 0, 0]).all()
-    later = key_reduction.Curves(
+    assert (cubic_curves.evaluate(joined.location, times) == 0).all()
+    assert (cubic_curves.evaluate(joined.rotation, times, unit=True) == [1, 0, 0, 0]).all()
+    later = cubic_curves.Curves(
         *(dataclasses.replace(k, times=k.times - 1) for k in (joined.location, joined.rotation))
     )
     assert largest_error(later, moving, np.linspace(0, 1, 301)) <= TOLERANCE
@@ -164,7 +164,7 @@ def test_rest_joined_to_rest_is_one_key():
         key_reduction.reduce(key_reduction.model_sampler(models.STATIC, 0.0), t, t + 1, TOLERANCE, RADIUS)
         for t in (0.0, 1.0)
     )
-    joined = key_reduction.join(first, second)
+    joined = cubic_curves.join(first, second)
     assert joined.location.times.tolist() == joined.rotation.times.tolist() == [0.0]
 
 
@@ -176,7 +176,7 @@ def test_joining_keeps_quaternion_signs_continuous():
         quats, d, rates, slopes = key_reduction.model_sampler(model, 0.0)(times)
         return -quats, d, -rates, slopes
 
-    joined = key_reduction.join(left, key_reduction.reduce(later, 1.0, 2.0, TOLERANCE, RADIUS))
+    joined = cubic_curves.join(left, key_reduction.reduce(later, 1.0, 2.0, TOLERANCE, RADIUS))
     assert (np.diff(joined.rotation.times) > 0).all()
     assert largest_error(joined, model, np.linspace(0, 2, 901)) <= TOLERANCE
 
@@ -264,8 +264,8 @@ def test_what_keys_cannot_follow_is_exact_at_every_frame_and_is_marked(monkeypat
         assert not curves.followed
         quats, displacements = models.evaluate(WILD[name], FRAME * np.arange(21))
         at = FRAME * np.arange(21)
-        shift = np.abs(key_reduction.evaluate(curves.location, at) - displacements).max()
-        turn = rotations.angle_between(key_reduction.evaluate(curves.rotation, at, unit=True), quats).max()
+        shift = np.abs(cubic_curves.evaluate(curves.location, at) - displacements).max()
+        turn = rotations.angle_between(cubic_curves.evaluate(curves.rotation, at, unit=True), quats).max()
         assert shift <= 1e-6 and turn <= 1e-6
         assert max(curves.location.times[-1], curves.rotation.times[-1]) == 20.5 * FRAME
 

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r5dgs_core.motion import key_reduction, models, rotations
+from r5dgs_core.motion import cubic_curves, models, rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import cameras, row_runs, validation
 from tests.support.scenes import T_MAX, make_scene
@@ -57,16 +57,16 @@ def test_between_knots_the_curve_is_smooth_and_near_the_motion(scene):
 
 
 def test_keys_at_the_knots_reproduce_playback(scene):
-    """Blender's Bezier keys with handles at a third are cubic Hermite curves: `key_reduction.evaluate` is their
+    """Blender's Bezier keys with handles at a third are cubic Hermite curves: `cubic_curves.evaluate` is their
     rule.
     """
     quats, displacements = scene_player.knots(scene)
     quat_slopes, slopes = scene_player.knot_slopes(scene)
     times = np.linspace(0, T_MAX, 131)
     for g in range(len(scene.groups)):
-        location = key_reduction.Keys(scene.tracks.times, displacements[g], slopes[g], slopes[g])
-        rotation = key_reduction.Keys(scene.tracks.times, quats[g], quat_slopes[g], quat_slopes[g])
-        keyed = key_reduction.evaluate(location, times), key_reduction.evaluate(rotation, times, unit=True)
+        location = cubic_curves.Keys(scene.tracks.times, displacements[g], slopes[g], slopes[g])
+        rotation = cubic_curves.Keys(scene.tracks.times, quats[g], quat_slopes[g], quat_slopes[g])
+        keyed = cubic_curves.evaluate(location, times), cubic_curves.evaluate(rotation, times, unit=True)
         played = [scene_player.group_poses(scene, t) for t in times]
         np.testing.assert_allclose(keyed[0], np.stack([p[1][g] for p in played]), atol=1e-12)
         np.testing.assert_allclose(keyed[1], np.stack([p[0][g] for p in played]), atol=1e-12)
@@ -76,9 +76,9 @@ def test_slopes_are_exact_for_parabolas_on_uneven_times():
     times = np.array([0.0, 0.1, 0.35, 0.4, 0.9])
     values = np.stack([3 * times**2 - times, 2 + 0 * times], -1)
     expected = np.stack([6 * times - 1, 0 * times], -1)
-    np.testing.assert_allclose(scene_player.slopes(times, values), expected, atol=1e-12)
-    np.testing.assert_allclose(scene_player.slopes(times[:2], values[:2])[0, 0], (values[1, 0] - values[0, 0]) / 0.1)
-    assert (scene_player.slopes(times[:1], values[:1]) == 0).all()
+    np.testing.assert_allclose(cubic_curves.slopes(times, values), expected, atol=1e-12)
+    np.testing.assert_allclose(cubic_curves.slopes(times[:2], values[:2])[0, 0], (values[1, 0] - values[0, 0]) / 0.1)
+    assert (cubic_curves.slopes(times[:1], values[:1]) == 0).all()
 
 
 def test_signs_in_the_file_do_not_matter(scene):
