@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r5dgs_core import errors
-from r5dgs_core.search import english, object_search, prompts
+from r5dgs_core.search import english, object_search, prompts, spelling
 from tests.support.scenes import make_scene
 
 MUG, APPLE, CAR, LEMON, BLOCK, GLOBE = range(1, 7)
@@ -198,12 +198,12 @@ def test_words_that_merely_share_letters_are_not_suggested(text):
 
 
 def edit_distance(a, b):
-    return object_search.edit_distance(a, b, most=99)
+    return spelling.edit_distance(a, b, most=99)
 
 
 @given(st.text("abc", max_size=8), st.text("abc", max_size=8), st.integers(0, 8))
 def test_slips_are_counted_up_to_a_limit(a, b, most):
-    assert object_search.edit_distance(a, b, most) == min(edit_distance(a, b), most + 1)
+    assert spelling.edit_distance(a, b, most) == min(edit_distance(a, b), most + 1)
 
 
 @pytest.mark.parametrize("text", ["mug " * 300, "x" * 1001, " " * 500_000, "mug, " * 100_000])
@@ -227,7 +227,7 @@ def test_long_words_are_compared_letter_by_letter_in_a_narrow_band(monkeypatch):
             return str.__getitem__(self, place)
 
     name = Letters("ab" * 5000)
-    assert object_search.edit_distance(name[:-1], name, 3) == 1
+    assert spelling.edit_distance(name[:-1], name, 3) == 1
     assert Letters.looked_at < 60 * len(name)  # and not its square
 
 
