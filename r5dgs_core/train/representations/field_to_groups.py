@@ -61,39 +61,12 @@ def observed_motion(
         light: Light of the shading. [3]
         regrouping: "off" leaves Gaussians in their original groups.
     """
-    at = knots(times, motion.horizon)
-    rows, means = movers, gaussians["means"][movers]
-    quats = rotations.normalize(gaussians["quats"][movers])
-    states = [motion.deltas(means, float(t)) for t in at]
-    path = torch.stack([means + s.offsets for s in states], 1).numpy().astype(np.float64)
-    turns = torch.stack([rotations.multiply(s.quats, quats) for s in states], 1).numpy().astype(np.float64)
-    sizes = torch.stack([gaussians["log_scales"][movers] + s.log_scales for s in states], 1).numpy()
-    state = motion.state(means + states[-1].offsets, motion.horizon)
-    dynamics = np.zeros((len(gaussians["means"]), 12))
-    dynamics[rows.numpy()] = _about_own_centre(path[:, -1], state, motion.clock.scale)
-    bind = {name: tensor.numpy().copy() for name, tensor in gaussians.items()}
-    canonical = bind["means"].copy()
-    for name, value in (("means", path[:, -1]), ("quats", turns[:, -1]), ("log_scales", sizes[:, -1])):
-        bind[name][rows.numpy()] = value
-    sh = np.concatenate([bind["sh"], bind["sh_rest"]], axis=1).astype(np.float64)[rows.numpy()]
-    since = states[-1].quats.numpy().astype(np.float64)
-    sh = sh_color.rotate(sh, since)
-    ones = np.ones(len(sh))
-    sh, vectors, lit = shading.rebind(sh, bind["shading"][rows.numpy()].astype(np.float64), ones, since, light)
-    bind["shading_rest"] = np.ones(len(labels))
-    bind["shading_rest"][rows.numpy()] = lit
-    for name, value in (("sh", sh[:, :1]), ("sh_rest", sh[:, 1:]), ("shading", vectors)):
-        bind[name][rows.numpy()] = value
-    motion_ids = np.zeros(len(labels), np.int64)
-    own = gaussians["motion_ids"].numpy()[rows.numpy()]
-    own = np.where(own == alone, labels[rows.numpy()], own)
-    if not own.any():  # training had no groups, so the labels define them
-        own = labels[rows.numpy()].astype(np.int64)
-    motion_ids[rows.numpy()] = own
-    resting = ~np.isin(labels, own)  # objects without movers are groups, too,
-    resting[rows.numpy()] = False  # but movers stay in their groups even if the masks label them as background
-    motion_ids[resting] = labels[resting]
-    opacities = to_opacities(gaussians["opacity_logits"].numpy()[rows.numpy()])
+    at, rows = knots(times, motion.horizon), movers.numpy()
+    points, since = _sample(motion, gaussians, movers, at)
+    path = points.means
+    bind = _bind_state(gaussians, points, since, light)
+    motion_ids = _motion_ids(gaussians["motion_ids"].numpy()[rows], labels, rows, alone)
+    own, opacities = motion_ids[rows], to_opacities(gaussians["opacity_logits"].numpy()[rows])
     nearest = np.abs(times[None] - at[:, None]).argmin(1)
     observed = np.concatenate([np.ones((1, len(times)), bool), seen])[:, nearest]
     observed[:, -1] = True
@@ -111,9 +84,73 @@ def observed_motion(
             if shadows:
                 own = np.where(casters > 0, len(object_ids) + np.searchsorted(shadows, casters), own)
                 own, groups, moves = regroup.tidy(path, own, opacities, fit, made_for)
-        motion_ids[rows.numpy()] = own
-    points = PointMotion(rows.numpy(), path, turns, sizes.astype(np.float64), dynamics, canonical)
+        motion_ids[rows] = own
     return ObservedMotion(at, tuple(groups), light, bind, motion_ids, points, moves=moves)
+
+
+def _sample(
+    motion: Motion, gaussians: dict[str, Tensor], movers: Tensor, at: np.ndarray
+) -> tuple[PointMotion, np.ndarray]:
+    """Return the states of the movers at the knots, and their rotations at the horizon since the canonical state.
+
+    Returns:
+        The motion, and rotations wxyz. [R, 4]
+    """
+    means, quats = gaussians["means"][movers], rotations.normalize(gaussians["quats"][movers])
+    states = [motion.deltas(means, float(t)) for t in at]
+    path = torch.stack([means + s.offsets for s in states], 1).numpy().astype(np.float64)
+    turns = torch.stack([rotations.multiply(s.quats, quats) for s in states], 1).numpy().astype(np.float64)
+    sizes = torch.stack([gaussians["log_scales"][movers] + s.log_scales for s in states], 1).numpy()
+    state = motion.state(means + states[-1].offsets, motion.horizon)
+    canonical = gaussians["means"].numpy().copy()
+    dynamics = np.zeros((len(canonical), 12))
+    dynamics[movers.numpy()] = _about_own_centre(path[:, -1], state, motion.clock.scale)
+    points = PointMotion(movers.numpy(), path, turns, sizes.astype(np.float64), dynamics, canonical)
+    return points, states[-1].quats.numpy().astype(np.float64)
+
+
+def _bind_state(
+    gaussians: dict[str, Tensor], points: PointMotion, since: np.ndarray, light: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the parameters of all Gaussians in the bind state, with the shading of that pose.
+
+    Args:
+        gaussians: Canonical parameters by name.
+        points: Result of `_sample`.
+        since: Result of `_sample`. [R, 4]
+        light: Light of the shading. [3]
+    """
+    rows = points.rows
+    bind = {name: tensor.numpy().copy() for name, tensor in gaussians.items()}
+    sh = sh_color.rotate(np.concatenate([bind["sh"], bind["sh_rest"]], axis=1).astype(np.float64)[rows], since)
+    ones = np.ones(len(sh))
+    sh, vectors, lit = shading.rebind(sh, bind["shading"][rows].astype(np.float64), ones, since, light)
+    bind["shading_rest"] = np.ones(len(bind["means"]))
+    pose = {"means": points.means, "quats": points.quats, "log_scales": points.log_scales}
+    moved = {"sh": sh[:, :1], "sh_rest": sh[:, 1:], "shading": vectors, "shading_rest": lit}
+    for name, values in ({name: states[:, -1] for name, states in pose.items()} | moved).items():
+        bind[name][rows] = values
+    return bind
+
+
+def _motion_ids(trained: np.ndarray, labels: np.ndarray, rows: np.ndarray, alone: int) -> np.ndarray:
+    """Return the group of each Gaussian before regrouping. [N]
+
+    Args:
+        trained: Groups of the movers in training. [R]
+        labels: Class of each Gaussian. [N]
+        rows: The movers. [R]
+        alone: Motion id of movers that belong to no group.
+    """
+    own = np.where(trained == alone, labels[rows], trained)
+    if not own.any():  # training had no groups, so the labels define them
+        own = labels[rows].astype(np.int64)
+    result = np.zeros(len(labels), np.int64)
+    result[rows] = own
+    resting = ~np.isin(labels, own)  # objects without movers are groups, too,
+    resting[rows] = False  # but movers stay in their groups even if the masks label them as background
+    result[resting] = labels[resting]
+    return result
 
 
 def _groups(
