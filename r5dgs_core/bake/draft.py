@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from ..config.config import Config
-from ..config.sections import NeedsSection
+from ..config.sections.needs import NeedsSection
 from ..data.dataset import Dataset
 from ..scene.scene import MotionGroup, Scene
 from ..train import checkpoint

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..config.sections import NeedsSection
+from ..config.sections.needs import NeedsSection
 from ..motion import rotations
 from ..scene.scene import Classifier, MotionGroup
 from ..train.observed_motion import Moves

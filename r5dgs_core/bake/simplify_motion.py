@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from ..config.sections import NeedsSection
+from ..config.sections.needs import NeedsSection
 from ..motion import free_top, rotations
 from ..motion_fit import model_selection, shared_gravity
 from ..playback import visibility

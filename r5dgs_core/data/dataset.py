@@ -160,32 +160,15 @@ def read(
     raw = layout.read(root, min_registered, guard)
     if not raw.entries["train"]:
         raise errors.DatasetError(f"{root / CAMERAS_FILE}: expected at least one frame, found none", code="D24")
-    hasher = hashlib.sha256()
-    for path in raw.files:
-        hasher.update(path.read_bytes())
     raw, origin = _near_origin(raw, root)
     folders = {split: view_masks.folder_of(root, train_masks if split == "train" else MASKS) for split in SPLITS}
-    views = view_masks.attach(make_views(raw, folders, origin, guard), folders, hasher, guard)
-    for view in (view for split in SPLITS for view in views[split]):
-        for file in (view.image_path, view.mask_path):
-            if file is not None:
-                hasher.update(_fingerprint(root, file))
+    views, digest = _views(raw, root, folders, origin, guard)
     mask_folder = folders["train"]
     own_ids = mask_folder is not None and (mask_folder / OBJECTS).exists()
-    names: dict[int, str] = {}
-    aliases: dict[int, tuple[str, ...]] = {}
-    with guard(), findings.coded("D20"):
-        names, aliases = read_objects(mask_folder if mask_folder is not None and own_ids else root, guard)
+    names, aliases = _object_names(mask_folder if mask_folder is not None and own_ids else root, guard)
     with guard():
         _check_convention(root, raw.header)
-    ground_truth = None
-    with guard(), findings.coded("D21"):
-        if not own_ids:  # poses use the ids of the data set's own masks
-            ground_truth = read_ground_truth(root)
-    if ground_truth is not None:
-        ground_truth = ground_truth.moved(-origin)
-        for object_id, name in zip(ground_truth.object_ids, ground_truth.names, strict=True):
-            names.setdefault(object_id, name)
+    ground_truth = None if own_ids else _true_poses(root, origin, names, guard)  # these use the data set's own ids
     has_alpha = False
     with guard():
         has_alpha = _has_alpha(views["train"])
@@ -202,13 +185,47 @@ def read(
         world_convention=raw.header.get("world_convention", "blender"),
         frames_per_unit=frames_per_unit,
         has_alpha=has_alpha,
-        digest=hasher.hexdigest(),
+        digest=digest,
         points=raw.points,
         point_colors=raw.colors,
         mask_folder=mask_folder,
         own_ids=own_ids,
         origin=origin,
     )
+
+
+def _object_names(folder: Path, guard: findings.Guard) -> tuple[dict[int, str], dict[int, tuple[str, ...]]]:
+    """Return names and aliases by object id; none after an error that the guard collects."""
+    with guard(), findings.coded("D20"):
+        return read_objects(folder, guard)
+    return {}, {}
+
+
+def _true_poses(root: Path, origin: np.ndarray, names: dict[int, str], guard: findings.Guard) -> GroundTruth | None:
+    """Return the true poses, if any, and add the names of their objects to ``names``."""
+    found = None
+    with guard(), findings.coded("D21"):
+        found = read_ground_truth(root)
+    if found is None:
+        return None
+    for object_id, name in zip(found.object_ids, found.names, strict=True):
+        names.setdefault(object_id, name)
+    return found.moved(-origin)
+
+
+def _views(
+    raw: RawDataset, root: Path, folders: dict[str, Path | None], origin: np.ndarray, guard: findings.Guard
+) -> tuple[dict[str, tuple[View, ...]], str]:
+    """Return the views of each split, and the digest of all files of the data set."""
+    hasher = hashlib.sha256()
+    for path in raw.files:
+        hasher.update(path.read_bytes())
+    views = view_masks.attach(make_views(raw, folders, origin, guard), folders, hasher, guard)
+    for view in (view for split in SPLITS for view in views[split]):
+        for file in (view.image_path, view.mask_path):
+            if file is not None:
+                hasher.update(_fingerprint(root, file))
+    return views, hasher.hexdigest()
 
 
 def _near_origin(raw: RawDataset, root: Path) -> tuple[RawDataset, np.ndarray]:

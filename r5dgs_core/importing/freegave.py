@@ -41,12 +41,7 @@ def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
     field = networks.read_code_field(weights.load(run.weights("code_field.pth")))
     deform = networks.read_deform(weights.load(run.weights("deform.pth")), field.size)
     network = networks.read_velocity(velocity)
-    velocity.tensor(BANK, (field.size, WEIGHTS))
-    if (network.inputs, network.outputs) != (1, WEIGHTS * field.size):
-        raise CheckpointError(
-            f"{velocity.path}: expected a network from 1 to {WEIGHTS * field.size} numbers, found {network.inputs} to "
-            f"{network.outputs}; unknown layout"
-        )
+    _check(velocity, network, field.size)
 
     def codes(rows: slice) -> Tensor:
         with torch.no_grad():
@@ -89,3 +84,13 @@ def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
         return np.where(resting(rows.start, rows.stop)[0][:, None], 0.0, rates(rows, means, t))
 
     return Foreign("freegave", splats, TRACE_NEAR, state, dynamics, t_max)
+
+
+def _check(velocity: weights.Weights, network: networks.VelocityNetwork, patterns: int) -> None:
+    """Raise `CheckpointError` if the velocity network does not have FreeGave's layout for this number of patterns."""
+    velocity.tensor(BANK, (patterns, WEIGHTS))
+    if (network.inputs, network.outputs) != (1, WEIGHTS * patterns):
+        raise CheckpointError(
+            f"{velocity.path}: expected a network from 1 to {WEIGHTS * patterns} numbers, found {network.inputs} to "
+            f"{network.outputs}; unknown layout"
+        )

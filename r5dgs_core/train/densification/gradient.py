@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ...config.config import Config
-from ...config.sections import DensifyDefaultSection, DensifySection
+from ...config.sections.densification import DensifyDefaultSection, DensifySection
 from ...model.gaussians import Gaussians
 from ...raster import RasterStats
 from ...scene.cameras import Camera

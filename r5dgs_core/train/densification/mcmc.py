@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ...config.sections import DensifyMcmcSection
+from ...config.sections.densification import DensifyMcmcSection
 from ...model.gaussians import Gaussians
 from ...motion import rotations
 from ...raster import RasterStats

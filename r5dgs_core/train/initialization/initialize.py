@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...config.config import Config
-from ...config.sections import InitSection
+from ...config.sections.training import InitSection
 from ...model.gaussians import Gaussians
 from ..representations.representation import Representation
 from ..train_views import TrainView, camera_key, nearest_knot, spread

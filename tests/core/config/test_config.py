@@ -8,7 +8,7 @@ import hypothesis
 import pytest
 from hypothesis import strategies as st
 
-from r5dgs_core.config import config
+from r5dgs_core.config import config, rules
 from r5dgs_core.errors import ConfigError
 
 
@@ -123,7 +123,7 @@ def test_every_key_says_what_it_is(section):
 
 
 def test_every_rule_is_about_a_key_and_lets_its_default_pass():
-    for name, (good, _) in config._RULES.items():
+    for name, (good, _) in rules.RULES.items():
         section, key = name.split(".")
         assert good(getattr(getattr(config.Config(), section), key)), name
 

@@ -9,7 +9,7 @@ import torch
 
 from r5dgs_core.config import config as configs
 from r5dgs_core.config.config import Config
-from r5dgs_core.config.sections import DensifyDefaultSection, DensifySection
+from r5dgs_core.config.sections.densification import DensifyDefaultSection, DensifySection
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError
 from r5dgs_core.model.gaussians import Gaussians

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.config.sections import DensifyMcmcSection
+from r5dgs_core.config.sections.densification import DensifyMcmcSection
 from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.train.densification import mcmc
 from tests.core.train.densification.test_densifier import conditions, make

@@ -1,0 +1,37 @@
+"""Section of what the scene needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+NEEDS = ("auto", "on", "off")
+
+
+@dataclass(frozen=True)
+class NeedsSection:
+    """User's overrides of the decisions in the needs table (`bake/needs.py`).
+
+    "auto" decides from measurements, "on" keeps the feature, "off" leaves it out.
+
+    Attributes:
+        tracks: Motion of the objects.
+        rotation: Rotation of the objects; without it, they only translate.
+        shading: Colours that change as objects turn.
+        shadows: Shadow Gaussians.
+        view_dependent_colour: Harmonics of the colour up to ``train.sh_degree`` ("on" raises it to at least 1).
+        sky_gradient: Harmonics of the sky; without them, the sky has one colour.
+        classifier: Identity encodings and their classifier.
+        residuals: Residual motion of non-rigid objects.
+        regrouping: Assignment of a field's Gaussians to the group that explains their motion best, instead of the group
+            of their object.
+    """
+
+    tracks: str = "auto"
+    rotation: str = "auto"
+    shading: str = "auto"
+    shadows: str = "auto"
+    view_dependent_colour: str = "auto"
+    sky_gradient: str = "auto"
+    classifier: str = "auto"
+    residuals: str = "auto"
+    regrouping: str = "auto"
