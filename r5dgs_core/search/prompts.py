@@ -51,10 +51,10 @@ def parse(text: str, names: Iterable[str] = ()) -> Prompt:
         names: Names of objects; a prompt that equals one selects only that, even "Not" or "all".
 
     Raises:
-        ConfigError: Nothing follows an excluding word, or the prompt is longer than `MOST_LETTERS`.
+        UsageError: Nothing follows an excluding word, or the prompt is longer than `MOST_LETTERS`.
     """
     if len(text) > MOST_LETTERS:
-        raise errors.ConfigError(
+        raise errors.UsageError(
             f"a prompt of {len(text)} letters: expected at most {MOST_LETTERS}; ask for fewer objects at a time"
         )
     known = {_spelled(name) for name in names}
@@ -63,7 +63,7 @@ def parse(text: str, names: Iterable[str] = ()) -> Prompt:
         return _list(text, known)
     left, word, right = text[: found[0]].strip(" ,;"), text[slice(*found)].strip(" ,;"), text[found[1] :].strip()
     if not right:
-        raise errors.ConfigError(f"{text.strip()!r}: expected what to leave out after {word!r}")
+        raise errors.UsageError(f"{text.strip()!r}: expected what to leave out after {word!r}")
     if _spelled(right) not in known:
         right = _EXCEPT.sub(" and ", right)  # "not the vase and not the ball" leaves out both
     excluded = _list(right, known)

@@ -132,11 +132,14 @@ def object_ids(scene: Scene, words: str) -> frozenset[int]:
     """Return the ids of the objects that the words name or describe, without an encoder.
 
     Raises:
+        UsageError: The words are empty or incomplete.
         ConfigError: Nothing matches one of the phrases.
     """
     from ...language import query
     from ...search import object_search
 
+    if not object_search.wishes(words):
+        raise errors.UsageError(f"--objects {words!r}: expected words for the objects to export, such as 'red mug'")
     found = object_search.search(scene, words)
     missing = query.unanswered(scene, words) if found else [words]
     if missing:

@@ -47,6 +47,13 @@ def test_each_frame_of_a_range_is_a_file(path, scene, tmp_path, capsys):
     np.testing.assert_array_equal(ply.read(paths[1]).means, means)
 
 
+@pytest.mark.parametrize("words", ["", " , ", "not", "everything but"])
+def test_words_that_name_nothing_are_wrong_usage_of_query_and_export(path, tmp_path, capsys, words):
+    given = ("export", path, "--to", "ply", "--out", tmp_path / "a.ply", "--objects", words)
+    for arguments in (given, ("query", path, words)):
+        assert "expected w" in complaint(capsys, *arguments, status=ExitStatus.USAGE)
+
+
 def test_objects_are_chosen_by_words(path, scene, tmp_path, capsys):
     assert export(path, "--to", "ply", "--out", tmp_path / "a.ply", "--objects", "cup and toy car") == 0
     assert set(ply.read(tmp_path / "a.ply").object_ids) == {1, 3}

@@ -100,7 +100,7 @@ def test_the_error_says_what_may_have_been_meant(scene):
 
 @pytest.mark.parametrize("text", ["not", "everything but", "all except for ", "without"])
 def test_a_prompt_that_ends_too_early_says_so(scene, text):
-    with pytest.raises(errors.ConfigError, match="expected what to leave out"):
+    with pytest.raises(errors.UsageError, match="expected what to leave out"):
         query.find(scene, text)
 
 
