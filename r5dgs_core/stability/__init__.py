@@ -1,8 +1,7 @@
 """``r5dgs report --stability``: stiff, extreme and degenerate cases that run the shipped code, one row each.
 
-The cases read no files and use fixed seeds: the rows are the same on every run, except for their seconds and, on
-    another
-processor, their last digits.
+The cases read no files and use fixed seeds, so every run gives the same rows. Only the seconds differ, and on another
+processor the last digits.
 """
 
 from __future__ import annotations
@@ -43,9 +42,9 @@ CASES: tuple[Case, ...] = (
     *loading.CASES,
 )
 _CAPTION = (
-    f"Less is better. A case over {MOST_SECONDS:g} s of processor time fails. No motion model has drag, so none is "
-    "stiff by it. --json FILE has the quantity, the function, TRACE's integrator on the same case, and where "
-    "tolerances come from."
+    f"Less is better. A case over {MOST_SECONDS:g} s of processor time fails. No motion model has drag, so no case "
+    "tests stiffness caused by drag. --json FILE adds the quantity, the function, the result of TRACE's integrator and "
+    "the origin of each tolerance."
 )
 
 
@@ -56,7 +55,7 @@ class Row:
     Attributes:
         topic: Topic, by which rows are grouped.
         name: Description of the case.
-        method: Tested function.
+        method: Tested functions, relative to the package.
         quantity: Measured quantity; less is better.
         measured: Measured value; NaN if the case raised an error.
         tolerance: Largest value that passes.

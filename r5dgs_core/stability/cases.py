@@ -32,7 +32,7 @@ class Case:
     Attributes:
         topic: Topic, by which rows are grouped.
         name: Description of the case.
-        method: Tested function.
+        method: Tested functions, relative to the package, separated by commas; a remark may follow in parentheses.
         quantity: Measured quantity; less is better.
         tolerance: Largest measured value that passes.
         source: Origin of the tolerance.
@@ -55,7 +55,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Twist:
-    """A twist that is linear in time, about the origin. [3] each"""
+    """Twist that is linear in time, about the origin. [3] each"""
 
     w: np.ndarray
     v: np.ndarray
@@ -68,12 +68,12 @@ class Twist:
         return Twist(*(np.array(x, np.float64) for x in (w, v, eps, a)))
 
     def about(self, center: np.ndarray) -> Twist:
-        """Return the same motion, with velocities of the point at the new origin; the old origin lies at ``center``."""
+        """Return the twist of the same motion about another origin, in which the old origin lies at ``center``."""
         away = -np.asarray(center, np.float64)
         return Twist(self.w, self.v + np.cross(self.w, away), self.eps, self.a + np.cross(self.eps, away))
 
 
-# A body that turns three radians a unit about an axis that tilts, and travels: nothing about it commutes.
+# Spin of 3 rad per unit about a tilting axis, with a translation: none of these rotations and translations commute.
 TILTING = Twist.of([1.2, -2.0, 1.9], [0.4, 0.1, -0.3], [0.5, 0.4, -0.39], [0.1, -0.2, 0.05])
 TILTING_TIME = 2.0
 
@@ -154,19 +154,19 @@ def true_points(twist: Twist, duration: float, points: np.ndarray) -> np.ndarray
 
 
 def model_error(model: models.MotionModel, twist: Twist, tau: float) -> float:
-    """Largest error of a point under a motion model that is the same motion as a twist about its pivot, in radii."""
+    """Return the largest difference of a point between a motion model and a twist about its pivot, in radii."""
     points = body()
     return largest(moved(models.evaluate(model, tau), points) - true_points(twist, tau, points)) / RADIUS
 
 
 def world_twist(twist: Twist) -> models.MotionModel:
-    """The motion model of a twist about the pivot."""
+    """Return the motion model of a twist about the pivot."""
     rates = {"velocity": twist.v, "acceleration": twist.a, "angular_velocity": twist.w}
     return model_of("world_twist", **rates, angular_acceleration=twist.eps)
 
 
 def model_of(kind: str, **rates: Any) -> models.MotionModel:
-    """A motion model of any kind; a top gets three different moments of inertia."""
+    """Return a motion model of any kind; a top gets three different moments of inertia."""
     inertia = np.diag([0.4, 0.8, 1.0]) if models.KINDS[kind].needs_inertia else None
     return models.MotionModel(kind, radius=RADIUS, inertia=inertia, **rates)
 
@@ -226,7 +226,7 @@ def exact_exp(w: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _digits(angle2: float) -> int:
-    """Decimal digits that leave fifty of the series: its terms grow to exp(x) before they fall."""
+    """Number of decimal digits that keeps 50 significant ones, as the terms of the series grow to exp(x) at first."""
     return 60 + math.ceil(math.sqrt(angle2) / math.log(10))
 
 

@@ -29,7 +29,7 @@ from .cases import (
 
 _MODEL_TOLERANCE = 2e-9  # radii
 FAST_V, FAST_W = np.array([0.4, -0.2, 0.1]), 1000 * np.array([0.36, 0.48, -0.8])  # per unit of time
-_MODEL_SOURCE = "twice what models.evaluate asks of its steps"
+_MODEL_SOURCE = "twice the step tolerance of models.evaluate"
 
 
 _FAR = Twist.of([0.9, -1.4, 1.1], [0.2, 0.1, -0.1], [0.2, 0.3, -0.4], [0.1, 0, 0.05])
@@ -37,7 +37,7 @@ _DIAGONAL = np.array([0.6, -0.48, 0.64])
 
 
 def _far_error(distance: float) -> float:
-    """Error of a body of radius one whose twist is given about a far world origin, recentred by us."""
+    """Error of a body of radius 1 whose twist about a distant world origin is recentred first."""
     center = distance * _DIAGONAL
     world = _FAR.about(center)
     v, a = se3.recentre(world.w, world.v, world.eps, world.a, center)
@@ -46,28 +46,28 @@ def _far_error(distance: float) -> float:
 
 
 def _rk2_far(distance: float) -> float:
-    """Change of shape as TRACE computes: float32, about the world's origin."""
+    """Change of shape under TRACE's computation: float32, about the world's origin."""
     center = distance * _DIAGONAL
     points = (body(1.0) + center).astype(np.float32)
     return shape_error(rk2_points(_FAR.about(center), 1.0, points, 60), body(1.0))
 
 
 def _long_exp(radians: float) -> float:
-    """One exponential against decimal arithmetic, many turns; error of a point in radii."""
+    """Error of one exponential over many turns against decimal arithmetic, in radii."""
     w, v = radians * np.array([0.36, 0.48, -0.8]), np.array([0.4, -0.2, 0.1])
     rotmat, displacement = exact_exp(w, v)
     return largest(moved(se3.exp(w, v), body()) - body() @ rotmat.T - displacement) / RADIUS
 
 
 def _one_for_many(radians: float) -> float:
-    """One exponential against 4096 shorter ones."""
+    """Difference between one exponential and the product of 4096 shorter ones, in radii."""
     w, v = radians * np.array([0.36, 0.48, -0.8]), np.array([0.4, -0.2, 0.1])
     many = se3.product(*(np.tile(part, (4096, 1)) for part in se3.exp(w / 4096, v / 4096)))
     return largest(moved(se3.exp(w, v), body()) - moved(many, body())) / RADIUS
 
 
 def _tiny_exp() -> float:
-    """Exponentials of twists that hardly turn, against decimal arithmetic; error of R and d."""
+    """Error of R and d of exponentials against decimal arithmetic, from no rotation to 2 pi."""
     worst = 0.0
     for size in (0.0, 1e-300, 1e-160, 1e-30, 1e-12, 1e-8, 1e-4, 0.5, math.pi - 1e-9, math.pi, 2 * math.pi):
         w, v = size * np.array([0.36, 0.48, -0.8]), np.array([1.0, -2.0, 0.5])
@@ -78,7 +78,7 @@ def _tiny_exp() -> float:
 
 
 def _reversing(axis: tuple[float, float, float]) -> tuple[Twist, float]:
-    """A spin about z whose rate opposes it: stops half-way (axis along z), or is thrown over."""
+    """Spin about z with an opposing rate: it reverses half-way if the axis is z, else the axis tilts over."""
     return Twist.of([0, 0, 4.0], [0.2, 0, 0.1], -4.0 * np.array(axis), [0, 0, 0]), 2.0
 
 
@@ -95,7 +95,7 @@ def _reversing_step() -> float:
 
 
 def _reversing_spin() -> float:
-    """Closed form through the stop, in the centroid form that has no steps."""
+    """Error of the closed form of a spin about the centroid while it reverses, in radii."""
     model = model_of("ballistic_spin", angular_velocity=[0, 0, 4.0], angular_acceleration=[0, 0, -4.0])
     twist, _ = _reversing((0, 0, 1))
     return max(model_error(model, Twist(twist.w, np.zeros(3), twist.eps, twist.a), tau) for tau in (0.5, 1, 1.5, 2))
@@ -107,14 +107,14 @@ def _rk2_reversing(axis: tuple[float, float, float]) -> float:
 
 
 def _fast_screw() -> float:
-    """A constant twist of 1000 rad per unit over one unit."""
+    """Error of a constant twist of 1000 rad per unit over one unit, in radii."""
     model = model_of("constant_twist", velocity=FAST_V, angular_velocity=FAST_W)
     rotmat, displacement = exact_exp(FAST_W, FAST_V)
     return largest(moved(models.evaluate(model, 1.0), body()) - body() @ rotmat.T - displacement) / RADIUS
 
 
 def _fast_world_twist() -> float:
-    """1000 rad per unit with a rate that tilts the axis, over a quarter of a unit."""
+    """Error of a spin of 1000 rad per unit with a tilting axis, over a quarter of a unit, in radii."""
     twist = Twist.of(FAST_W, FAST_V, [200, -100, 300], [0.1, 0, 0])
     return model_error(world_twist(twist), twist, 0.25)
 
@@ -130,7 +130,7 @@ def _huge_rates() -> float:
 
 
 def _stiff_fade() -> float:
-    """Offsets blended in over 1e-300 to 1e300 units of time: distance from their limits, over the offset."""
+    """Relative distance of offsets blended in over 1e-300 to 1e300 units of time from their limits."""
     offset, worst = np.array([0.1, -0.2, 0.05]), 0.0
     for fade, share in ((1e-300, 1.0), (1e-12, 1.0), (1e-3, 1.0), (1e12, 0.0), (1e300, 0.0)):
         model = model_of("translation", offset_displacement=offset, fade_time=fade)
@@ -141,7 +141,7 @@ def _stiff_fade() -> float:
 
 
 def _slow_swing() -> float:
-    """A swing so slow that it is the steady motion: relative distance from that, and a fast one from its sine."""
+    """Relative error of very slow swings against uniform acceleration, and of a fast one against its sine."""
     vectors = {"velocity": [0.3, 0.1, -0.9], "acceleration": [0, 0.4, 6.0]}
     steady = models.evaluate(model_of("translation", **vectors), 2.0)[1]
     slow = [models.evaluate(model_of("translation", **vectors, frequency=f), 2.0)[1] for f in (1e-300, 1e-9)]
@@ -155,7 +155,7 @@ _HORIZON = 75.0
 
 
 def _horizon() -> float:
-    """An axis that keeps tilting over 100 times an observed time of 0.75: error of a point."""
+    """Error of a spin with a tilting axis over 100 times an observed time of 0.75, in radii."""
     return model_error(world_twist(_SLOW), _SLOW, _HORIZON)
 
 
@@ -166,7 +166,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "far from the origin",
             f"twist about a world origin {label} away, radius 1",
-            "se3.recentre, integrate",
+            "motion.se3.recentre, motion.se3.integrate",
             "error of a point / radius",
             tolerance,
             "float64 of the given velocity",
@@ -179,7 +179,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "fast",
             f"one exponential over {label} rad",
-            "se3.exp",
+            "motion.se3.exp",
             POINT_ERROR,
             tolerance,
             "float64 of the angle",
@@ -197,7 +197,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "fast",
             f"one exponential is 4096 shorter ones, {label} rad",
-            "se3.exp, product",
+            "motion.se3.exp, motion.se3.product",
             POINT_ERROR,
             1e-12,
             ROUNDING,
@@ -208,7 +208,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "fast",
         "1000 rad per unit, constant twist",
-        "models.evaluate",
+        "motion.models.evaluate",
         POINT_ERROR,
         1e-12,
         "float64 of the angle",
@@ -218,7 +218,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "fast",
         "1000 rad per unit, axis that tilts, 15 steps' time",
-        "models.evaluate",
+        "motion.models.evaluate",
         POINT_ERROR,
         _MODEL_TOLERANCE,
         _MODEL_SOURCE,
@@ -228,7 +228,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "reversing spin",
         "on its axis, one step",
-        "se3.integrate",
+        "motion.se3.integrate",
         POINT_ERROR,
         1e-12,
         ROUNDING,
@@ -238,7 +238,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "reversing spin",
         "on its axis, closed form through the stop",
-        "models.evaluate",
+        "motion.models.evaluate",
         POINT_ERROR,
         1e-12,
         ROUNDING,
@@ -248,7 +248,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "reversing spin",
         "rate tilted by half a radian",
-        "models.evaluate",
+        "motion.models.evaluate",
         POINT_ERROR,
         _MODEL_TOLERANCE,
         _MODEL_SOURCE,
@@ -258,18 +258,20 @@ CASES: tuple[Case, ...] = (
     Case(
         "reversing spin",
         "rate at a right angle",
-        "models.evaluate",
+        "motion.models.evaluate",
         POINT_ERROR,
         _MODEL_TOLERANCE,
         _MODEL_SOURCE,
         lambda: _reversing_model((1, 0, 0)),
         lambda: _rk2_reversing((1, 0, 0)),
     ),
-    Case("tiny rates", "spins of 0, 1e-300 to 2 pi rad", "se3.exp", "error of R and d", 1e-14, ROUNDING, _tiny_exp),
+    Case(
+        "tiny rates", "spins of 0, 1e-300 to 2 pi rad", "motion.se3.exp", "error of R and d", 1e-14, ROUNDING, _tiny_exp
+    ),
     Case(
         "huge rates",
         "velocities, spins and their rates of 1e30",
-        "models.evaluate, dynamics.propagate",
+        "motion.models.evaluate, motion.point_dynamics.propagate",
         "numbers that are not finite",
         0.0,
         "all finite",
@@ -278,7 +280,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "stiff",
         "offset blended in over 1e-300 to 1e300 units",
-        "models.evaluate_with_rates",
+        "motion.models.evaluate_with_rates",
         "distance from the limit / offset",
         1e-11,
         "half a unit over 1e12",
@@ -287,7 +289,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "stiff",
         "swing of 1e-300, 1e-9 and 1e6 rad per unit",
-        "models.evaluate",
+        "motion.models.evaluate",
         "relative distance from limit and sine",
         1e-12,
         ROUNDING,
@@ -296,7 +298,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "horizon",
         "100 times the observed time, axis that tilts",
-        "models.evaluate",
+        "motion.models.evaluate",
         POINT_ERROR,
         _MODEL_TOLERANCE,
         _MODEL_SOURCE,

@@ -21,7 +21,7 @@ _FITS = 100
 
 
 def _cloud(shape: str, rng: np.random.Generator) -> np.ndarray:
-    """Points of a body 0.6 long, thinner and thinner. [n, 3]"""
+    """Points of a body of length 0.6; the shape sets its width. [n, 3]"""
     if shape in ("3 points", "2 points", "1 point"):
         return np.array([[0.3, 0, 0], [-0.3, 0, 0], [0, 0.25, 0.1]])[: int(shape[0])] * [1, 1, 1]
     widths = {"box": (0.4, 0.3), "plane": (0.4, 0.0), "rod 0.1": (0.06, 0.06), "rod 0.01": (0.006, 0.006)}
@@ -30,9 +30,9 @@ def _cloud(shape: str, rng: np.random.Generator) -> np.ndarray:
 
 
 def _fits(shape: str) -> list[tuple[np.ndarray, rigid_fit.RigidFit]]:
-    """Fits of noisy copies of a cloud, each turned and moved by its own true rotation, unit wxyz [4].
+    """Fits to noisy copies of a cloud, each moved by a random true rotation, unit wxyz [4], and a translation.
 
-    All directions take part: whether a fit without care mirrors a flat body hangs on how it lies.
+    Random orientations are tested, because a naive fit mirrors a flat body only in some orientations.
     """
     rng, found = np.random.default_rng(6), []
     cloud = _cloud(shape, rng)
@@ -44,7 +44,7 @@ def _fits(shape: str) -> list[tuple[np.ndarray, rigid_fit.RigidFit]]:
 
 
 def _calibration(shape: str) -> float:
-    """Relative deviation of the rotation errors from those that the covariance predicts."""
+    """Relative difference between the rotation errors and those that the covariance predicts."""
     scores = []
     for quat, fit in _fits(shape):
         error = rotations.quats_to_rotvecs(rotations.multiply(rotations.conjugate(quat), fit.quat))
@@ -53,7 +53,7 @@ def _calibration(shape: str) -> float:
 
 
 def _misfits(shape: str) -> float:
-    """Fits that leave a point far off: of a mirrored cloud, or of one turned where its points do not allow that."""
+    """Number of fits with a point more than 8 sigma off, from mirroring or a wrong rotation."""
     cloud, wrong = _cloud(shape, np.random.default_rng(6)), 0
     for quat, fit in _fits(shape):
         fitted = cloud + fit.displacement_at(cloud)
@@ -62,7 +62,7 @@ def _misfits(shape: str) -> float:
 
 
 def _direction(shape: str) -> float:
-    """Largest error of the direction of a line, rad; infinite where the turn about it is not the least possible."""
+    """Largest error of the direction of a line, rad; infinity if the rotation about the line is not minimal."""
     along, worst = np.array([1.0, 0, 0]), 0.0
     for quat, fit in _fits(shape):
         direction = rotations.rotate(fit.quat, along)
@@ -74,7 +74,7 @@ def _direction(shape: str) -> float:
 
 
 def _point(count: int) -> float:
-    """One point, or several in one place: the rotation is the expected one, the displacement exact."""
+    """Error of the fit to coincident points, whose rotation must be the hint: angle (rad) plus distance."""
     hint = rotations.rotvecs_to_quats(_TURN)
     cloud = np.tile([[0.2, 0.1, -0.3]], (count, 1))
     fit = rigid_fit.fit_rigid(cloud, cloud + _MOVE, hint=hint)
@@ -82,14 +82,14 @@ def _point(count: int) -> float:
 
 
 def _triangle() -> float:
-    """Three points without noise, turned by nearly a half turn: the angle to the truth."""
+    """Error of the fit to three exact points rotated by almost 180 degrees, rad."""
     quat = rotations.rotvecs_to_quats(_TURN / np.linalg.norm(_TURN) * (math.pi - 1e-6))
     cloud = _cloud("3 points", np.random.default_rng(0))
     return angle(rigid_fit.fit_rigid(cloud, rotations.rotate(quat, cloud) + _MOVE).quat, quat)
 
 
 def _refused_fits() -> float:
-    """Fits without points, without weight, or with a point that is no number, that are not refused."""
+    """Number of invalid inputs (no points, zero weights, NaN, infinity) that are accepted."""
     cloud = _cloud("3 points", np.random.default_rng(0))
     broken = cloud + np.array([[np.nan, 0, 0], [0, 0, 0], [0, 0, 0]])
     accepted = 0
@@ -112,9 +112,9 @@ _DRIFTING = model_of("world_twist", velocity=[0.3, -0.2, 0.1], angular_velocity=
 
 
 def _aggregated(distance: float, source: str) -> np.ndarray:
-    """Velocity of the centre of a body and its spin, from members whose twists are noisy, a tenth of them wrong. [6]
+    """Velocity of a body's centre and its spin, computed from noisy member twists, 10 % of them wrong. [6]
 
-    The members lie on a grid that float32 holds at every distance, so that rounding of the scene has no part in it.
+    The members lie on a grid that float32 represents exactly at every distance, which excludes rounding of the scene.
     """
     rng = np.random.default_rng(7)
     grid = np.round(rng.uniform(-0.25, 0.25, size=(_MEMBERS, 3)) * 512) / 512
@@ -122,7 +122,7 @@ def _aggregated(distance: float, source: str) -> np.ndarray:
     scene = scene_of([grid + center], [_DRIFTING], singles=True)
     assert scene.dynamics is not None
     spins = _DRIFTING.angular_velocity + 0.2 * rng.normal(size=(_MEMBERS, 3))
-    # What a member knows is its velocity; that is v_i + w_i x y_i about the world's origin, whatever its w_i.
+    # Each member has the correct velocity at its own position, with any spin w_i.
     speeds = _DRIFTING.velocity + np.cross(_DRIFTING.angular_velocity, grid - grid.mean(0))
     speeds += 0.02 * rng.normal(size=(_MEMBERS, 3))
     wrong = rng.permutation(_MEMBERS)[: _MEMBERS // 10]
@@ -149,7 +149,7 @@ def _track(step_rad: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _aliased(step_degrees: float, seen_degrees: float | None) -> float:
-    """Difference of the step that is told of from the one that is seen, rad; infinite where it is (not) told."""
+    """Error of the reported step, rad; infinity if a step is reported that should not be, or not reported."""
     found = rigid_fit.aliased_step(TIMES, _track(math.radians(step_degrees))[0])
     if found is None or seen_degrees is None:
         return 0.0 if found is None and seen_degrees is None else math.inf
@@ -157,7 +157,7 @@ def _aliased(step_degrees: float, seen_degrees: float | None) -> float:
 
 
 def _spin_of_track(step_degrees: float) -> float:
-    """Relative error of the spin fitted to exact poses with such steps."""
+    """Relative error of the spin fitted to exact poses with steps of this size."""
     with logged():
         fit = model_selection.fit(TIMES, *_track(math.radians(step_degrees)), radius=0.3)
     expected = math.radians(step_degrees) / (T_MAX / (len(TIMES) - 1))
@@ -165,7 +165,7 @@ def _spin_of_track(step_degrees: float) -> float:
 
 
 def _few_poses() -> float:
-    """Distance from the steady motion that one, two or three poses say, over a radius, a third of their span on."""
+    """Largest error, in radii, of motions fitted to 1, 2 and 3 poses, a quarter of their span past the last pose."""
     worst = 0.0
     for count, speed in ((1, 0.0), (2, 0.4), (3, 0.4)):
         times = TIMES[-count:]
@@ -183,8 +183,8 @@ CASES: tuple[Case, ...] = (
     *(
         Case(
             "degenerate groups",
-            f"{shape}: errors are as large as predicted",
-            "poses.fit_rigid",
+            f"{shape}: errors match their prediction",
+            "motion.rigid_fit.fit_rigid",
             "|rms error / predicted - 1|",
             0.2,
             _NOISE,
@@ -195,8 +195,8 @@ CASES: tuple[Case, ...] = (
     *(
         Case(
             "degenerate groups",
-            f"{shape}: every point is where it belongs",
-            "poses.fit_rigid",
+            f"{shape}: all points within 8 sigma",
+            "motion.rigid_fit.fit_rigid",
             "fits with a point over 8 sigma off",
             0.0,
             _NOISE,
@@ -207,8 +207,8 @@ CASES: tuple[Case, ...] = (
     *(
         Case(
             "degenerate groups",
-            f"{shape}: direction found, least turn about it",
-            "poses.fit_rigid",
+            f"{shape}: direction correct, rotation about it minimal",
+            "motion.rigid_fit.fit_rigid",
             "largest error (rad)",
             tolerance,
             "5 sigma of the noise",
@@ -219,7 +219,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "degenerate groups",
         "3 exact points, almost a half turn",
-        "poses.fit_rigid",
+        "motion.rigid_fit.fit_rigid",
         "angle (rad)",
         1e-12,
         ROUNDING,
@@ -228,8 +228,8 @@ CASES: tuple[Case, ...] = (
     *(
         Case(
             "degenerate groups",
-            f"{name}: expected rotation, own displacement",
-            "poses.fit_rigid",
+            f"{name}: rotation of the hint, exact displacement",
+            "motion.rigid_fit.fit_rigid",
             "angle (rad) and distance",
             1e-14,
             ROUNDING,
@@ -239,21 +239,21 @@ CASES: tuple[Case, ...] = (
     ),
     Case(
         "degenerate groups",
-        "no points, no weight, NaN, infinity: refused",
-        "poses.fit_rigid",
+        "no points, zero weights, NaN, infinity raise errors",
+        "motion.rigid_fit.fit_rigid",
         "accepted",
         0.0,
-        "errors are told",
+        "an error is raised",
         _refused_fits,
     ),
     *(
         Case(
             "twists of members",
-            f"median of 400, a tenth of them wrong, {label} from the origin",
-            "group_dynamics.models_of",
+            f"median of 400, 10 % of them wrong, {label} from the origin",
+            "playback.group_dynamics.models_of",
             "error of the centre's velocity",
             0.015,
-            "0.14 sigma, as a tenth are wrong to one side",
+            "bias of the median from 10 % one-sided outliers, 0.14 sigma",
             functools.partial(_aggregation_error, d, "median"),
         )
         for label, d in (("0", 0.0), ("10", 10.0), ("1e4", 1e4))
@@ -262,7 +262,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "twists of members",
             f"{source.replace('_', ' ')}: the same 1, 100 and 1e4 from the origin",
-            "group_dynamics.models_of",
+            "playback.group_dynamics.models_of",
             "change of the twist",
             1e-10,
             ROUNDING,
@@ -273,11 +273,11 @@ CASES: tuple[Case, ...] = (
     *(
         Case(
             "aliasing",
-            f"poses {step:g} degrees apart are {'told of' if seen else 'not told of'}",
-            "poses.aliased_step",
-            "error of the step seen (rad)",
+            f"poses {step:g} degrees apart are {'reported' if seen else 'not reported'}",
+            "motion.rigid_fit.aliased_step",
+            "error of the reported step (rad)",
             1e-12,
-            "over 120 degrees is told, over 180 seen as the rest of the turn",
+            "steps over 120 degrees are reported; x > 180 degrees appears as 360 - x",
             functools.partial(_aliased, step, seen),
         )
         for step, seen in ((60.0, None), (119.0, None), (121.0, 121.0), (200.0, 160.0))
@@ -285,7 +285,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "aliasing",
         "spin of poses 100 degrees apart",
-        "fitting.fit",
+        "motion_fit.model_selection.fit",
         "relative error of the spin",
         1e-6,
         "exact poses",
@@ -294,10 +294,10 @@ CASES: tuple[Case, ...] = (
     Case(
         "few poses",
         "1, 2 and 3 poses",
-        "fitting.fit",
+        "motion_fit.model_selection.fit",
         "error / radius",
         1e-2,
-        "what few poses are asked to explain",
+        "linear motion is fitted exactly",
         _few_poses,
     ),
 )

@@ -21,7 +21,7 @@ def _reduced(name: str) -> tuple[cubic_curves.Curves, key_reduction.Sampler]:
 
 
 def _keys(name: str) -> float:
-    """Error of keys on a grid four times finer than 240 frames a unit, over their tolerance."""
+    """Error of keys on a grid of 960 samples per unit, relative to their tolerance."""
     curves, sample = _reduced(name)
     times = np.linspace(T_MAX, T_MAX + _KEYED, 961)
     quats, displacements, _, _ = sample(times)
@@ -45,7 +45,7 @@ def _key_error(found: tuple[np.ndarray, np.ndarray], true: tuple[np.ndarray, np.
 
 
 def _key_steps() -> float:
-    """Largest turn from one key to the next over 120 degrees, of a body that turns by 10 rad."""
+    """Largest rotation between neighbouring keys of a body that turns by 10 rad, relative to 120 degrees."""
     model = model_of("ballistic_spin", angular_velocity=[0, 6, 8])
     sample = key_reduction.model_sampler(model, T_MAX)
     keys = key_reduction.reduce(sample, T_MAX, T_MAX + _KEYED, 0.5, RADIUS).rotation
@@ -54,7 +54,7 @@ def _key_steps() -> float:
 
 
 def _static_keys() -> float:
-    """Keys beyond one per curve for a body at rest."""
+    """Number of keys in excess of one per curve, for a body at rest."""
     curves, _ = _reduced("static")
     return float(len(curves.location.times) + len(curves.rotation.times) - 2)
 
@@ -103,10 +103,10 @@ CASES: tuple[Case, ...] = (
         Case(
             "keys",
             f"{name}: on a grid four times finer",
-            "keyframes.reduce",
+            "motion.key_reduction.reduce",
             _TOLERANCE,
             1.0,
-            "asked for",
+            "requested tolerance",
             functools.partial(_keys, name),
         )
         for name in MOTIONS
@@ -115,10 +115,10 @@ CASES: tuple[Case, ...] = (
         Case(
             "keys",
             f"{name}: as Blender evaluates them",
-            "keyframes.reduce",
+            "motion.key_reduction.reduce",
             _TOLERANCE,
             1.0,
-            "asked for, in float32",
+            "requested tolerance, in float32",
             functools.partial(_blender_keys, name),
         )
         for name in MOTIONS
@@ -126,13 +126,19 @@ CASES: tuple[Case, ...] = (
     Case(
         "keys",
         "no step over 120 degrees",
-        "keyframes.reduce",
+        "motion.key_reduction.reduce",
         "largest step / 120 degrees",
         1.0,
         "signs of quaternions",
         _key_steps,
     ),
     Case(
-        "keys", "a body at rest has one key per curve", "keyframes.reduce", "keys too many", 0.0, "count", _static_keys
+        "keys",
+        "a body at rest has one key per curve",
+        "motion.key_reduction.reduce",
+        "keys too many",
+        0.0,
+        "count",
+        _static_keys,
     ),
 )

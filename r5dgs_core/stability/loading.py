@@ -23,7 +23,7 @@ _ROUNDING = "rounding of float32"
 
 
 def _round_trip(bodies: int, scale: float, times: np.ndarray) -> float:
-    """Largest error of a centre, in sizes of the scene, after writing and reading it."""
+    """Largest error of a centre after writing and reading a scene, relative to its extent."""
     cloud = scale * body(0.3)
     clouds = [cloud + scale * np.array([k % 100, k // 100, 0.0]) for k in range(bodies)]
     motion = model_of("ballistic_spin", angular_velocity=[0, 0, 1e5], velocity=[scale, 0, 0])
@@ -51,7 +51,7 @@ _WILD = {
 
 
 def _keys(model: models.MotionModel, frame: float) -> float:
-    """Samples over the bound, or infinity if keys are not finite; ten units of time."""
+    """Number of samples over its bound, for ten units of time; infinity if keys are not finite."""
     sampled, sample = [0], key_reduction.model_sampler(model, T_MAX)
 
     def counted(times: np.ndarray) -> key_reduction.Samples:
@@ -73,14 +73,14 @@ def _looking(distance: float = 4.0) -> Camera:
 
 
 def _axes(scale: float) -> float:
-    """A pose there and back through OpenGL's axes, in its distance."""
+    """Largest error of a pose converted to OpenGL's axes and back, relative to its distance."""
     pose = _looking(scale).T_cam_world
     back = cameras.opengl_to_cam_world(cameras.cam_world_to_opengl(pose))
     return float(np.abs(back - pose).max() / max(scale, 1.0))
 
 
 def _projected(scale: float) -> float:
-    """Pixels by which the same view of a world of another unit differs."""
+    """Largest difference of a projected point, in pixels, between a world and its scaled copy."""
     one, other = (cameras.project(_looking(4 * s), s * body())[0] for s in (1.0, scale))
     return float(np.abs(one - other).max())
 
@@ -101,7 +101,7 @@ def _picture(scale: float, shape: tuple[float, float, float] = (0.1, 0.1, 0.1), 
 
 
 def _drawn(scale: float) -> float:
-    """Largest difference of a pixel to the same picture in a world of unit size."""
+    """Largest difference of a pixel between a world and its copy of unit size."""
     return float(np.abs(_picture(scale) - _picture(1.0)).max())
 
 
@@ -118,7 +118,15 @@ def _warm() -> None:
 
 CASES: tuple[Case, ...] = (
     *(
-        Case("loading", name, "scene_file", "error of a centre / extent", 1e-4, "16 bits of a position", measure)
+        Case(
+            "loading",
+            name,
+            "scene.scene_file.write, scene.scene_file.read",
+            "error of a centre / extent",
+            1e-4,
+            "16 bits of a position",
+            measure,
+        )
         for name, measure in (
             ("a world of 1e-6 units", functools.partial(_round_trip, 1, 1e-6, np.linspace(0, 1, 5))),
             ("a world of 1e6 units", functools.partial(_round_trip, 1, 1e6, np.linspace(0, 1, 5))),
@@ -131,7 +139,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "keying",
             f"{name}, {label}",
-            "keyframes.reduce",
+            "motion.key_reduction.reduce",
             "samples / bound",
             1.0,
             _BOUNDED,
@@ -143,8 +151,15 @@ CASES: tuple[Case, ...] = (
     *(
         Case("cameras", f"{what}, {scale:g}", method, quantity, limit, source, functools.partial(measure, scale))
         for what, method, quantity, limit, source, measure in (
-            ("to OpenGL and back, distance", "cameras", "error / distance", 1e-12, "rounding of float64", _axes),
-            ("projection, world of size", "cameras.project", "pixels", 1e-9, "rounding of float64", _projected),
+            (
+                "to OpenGL and back, distance",
+                "scene.cameras.cam_world_to_opengl, scene.cameras.opengl_to_cam_world",
+                "error / distance",
+                1e-12,
+                "rounding of float64",
+                _axes,
+            ),
+            ("projection, world of size", "scene.cameras.project", "pixels", 1e-9, "rounding of float64", _projected),
         )
         for scale in (1e-12, 1e-6, 1e6, 1e12)
     ),
@@ -152,7 +167,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "rasterizer",
             f"a world of size {scale:g}",
-            "rasterize_splats",
+            "raster.rasterize_splats",
             "largest difference of a pixel",
             2e-3,
             _ROUNDING,
@@ -165,7 +180,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "rasterizer",
             name,
-            "rasterize_splats",
+            "raster.rasterize_splats",
             "pixels that are not finite",
             0.0,
             "all finite",

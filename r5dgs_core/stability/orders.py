@@ -95,7 +95,7 @@ def _scan() -> float:
 def _by_steps(name: str, steps: int, order: int, tolerance: float, source: str) -> Case:
     error = functools.partial(magnus_error, TILTING, TILTING_TIME, steps, order)
     other = functools.partial(rk2_error, TILTING, TILTING_TIME, steps)
-    return Case("order", name, f"se3.integrate, order {order}", POINT_ERROR, tolerance, source, error, other)
+    return Case("order", name, f"motion.se3.integrate (order {order})", POINT_ERROR, tolerance, source, error, other)
 
 
 def _closed(name: str, method: str, measure: Callable[[], float]) -> Case:
@@ -110,7 +110,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "order",
         "Magnus-2 is of order 2",
-        "se3.integrate, order 2",
+        "motion.se3.integrate (order 2)",
         "|order - 2|",
         0.1,
         "16 to 64 steps",
@@ -119,7 +119,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "order",
         "Magnus-4 is of order 4",
-        "se3.integrate, order 4",
+        "motion.se3.integrate (order 4)",
         "|order - 4|",
         0.1,
         "16 to 64 steps",
@@ -129,7 +129,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "order",
         "TRACE's integrator is of order 2",
-        "dynamics.rk2",
+        "motion.point_dynamics.rk2",
         "|order - 2|",
         0.1,
         "64 to 256 steps",
@@ -141,8 +141,8 @@ CASES: tuple[Case, ...] = (
     Case(
         "order",
         "steps chosen by rule, 60 random twists",
-        "se3.steps_needed",
-        "real error / tolerance asked for",
+        "motion.se3.steps_needed",
+        "error / requested tolerance",
         2.0,
         "leading omitted term, with a factor of 2",
         _step_rule,
@@ -150,20 +150,24 @@ CASES: tuple[Case, ...] = (
     Case(
         "order",
         "products in log depth equal a loop, 1 to 1000 steps",
-        "se3.scan, se3.product",
+        "motion.se3.scan, motion.se3.product",
         "angle (rad) and distance",
         1e-12,
         ROUNDING,
         _scan,
     ),
-    _closed("no spin: one step is exact", "se3.integrate", lambda: magnus_error(_SLIDING, 2.0, 1)),
-    _closed("constant twist: one step is exact", "se3.integrate", lambda: magnus_error(_STEADY, 2.0, 1)),
-    _closed("spin that slows on its axis: one step is exact", "se3.integrate", lambda: magnus_error(_PARALLEL, 2.0, 1)),
-    _closed("constant spin, accelerating", "se3.accelerated_spin", _accelerated_spin),
+    _closed("no spin: one step is exact", "motion.se3.integrate", lambda: magnus_error(_SLIDING, 2.0, 1)),
+    _closed("constant twist: one step is exact", "motion.se3.integrate", lambda: magnus_error(_STEADY, 2.0, 1)),
+    _closed(
+        "spin that slows on its axis: one step is exact",
+        "motion.se3.integrate",
+        lambda: magnus_error(_PARALLEL, 2.0, 1),
+    ),
+    _closed("constant spin, accelerating", "motion.se3.accelerated_spin", _accelerated_spin),
     Case(
         "closed forms",
         "world twist to velocity and acceleration of a centre",
-        "se3.recentre",
+        "motion.se3.recentre",
         "distance from differences of the path",
         1e-5,
         "rounding of second differences",

@@ -23,9 +23,9 @@ _PAST = (0.0, 0.123, 0.4, 0.74)
 
 
 def _distances(distance: float, mode: str = "rigid") -> float:
-    """Largest relative change of a distance inside a body, of any motion, until 100 times the observed time.
+    """Largest relative change of a distance inside a body, over all motions, up to 100 times the observed time.
 
-    Frames are float32, each seen from where its body is: what a camera that looks at it needs.
+    Frames are float32, relative to the body's position, as a camera near the body needs them.
     """
     scene, worst = every_motion(distance, singles=mode != "rigid"), 0.0
     for t in (*_PAST, *_FUTURES):
@@ -39,7 +39,7 @@ def _distances(distance: float, mode: str = "rigid") -> float:
 
 
 def _absolute(distance: float) -> float:
-    """The same in absolute float32 coordinates, in units of what their grid can change a distance by."""
+    """Like `_distances`, in absolute float32 coordinates; relative to the change that float32 spacing can cause."""
     scene, worst = every_motion(distance), 0.0
     shortest = float(np.linalg.norm(body()[0] - body()[1]))
     for t in _FUTURES:
@@ -53,7 +53,7 @@ def _absolute(distance: float) -> float:
 
 
 def _rk2_distances(distance: float) -> float:
-    """TRACE's integrator on each point of the body that tilts, float32, about the world's origin."""
+    """Like `_distances`, for TRACE's integrator on each point in float32, about the world's origin."""
     model, center = MOTIONS["world twist"], distance * DIAGONAL
     twist = Twist(model.angular_velocity, model.velocity, model.angular_acceleration, model.acceleration)
     points = (body() + center).astype(np.float32)
@@ -61,7 +61,7 @@ def _rk2_distances(distance: float) -> float:
 
 
 def _places(distance: float) -> float:
-    """Largest distance of points, relative to their body, from float64 for every motion, over the radius."""
+    """Largest error of float32 positions relative to their body against float64, over all motions, in radii."""
     scene, worst = every_motion(distance), 0.0
     for t in (1.0, HORIZON):
         for g in range(1, len(scene.groups)):
@@ -75,28 +75,28 @@ def _places(distance: float) -> float:
 
 
 def _units(mode: str) -> float:
-    """Length of the quaternions of frames, until 100 times the observed time."""
+    """Largest deviation of a quaternion's length from 1, up to 100 times the observed time."""
     scene = every_motion(singles=True)
     quats = [scene_player.frame(scene, t, mode).quats.astype(np.float64) for t in (*_PAST, *_FUTURES)]
     return float(np.abs(np.linalg.norm(np.stack(quats), axis=-1) - 1).max())
 
 
 def _at_t_max(mode: str) -> float:
-    """Values of the frame at t_max that are not those of the bind state."""
+    """Number of values of the frame at t_max that differ from the bind state."""
     scene = every_motion(singles=True)
     frame = scene_player.frame(scene, scene.t_max, mode)
     return different(frame.means, scene.gaussians.means) + different(frame.quats, scene.gaussians.quats)
 
 
 def _jump(mode: str) -> float:
-    """Largest displacement of points within 1e-9 units before and after t_max, over the radius."""
+    """Largest displacement of points from t_max to 1e-9 units before and after it, in radii."""
     scene = every_motion(singles=True)
     frames = [scene_player.frame(scene, scene.t_max + step, mode) for step in (-1e-9, 0.0, 1e-9)]
     return max(largest(frame.means.astype(np.float64) - frames[1].means) for frame in frames) / RADIUS
 
 
 def _random_access(mode: str) -> float:
-    """Values of frames at shuffled times that differ from the same frames in order."""
+    """Number of values that differ between frames played in shuffled and in increasing order."""
     times = [*np.linspace(0, 3, 19).tolist(), 0.3, 3.0 if mode == "rigid_paper" else HORIZON]
     forward = [scene_player.frame(every_motion(singles=True), t, mode) for t in times]
     scene, count = every_motion(singles=True), 0.0
@@ -107,7 +107,7 @@ def _random_access(mode: str) -> float:
 
 
 def _agreement() -> float:
-    """`standard` of members that share one twist against `rigid` with that twist, over the radius."""
+    """Largest difference between modes "standard" and "rigid" if all members share one twist, in radii."""
     scene, worst = every_motion(singles=True), 0.0
     rows = np.flatnonzero(scene.gaussians.motion_ids == list(MOTIONS).index("world twist") + 1)
     for t in (1.0, 2.0, 5.0):
@@ -119,7 +119,7 @@ def _agreement() -> float:
 
 
 def _ten_turns() -> float:
-    """Ten turns observed, ten more extrapolated: largest jump of the quaternion over what the time step turns."""
+    """Largest quaternion step over ten observed and ten extrapolated turns, relative to the expected step."""
     model = model_of("ballistic_spin", angular_velocity=[0, 0, 20 * math.pi / T_MAX])
     scene = scene_of([body()], [model], times=np.linspace(0, T_MAX, 181))
     times = np.linspace(0, 2 * T_MAX, 361)
@@ -138,7 +138,7 @@ def _wild(scene: Scene, group: int, name: str, value: float) -> Scene:
 
 
 def _isolated(value: float) -> float:
-    """Values of other groups that change when rates and track of one are not numbers, for every motion in turn."""
+    """Number of values of other groups that change if rates and track of one group are not finite."""
     scene, count = every_motion(), 0.0
     sound = {t: scene_player.frame(scene, t) for t in (0.4, 2.0)}
     for g in range(1, len(scene.groups)):
@@ -189,7 +189,7 @@ def _refused_rates() -> float:
 
 
 def _huge(rate: float, mode: str) -> float:
-    """Number of non-finite values in frames of bodies with rates near the end of float32's range, after one unit."""
+    """Number of non-finite values in frames of bodies with rates near the limit of float32, after one unit."""
     fast = [
         model_of(kind, velocity=[rate, 0, 0], angular_velocity=[0, rate, 0], acceleration=[0, 0, rate])
         for kind in models.KINDS
@@ -217,7 +217,7 @@ def _lacking(clouds: list[np.ndarray]) -> float:
 
 
 def _before_first(mode: str) -> float:
-    """Values of frames long before the first knot that differ from the first pose."""
+    """Number of values that differ between frames at the first knot and long before it."""
     scene = every_motion(singles=True)
     first, long_ago = (scene_player.frame(scene, t, mode) for t in (0.0, -1e6))
     return different(first.means, long_ago.means) + different(first.quats, long_ago.quats)
@@ -231,7 +231,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "distances in a body",
             f"{label} from the origin, to 100 times the observed time",
-            "playback.frame",
+            "playback.scene_player.frame",
             _DISTANCE,
             1e-6,
             _FLOAT32,
@@ -244,7 +244,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "distances in a body",
             f"{label} from the origin, absolute float32",
-            "playback.frame",
+            "playback.scene_player.frame",
             "largest change / grid of float32 there",
             1.0,
             _FLOAT32,
@@ -256,7 +256,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "distances in a body",
             f"places {label} from the origin, seen from the body",
-            "playback.frame",
+            "playback.scene_player.frame",
             "distance / radius",
             5e-7,
             _FLOAT32,
@@ -268,7 +268,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "distances in a body",
             f"unit quaternions in float32, {mode}",
-            "playback.frame",
+            "playback.scene_player.frame",
             "| |q| - 1 |",
             3e-7,
             _FLOAT32,
@@ -281,7 +281,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "t_max",
             f"the bind state to the bit, {mode}",
-            "playback.frame",
+            "playback.scene_player.frame",
             "values that differ",
             0.0,
             "to the bit",
@@ -293,7 +293,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "t_max",
             f"no jump, {mode}",
-            "playback.frame",
+            "playback.scene_player.frame",
             "distance / radius in 1e-9 units",
             1e-6,
             "rounding of float32 and speed",
@@ -303,8 +303,8 @@ CASES: tuple[Case, ...] = (
     ),
     Case(
         "t_max",
-        "ten turns before it, ten after it",
-        "playback.group_poses",
+        "ten turns before and after it",
+        "playback.scene_player.group_poses",
         "largest step of q / that of the turn",
         1 + 1e-3,
         "the track between its knots",
@@ -314,7 +314,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "random access",
             f"shuffled times give the frames in order, {mode}",
-            "playback.frame",
+            "playback.scene_player.frame",
             "values that differ",
             0.0,
             "to the bit",
@@ -325,7 +325,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "random access",
         "long before the first pose",
-        "playback.frame",
+        "playback.scene_player.frame",
         "values that differ",
         0.0,
         "to the bit",
@@ -334,7 +334,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "random access",
         "members with one twist move as their group",
-        "playback.frame, standard",
+        "playback.scene_player.frame",
         "distance / radius",
         2e-4,
         "residuals.TOLERANCE of the scene's extent",
@@ -347,7 +347,7 @@ CASES: tuple[Case, ...] = (
             Case(
                 "bad rates",
                 f"{label} in one group changes no other, rigid",
-                "playback.frame",
+                "playback.scene_player.frame",
                 "values of others that differ",
                 0.0,
                 "to the bit",
@@ -356,7 +356,7 @@ CASES: tuple[Case, ...] = (
             Case(
                 "bad rates",
                 f"{label} in one group: it stands still, standard",
-                "playback.frame",
+                "playback.scene_player.frame",
                 "values that differ from that",
                 0.0,
                 "to the bit",
@@ -365,7 +365,7 @@ CASES: tuple[Case, ...] = (
             Case(
                 "bad rates",
                 f"{label} in one group: others move as before, standard",
-                "playback.frame",
+                "playback.scene_player.frame",
                 "distance / extent",
                 2e-5,
                 "twice residuals.TOLERANCE",
@@ -375,19 +375,19 @@ CASES: tuple[Case, ...] = (
     ),
     Case(
         "bad rates",
-        "a motion model refuses NaN and infinity",
-        "models.MotionModel",
+        "a motion model with NaN or infinity raises an error",
+        "motion.models.MotionModel",
         "accepted",
         0.0,
-        "errors are told",
+        "an error is raised",
         _refused_rates,
     ),
     *(
         Case(
             "bad rates",
             f"rates of {rate:g}, {mode}",
-            "playback.frame",
-            "numbers that are not finite",
+            "playback.scene_player.frame",
+            "values that are not finite",
             0.0,
             "all finite",
             functools.partial(_huge, rate, mode),
@@ -397,12 +397,12 @@ CASES: tuple[Case, ...] = (
     ),
     *(
         Case(
-            "scenes that lack things",
+            "incomplete scenes",
             name,
-            "playback.frame, all modes",
-            "numbers not finite, shapes wrong",
+            "playback.scene_player.frame",
+            "values not finite, shapes wrong",
             0.0,
-            "plays",
+            "finite values, correct shapes",
             functools.partial(_lacking, clouds),
         )
         for name, clouds in (
@@ -410,8 +410,8 @@ CASES: tuple[Case, ...] = (
             ("a group without members", [body(), np.zeros((0, 3)), body() + 1]),
             ("one Gaussian in a group", [body()[:1], body()]),
             ("two Gaussians in a group", [body()[:2], body()]),
-            ("a group of no size", [np.full((5, 3), 0.3), body()]),
-            ("a group in one line", [np.outer(np.linspace(-1, 1, 9), [1.0, 0, 0]), body()]),
+            ("a group of coincident points", [np.full((5, 3), 0.3), body()]),
+            ("a group of collinear points", [np.outer(np.linspace(-1, 1, 9), [1.0, 0, 0]), body()]),
         )
     ),
 )

@@ -16,7 +16,7 @@ _RATIOS = (rotations.sine_ratio, rotations.versine_ratio, rotations.remainder_ra
 
 
 def _ratio(index: int, dtype: type) -> float:
-    """Largest relative error of a coefficient of the exponential, at the squared angles that the dtype holds."""
+    """Largest relative error of a coefficient of the exponential, at squared angles rounded to the dtype."""
     squares = (np.array(_SMALL) ** 2).astype(dtype)
     values = _RATIOS[index](squares)
     exact = [ratios(float(x))[index] for x in squares]
@@ -24,7 +24,7 @@ def _ratio(index: int, dtype: type) -> float:
 
 
 def _gradients() -> float:
-    """Gradients of the exponential at and near no rotation that are not those of its series."""
+    """Largest error of the gradients of the exponential at and near the identity."""
     import torch
 
     worst = 0.0
@@ -39,7 +39,7 @@ def _gradients() -> float:
 
 
 def _half_turns(offset: float, dtype: type) -> float:
-    """Angle between turns of nearly pi and the quaternions read back from their matrices, over 200 axes."""
+    """Largest error of quaternions recovered from matrices of rotations by almost pi, over 200 axes, rad."""
     axes = np.random.default_rng(1).normal(size=(200, 3))
     axes = np.concatenate([np.eye(3), -np.eye(3), axes / np.linalg.norm(axes, axis=-1, keepdims=True)])
     half = 0.5 * (math.pi - offset)
@@ -49,7 +49,7 @@ def _half_turns(offset: float, dtype: type) -> float:
 
 
 def _angles(dtype: type) -> float:
-    """Error of the angle between two orientations that differ by almost nothing or by almost a half turn."""
+    """Largest error of the angle between two orientations, from 0 to pi, rad."""
     axis, worst = np.array([0.36, 0.48, -0.8]), 0.0
     start = rotations.rotvecs_to_quats(np.array([0.3, -0.2, 0.5]))
     for x in (0.0, 1e-6, 1e-4, 1e-2, 1.0, math.pi - 1e-2, math.pi - 1e-4, math.pi - 1e-6, math.pi):
@@ -59,7 +59,7 @@ def _angles(dtype: type) -> float:
 
 
 def _logarithm() -> float:
-    """Exponential of the logarithm: angle to the quaternion that went in, from no turn to nearly a half turn."""
+    """Largest error of a logarithm followed by an exponential, from no rotation to slightly over pi, rad."""
     axis, worst = np.array([0.36, 0.48, -0.8]), 0.0
     for x in (0.0, 1e-300, 1e-12, 1e-8, 1e-4, 0.1, 1.0, math.pi - 1e-4, math.pi - 1e-12, math.pi, math.pi + 1e-4):
         quat = rotations.rotvecs_to_quats(x * axis)
@@ -69,7 +69,7 @@ def _logarithm() -> float:
 
 
 def _ten_turns() -> float:
-    """Steps of 20 degrees over ten turns, signs as matrices give them: largest step over the one that 20 degrees is."""
+    """Relative error of quaternion steps over ten turns of 20-degree steps, with the signs that matrices give."""
     step = math.radians(20)
     turns = step * np.arange(181)[:, None] * np.array([0.36, 0.48, -0.8])
     quats = rotations.rotmats_to_quats(rotations.quats_to_rotmats(rotations.rotvecs_to_quats(turns)))
@@ -78,7 +78,7 @@ def _ten_turns() -> float:
 
 
 def _unit() -> float:
-    """Unit length of normalised quaternions of any size that squares, and the identity for none."""
+    """Deviation of normalised quaternions from unit length, plus that of a zero quaternion from the identity."""
     rng = np.random.default_rng(2)
     quats = rng.normal(size=(7, 1, 4)) * np.array([1e-150, 1e-30, 1e-6, 1, 1e6, 1e30, 1e150])[:, None, None]
     norms = np.linalg.norm(rotations.normalize(quats), axis=-1)
@@ -87,14 +87,14 @@ def _unit() -> float:
 
 
 def _rotating_keeps_lengths() -> float:
-    """Distances between points turned in float32, relative."""
+    """Largest relative change of the length of points rotated in float32."""
     quats = rotations.rotvecs_to_quats(np.random.default_rng(4).normal(size=(50, 1, 3))).astype(np.float32)
     turned = rotations.rotate(quats, body(1.0).astype(np.float32))
     return float(np.abs(np.linalg.norm(turned, axis=-1) - 1).max())
 
 
 def _inverse() -> float:
-    """A turn and its inverse: distance of points from where they were."""
+    """Largest distance of points from their start after a rotation and its inverse."""
     quats = rotations.rotvecs_to_quats(10 * np.random.default_rng(5).normal(size=(50, 1, 3)))
     back = rotations.rotate(rotations.conjugate(quats), rotations.rotate(quats, body(1.0)))
     return max(largest(points - body(1.0)) for points in back)
@@ -114,7 +114,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "small angles",
             f"{_NAMES[i]} from 0, 1e-300 to 2 rad, {np.dtype(dtype).name}",
-            f"rotations.{_FUNCTIONS[i]}",
+            f"motion.rotations.{_FUNCTIONS[i]}",
             "relative error",
             limits[i],
             "decimal arithmetic",
@@ -126,7 +126,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "small angles",
         "gradients of the exponential at 0, 1e-300 to 1e-4 rad",
-        "rotations.rotvecs_to_quats (torch)",
+        "motion.rotations.rotvecs_to_quats (torch)",
         "distance from the series",
         1e-9,
         "second order at 1e-4 rad",
@@ -135,7 +135,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "small angles",
         "angle between orientations, float64",
-        "rotations.angle_between",
+        "motion.rotations.angle_between",
         "error (rad)",
         1e-15,
         ROUNDING,
@@ -144,7 +144,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "small angles",
         "angle between orientations, float32",
-        "rotations.angle_between",
+        "motion.rotations.angle_between",
         "error (rad)",
         3e-7,
         _rounding(np.float32),
@@ -154,7 +154,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "half turns",
             f"matrix to quaternion at pi{label}, {np.dtype(dtype).name}",
-            "rotations.rotmats_to_quats",
+            "motion.rotations.rotmats_to_quats",
             "angle (rad)",
             tolerance,
             _rounding(dtype),
@@ -166,7 +166,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "half turns",
         "logarithm and exponential, 0 to pi + 1e-4 rad, both signs",
-        "rotations.quats_to_rotvecs",
+        "motion.rotations.quats_to_rotvecs",
         "angle (rad)",
         1e-15,
         ROUNDING,
@@ -175,7 +175,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "signs",
         "ten turns in steps of 20 degrees",
-        "rotations.make_continuous",
+        "motion.rotations.make_continuous",
         "largest step / (2 sin 5 deg) - 1",
         1e-12,
         ROUNDING,
@@ -184,17 +184,25 @@ CASES: tuple[Case, ...] = (
     Case(
         "signs",
         "quaternions of length 0, 1e-150 to 1e150",
-        "rotations.normalize",
+        "motion.rotations.normalize",
         "| |q| - 1 |",
         1e-15,
         ROUNDING,
         _unit,
     ),
-    Case("signs", "a turn and back", "rotations.rotate, conjugate", "distance / radius", 1e-14, ROUNDING, _inverse),
+    Case(
+        "signs",
+        "a turn and back",
+        "motion.rotations.rotate, motion.rotations.conjugate",
+        "distance / radius",
+        1e-14,
+        ROUNDING,
+        _inverse,
+    ),
     Case(
         "signs",
         "lengths of turned points, float32",
-        "rotations.rotate",
+        "motion.rotations.rotate",
         "relative error",
         5e-7,
         _rounding(np.float32),

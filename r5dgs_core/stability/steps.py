@@ -1,4 +1,4 @@
-"""Stability cases on many steps: growth, drift, the time grid, both directions of time."""
+"""Stability cases on many steps: growth, drift, the time grid, forward and backward time."""
 
 from __future__ import annotations
 
@@ -78,14 +78,14 @@ def _million_pose() -> float:
 
 
 def _rk2_million() -> float:
-    """Growth of an arm. With constant w each step is one linear map, whose power is taken instead of its steps."""
+    """Relative growth of an arm, from a matrix power: at constant w, all steps are the same linear map."""
     still = Twist(_LONG_SPIN, np.zeros(3), np.zeros(3), np.zeros(3))
     step = rk2_points(still, _STEP, np.eye(3), 1).T
     return float(np.linalg.norm(np.linalg.matrix_power(step, _LONG), 2)) - 1
 
 
 def _single_precision_rates() -> float:
-    """Rates given in float32, 10,000 steps: the integration must not fall to their precision."""
+    """Error of 10,000 steps in radii, for float32 rates; the integration itself must keep float64 precision."""
     w, v, eps, a = (np.asarray(x, np.float32) for x in (TILTING.w, TILTING.v, TILTING.eps, TILTING.a))
     same = Twist.of(w, v, eps, a)
     pose = se3.integrate(w, v, eps, a, np.float32(TILTING_TIME), 10_000)
@@ -93,31 +93,31 @@ def _single_precision_rates() -> float:
 
 
 def _orthogonality() -> float:
-    """Of rotations cast once to float32 after 10,000 steps."""
+    """Deviation from orthogonality of a rotation matrix cast to float32 after 10,000 steps."""
     quat, _ = se3.integrate(_LONG_SPIN, np.zeros(3), np.zeros(3), np.zeros(3), np.float64(1e4 / 60), 10_000)
     rotmat = rotations.quats_to_rotmats(quat).astype(np.float32).astype(np.float64)
     return float(np.abs(rotmat.T @ rotmat - np.eye(3)).max())
 
 
 def _grid(duration: float) -> float:
-    """Steps too many or too few, and where they end, for a duration of whole steps."""
+    """Error of the number of steps plus the relative error of their sum, for a whole number of steps."""
     steps = point_dynamics.step_sizes(duration, _STEP)
     return abs(len(steps) - round(duration / _STEP)) + abs(math.fsum(steps) - duration) / duration
 
 
-_unheard = itertools.count()
+_unused_steps = itertools.count()
 
 
 def _unguarded() -> float:
-    """Return 1 if TRACE's integrator takes steps of a radian without a warning; it warns once per step length."""
-    step = 0.1 + 1e-6 * next(_unheard)
+    """Return 1 if TRACE's integrator takes steps of 1 rad without a warning, else 0; it warns once per step length."""
+    step = 0.1 + 1e-6 * next(_unused_steps)
     with logged() as messages:
         point_dynamics.rk2(np.ones(3), np.zeros(3), np.array([0, 0, 1 / step]), np.zeros(3), np.zeros(3), step, step)
     return float(not messages)
 
 
 def _back(steps: int) -> float:
-    """Forward, then as long backward from where that ends: how far from the start."""
+    """Largest distance of a point from its start after integration forward and back, in radii."""
     t = np.float64(TILTING_TIME)
     there = se3.integrate(TILTING.w, TILTING.v, TILTING.eps, TILTING.a, t, steps)
     w, v = TILTING.w + t * TILTING.eps, TILTING.v + t * TILTING.a
@@ -133,7 +133,7 @@ def _rk2_back(steps: int) -> float:
 
 
 def _before() -> float:
-    """`curve` of every kind at times before t_max, against the twist that it is."""
+    """Largest error of `curve` before t_max, in radii, for two kinds that equal a twist."""
     spin = model_of("constant_twist", velocity=TILTING.v, angular_velocity=TILTING.w)
     gaps = []
     for model, twist in ((spin, Twist.of(TILTING.w, TILTING.v)), (world_twist(TILTING), TILTING)):
@@ -143,7 +143,7 @@ def _before() -> float:
 
 
 def _group_property() -> float:
-    """The pose after T1 + T2 against that after T1, then T2 with the rates of then; the steps chosen by the rule."""
+    """Difference between a motion over T1 + T2 and the composition of those over T1 and T2, in radii."""
     whole = models.evaluate(world_twist(TILTING), 2.0)
     w, v = TILTING.w + 1.3 * TILTING.eps, TILTING.v + 1.3 * TILTING.a
     second = models.evaluate(world_twist(Twist(w, v, TILTING.eps, TILTING.a)), 0.7)
@@ -152,7 +152,7 @@ def _group_property() -> float:
 
 
 def _no_time() -> float:
-    """Values that differ from the identity after no time at all, over integrators, kinds and single points."""
+    """Number of values that differ from the identity after duration 0, in all integrators and motion kinds."""
     zero = np.float64(0.0)
     poses = [se3.integrate(TILTING.w, TILTING.v, TILTING.eps, TILTING.a, zero, n) for n in (1, 3, 64)]
     poses.append(se3.accelerated_spin(TILTING.w, TILTING.v, TILTING.a, zero))
@@ -173,7 +173,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "growth",
             f"one step of {label} rad",
-            "se3.integrate",
+            "motion.se3.integrate",
             _GROWTH,
             2e-15,
             ROUNDING,
@@ -186,7 +186,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "growth",
             f"{w} rad per unit, 60 steps",
-            "se3.integrate",
+            "motion.se3.integrate",
             _GROWTH,
             1e-13,
             ROUNDING,
@@ -198,7 +198,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "growth",
         "TRACE's integrator grows by sqrt(1 + x^4 / 4) a step",
-        "dynamics.rk2",
+        "motion.point_dynamics.rk2",
         "distance from the formula",
         1e-9,
         "the formula",
@@ -206,17 +206,17 @@ CASES: tuple[Case, ...] = (
     ),
     Case(
         "growth",
-        "TRACE's integrator tells of steps over 0.1 rad",
-        "dynamics.rk2",
+        "TRACE's integrator warns about steps over 0.1 rad",
+        "motion.point_dynamics.rk2",
         "steps without a warning",
         0.0,
-        "its growth is visible there",
+        "its growth is visible from there on",
         _unguarded,
     ),
     Case(
         "drift",
-        "a million steps: quaternion stays unit, never normalised",
-        "se3.product",
+        "a million steps: unit quaternion without normalisation",
+        "motion.se3.product",
         "| |q| - 1 |",
         1e-10,
         "a million roundings of 1e-16",
@@ -226,19 +226,25 @@ CASES: tuple[Case, ...] = (
     Case(
         "drift",
         "a million steps: the pose",
-        "se3.product",
+        "motion.se3.product",
         "angle (rad) and distance",
         1e-8,
         "float64: 1e6 steps of 1e-16, over a path of 6e3",
         _million_pose,
     ),
     Case(
-        "drift", "float32 rates, 10,000 steps", "se3.integrate", POINT_ERROR, 1e-12, ROUNDING, _single_precision_rates
+        "drift",
+        "float32 rates, 10,000 steps",
+        "motion.se3.integrate",
+        POINT_ERROR,
+        1e-12,
+        ROUNDING,
+        _single_precision_rates,
     ),
     Case(
         "drift",
         "rotation cast once to float32 after 10,000 steps",
-        "se3.integrate",
+        "motion.se3.integrate",
         "|R'R - I|",
         3e-7,
         "rounding of float32",
@@ -248,7 +254,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "time grid",
             f"{units} {'unit' if units == 1 else 'units'} of 60 steps",
-            "dynamics.step_sizes",
+            "motion.point_dynamics.step_sizes",
             _STEPS,
             1e-12,
             "whole numbers of steps",
@@ -260,7 +266,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "direction of time",
             f"forward, then backward, {n} {'step' if n == 1 else 'steps'}",
-            "se3.integrate",
+            "motion.se3.integrate",
             POINT_ERROR,
             1e-13,
             ROUNDING,
@@ -272,25 +278,25 @@ CASES: tuple[Case, ...] = (
     Case(
         "direction of time",
         "before t_max",
-        "models.curve",
+        "motion.models.curve",
         POINT_ERROR,
         2e-9,
-        "twice what models.evaluate asks of its steps",
+        "twice the step tolerance of models.evaluate",
         _before,
     ),
     Case(
         "direction of time",
-        "T1, then T2, is T1 + T2",
-        "models.evaluate, se3.compose",
+        "T1 followed by T2 equals T1 + T2",
+        "motion.models.evaluate, motion.se3.compose",
         POINT_ERROR,
         2e-9,
-        "twice what models.evaluate asks of its steps",
+        "twice the step tolerance of models.evaluate",
         _group_property,
     ),
     Case(
         "direction of time",
-        "no time: the identity to the bit",
-        "se3, models, dynamics",
+        "duration 0 gives the identity, to the bit",
+        "motion.se3.integrate, motion.models.evaluate, motion.point_dynamics.propagate",
         "values that differ",
         0.0,
         "to the bit",

@@ -111,7 +111,7 @@ CASES: tuple[Case, ...] = tuple(
     Case(
         "training",
         name,
-        "train.run",
+        "train.run.train",
         "numbers that are not finite",
         0.0,
         "all finite",
