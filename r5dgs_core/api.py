@@ -52,7 +52,7 @@ def poses(scene: Scene, t: float, mode: str = "rigid") -> dict[str, np.ndarray]:
 
 
 def picture(scene: Scene, t: float, camera: Camera | int = 0, mode: str = "rigid") -> np.ndarray:
-    """Render a scene at a time. Requires torch.
+    """Render a scene at a time.
 
     Args:
         scene: The scene.
@@ -67,7 +67,7 @@ def picture(scene: Scene, t: float, camera: Camera | int = 0, mode: str = "rigid
 
     view = scene.cameras[camera] if isinstance(camera, int) else camera
     frame = Player(scene, mode).frame(t, view.center)
-    return np.clip(scene_renderer.to_numpy(scene_renderer.render_frame(scene, frame, view).color, np.float32), 0, 1)
+    return np.clip(scene_renderer.render_frame(scene, frame, view).color, 0, 1)
 
 
 def train_scene(

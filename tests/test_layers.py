@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import functools
 import graphlib
 import importlib.util
@@ -13,7 +14,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from r5dgs_core import api
+from r5dgs_core.scene import scene_file
+from tests.support import scenes
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -37,7 +43,7 @@ ALLOWED = {
     "scene": {"motion"},
     "color": {"scene"},
     "data": {"motion", "scene", "color"},
-    "raster": {"scene"},
+    "raster": {"motion", "scene"},
     "search": {"scene"},
     "config": {"data"},
     "playback": {"motion", "scene", "color"},
@@ -113,8 +119,9 @@ LATE_IMPORTS = {
     # A layout is detected before numpy is imported.
     "data.layouts.camera_files": {"data.transforms"},
     "data.layouts.colmap": {"data.colmap_dataset"},
-    # numba is optional.
+    # numba is optional, and torch is for gradients and odd dtypes.
     "raster.cpu.backend": {
+        "raster.torch_backend",
         *("raster.compilation", "raster.cpu.autograd", "raster.cpu.forward"),
         *("raster.cpu.sky", "raster.cpu.static_layer"),
     },
@@ -158,6 +165,8 @@ HEAVY = {
     *("torch", "numba", "scipy", "OpenImageIO", "trimesh", "matplotlib", "rich", "gsplat", "transformers"),
     *("safetensors", "open_clip"),
 }
+# Modules of `raster/` and `render/` that compute in torch. All others draw without it.
+TORCH_MODULES = {"raster.cpu.autograd", "raster.cuda", "raster.reference", "raster.torch_backend"}
 TORCH_TIER = {"torch", "numba", "gsplat", "transformers", "torchvision", "safetensors", "open_clip"}
 
 
@@ -430,7 +439,7 @@ class Blocker:
     def __init__(self, names): self.names = set(names)
     def find_spec(self, fullname, path=None, target=None):
         if fullname.split(".")[0] in self.names:
-            raise ImportError(f"{fullname} is blocked")
+            raise ModuleNotFoundError(f"{fullname} is blocked", name=fullname)
 
 root, blocked = sys.argv[1], json.loads(sys.argv[2])
 sys.meta_path.insert(0, Blocker(blocked))
@@ -447,6 +456,36 @@ for name in ("motion", "scene", "color", "formats", "playback", "editing", "sear
         seen.append(info.name)
 assert not set(sys.modules) & set(blocked)
 print(len(seen))
+"""
+
+IMPORT_RENDERER = """
+sys.path.insert(0, root)
+import r5dgs_core
+for name in ("raster", "render"):
+    package = importlib.import_module(f"r5dgs_core.{name}")
+    for info in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        try:
+            importlib.import_module(info.name)
+        except ModuleNotFoundError as error:
+            assert error.name == "torch", error
+            print(info.name.removeprefix("r5dgs_core."))
+"""
+
+DRAW = """
+sys.path.insert(0, root)
+import numpy, r5dgs_core
+from r5dgs_core import errors
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer, warm_up
+scene = r5dgs_core.load("scene.r5dgs")
+numpy.save("picture.npy", r5dgs_core.picture(scene, 0.9))
+warm_up.warm_up(gradients=False)
+for backend in ("reference", "cuda"):
+    try:
+        scene_renderer.render_frame(scene, scene_player.frame(scene, 0.9), scene.cameras[0], backend=backend)
+    except errors.BackendError as error:
+        print(error)
+assert not set(sys.modules) & set(blocked)
 """
 
 REGISTER_EXTENSION = """
@@ -478,6 +517,23 @@ def run_blocked(code: str, blocked: set[str], tmp_path: Path) -> str:
 
 def test_the_light_tier_imports_with_numpy_alone(tmp_path):
     assert int(run_blocked(IMPORT_LIGHT_TIER, HEAVY | BLENDER, tmp_path).split()[-1]) >= 8
+
+
+def test_only_gradients_and_the_torch_backends_import_torch(tmp_path):
+    assert set(run_blocked(IMPORT_RENDERER, {"torch"}, tmp_path).split()) == TORCH_MODULES
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_a_scene_is_drawn_without_torch_to_the_same_bits(tmp_path, degree):
+    scene = scenes.make_scene(200, sh_degree=degree)
+    scene = dataclasses.replace(scene, cameras=(scenes.orbit_camera(0.3, 40, 30),))
+    scene_file.write(scene, tmp_path / "scene.r5dgs")
+    complaints = run_blocked(DRAW, {"torch"}, tmp_path).splitlines()
+    assert complaints == [
+        f"rasterizer '{name}': torch is not installed; remedy: pip install torch" for name in ("reference", "cuda")
+    ]
+    expected = api.picture(scene_file.read(tmp_path / "scene.r5dgs"), 0.9)
+    assert np.array_equal(np.load(tmp_path / "picture.npy"), expected)
 
 
 def test_the_block_is_a_block(tmp_path):

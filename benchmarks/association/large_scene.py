@@ -43,7 +43,7 @@ def make_views(scene: Scene, images: int, pixels: int, folder: Path) -> tuple[li
         for i, t in enumerate(np.linspace(0, scene.t_max, images // CAMERAS)):
             ids = scene_renderer.render_frame(scene, scene_player.frame(scene, float(t)), camera, background=None).ids
             assert ids is not None
-            truth.append(Image(k, i, np.maximum(ids.numpy(), 0).astype(np.int32).reshape(-1), nothing, nothing))
+            truth.append(Image(k, i, np.maximum(ids, 0).astype(np.int32).reshape(-1), nothing, nothing))
             path = folder / f"camera{k}_{i:03d}.png"
             views.append(datasets.View(path.stem, camera, float(t), "train", path, path, mask_video=f"camera{k}"))
     for view, ids in zip(views, degraded_masks.spoil(truth, degraded_masks.CASES["D"], pixels, 7), strict=True):

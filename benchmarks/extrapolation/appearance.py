@@ -32,7 +32,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from scipy import ndimage
 
 from r5dgs_core.bake import bake
@@ -42,8 +41,7 @@ from r5dgs_core.error_vs_time import image_task
 from r5dgs_core.evaluation import evaluate, metrics
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_player
-from r5dgs_core.raster import rasterize
-from r5dgs_core.render import scene_renderer
+from r5dgs_core.render import scene_renderer, segment_weights
 from r5dgs_core.render.warm_up import warm_up
 from r5dgs_core.scene import cameras
 from r5dgs_core.scene.cameras import Camera
@@ -97,7 +95,7 @@ def pictures(scene: Scene, views: Sequence[datasets.View], move: Move) -> list[P
 
 def draw(scene: Scene, frame: scene_player.Frame, camera: Camera) -> np.ndarray:
     """Colour of a frame, rounded to 8 bits. [H, W, 3] float32"""
-    color = scene_renderer.to_numpy(scene_renderer.render_frame(scene, frame, camera).color, np.float32)
+    color = scene_renderer.render_frame(scene, frame, camera).color
     return images.to_uint8(color).astype(np.float32) / np.float32(255)
 
 
@@ -148,8 +146,7 @@ class Sight:
         for directions in self.directions:
             np.maximum(nearest, (directions * now).sum(1), out=nearest)
         known = np.stack([nearest > NEAR, np.ones(len(nearest), bool)], axis=1)
-        output = scene_renderer.render_frame(self.scene, frame, camera, features=known.astype(np.float32))
-        blended = scene_renderer.to_numpy(output.features, np.float32)
+        blended = scene_renderer.render_frame(self.scene, frame, camera, features=known).features
         return blended[..., 0] / np.maximum(blended[..., 1], 1e-6)
 
 
@@ -164,15 +161,14 @@ def visibility(scene: Scene, frame: scene_player.Frame, camera: Camera) -> np.nd
     """Visible share of each Gaussian in a view, relative to drawing it alone and whole. [N]"""
     posed = scene_renderer.pose_frame(scene, frame)
     gaussians = scene_renderer.PosedGaussians(posed)
-    ones = torch.ones(len(posed.means), 1, requires_grad=True)
-    output = rasterize(gaussians, camera, ones, colors=torch.zeros(len(posed.means), 3))
-    assert output.features is not None
-    (weights,) = torch.autograd.grad(output.features.sum(), ones)
+    shapes = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+    everywhere = np.zeros((camera.height, camera.width), np.int64)
+    weights = segment_weights.segment_weights(*shapes, camera, everywhere, 1).toarray()[0]
     _, depth = cameras.project(camera, posed.means.astype(np.float64))
     pixels = camera.intrinsics[0, 0] / np.maximum(depth, 1e-6)
     axes = np.sort(np.exp(posed.log_scales), axis=1)[:, 1:] * pixels[:, None]
-    whole = 2 * np.pi * np.sqrt(axes**2 + 0.3).prod(1) * gaussians.opacities.numpy()  # 0.3 px^2: the blur of 3DGS
-    return np.where(depth > 0, weights.numpy()[:, 0] / np.maximum(whole, 1e-6), 0.0)
+    whole = 2 * np.pi * np.sqrt(axes**2 + 0.3).prod(1) * gaussians.opacities  # 0.3 px^2: the blur of 3DGS
+    return np.where(depth > 0, weights / np.maximum(whole, 1e-6), 0.0)
 
 
 def resting(scene: Scene) -> np.ndarray:

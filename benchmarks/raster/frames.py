@@ -138,7 +138,7 @@ def compare(staged: RenderOutput, scene: Scene, instances: list[Instance], camer
     """Raise AssertionError where the picture of a stage is not that of all Gaussians drawn anew."""
     anew = scene_renderer.render_frame(scene, scene_renderer.pose_instances(scene, instances), camera)
     for name in ("color", "alpha"):
-        difference = (getattr(staged, name) - getattr(anew, name)).abs().max().item()
+        difference = np.abs(getattr(staged, name) - getattr(anew, name)).max()
         if not difference <= TOLERANCE:
             raise AssertionError(f"{name}: expected the stage's within {TOLERANCE:g}, found {difference:g} beside it")
 

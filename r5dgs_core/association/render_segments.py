@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import torch
 
 from ..data import dataset as datasets
 from ..data import masks as id_masks
@@ -53,7 +52,7 @@ def draw(
             gaussians.scales,
             gaussians.opacities,
             view.camera,
-            torch.from_numpy(segments.reshape(mask.shape)),
+            segments.reshape(mask.shape),
             len(ids),
             settings=RasterSettings(near_plane=scene.near_plane),
             backend=backend,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import torch
 
 from ..data import dataset as datasets
 from ..playback import scene_player
@@ -43,15 +42,15 @@ def mend(
             yield mending.relabel(mask, images[image].ids, found.ids[image])
             continue
         posed = scene_renderer.PosedGaussians(scene_renderer.pose_frame(scene, scene_player.frame(scene, view.t)))
-        shown = torch.from_numpy(seen)  # Gaussians that the image does not show occlude nothing
+        # Gaussians that the image does not show occlude nothing.
         drawn = rasterize_splats(
-            posed.means[shown],
-            posed.quats[shown],
-            posed.scales[shown],
-            posed.opacities[shown],
-            torch.from_numpy(part),
+            posed.means[seen],
+            posed.quats[seen],
+            posed.scales[seen],
+            posed.opacities[seen],
+            part,
             view.camera,
             settings=RasterSettings(near_plane=scene.near_plane),
             backend=backend,
         ).image
-        yield mending.mend(mask, images[image].ids, drawn.numpy(), found, image)
+        yield mending.mend(mask, images[image].ids, drawn, found, image)

@@ -149,8 +149,8 @@ class ImageEvidence:
         if octants is not None:
             frame = dataclasses.replace(frame, object_ids=octants)
         output = scene_renderer.render_frame(self._scene, frame, view.camera)
-        ids = scene_renderer.to_numpy(output.ids, np.int32)
-        color = scene_renderer.to_numpy(output.color, np.float32)
+        ids = output.ids
+        color = output.color
         return np.clip(color, 0, 1), np.where(ids < 0, PATCHES, ids)
 
     def _psnr(self, scene: Scene) -> float:
@@ -204,7 +204,7 @@ def painter(scene: Scene) -> Callable[[datasets.View], np.ndarray]:
 
     def draw(view: datasets.View) -> np.ndarray:
         output = scene_renderer.render_frame(scene, player.frame(view.t), view.camera)
-        return scene_renderer.to_numpy(output.color, np.float32)
+        return output.color
 
     return draw
 

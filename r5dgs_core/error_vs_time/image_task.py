@@ -161,9 +161,7 @@ def _times(
         frames = [move(view.t) for view in some]
         calls[mode, "motion"] = lambda move=move: [move(view.t) for view in some]
         calls[mode, "raster"] = lambda frames=frames: [
-            scene_renderer.to_numpy(
-                scene_renderer.render_frame(scene, frame, view.camera, backend=backend).color, np.float32
-            )
+            scene_renderer.render_frame(scene, frame, view.camera, backend=backend)
             for frame, view in zip(frames, some, strict=True)
         ]
     times = {key: found.scaled(1 / len(some)) for key, found in timing.take(calls, rounds).items()}

@@ -63,7 +63,7 @@ def measure(
     else:
         truths = []
         absent.append("raster: PSNR against true images needs a data set")
-    used = backends.choose(backend, scene_renderer.tensor(scene.gaussians.means)).name
+    used = backends.choose(backend, scene.gaussians.means).name
     base = RasterSettings(near_plane=scene.near_plane)
 
     def draw(changes: dict[str, float]) -> list[np.ndarray]:
@@ -72,7 +72,7 @@ def measure(
             scene_renderer.render_frame(scene, frame, camera, backend=backend, settings=settings)
             for frame, (camera, _) in zip(frames, shots, strict=True)
         ]
-        return [np.clip(scene_renderer.to_numpy(output.color, np.float32), 0, 1) for output in outputs]
+        return [np.clip(output.color, 0, 1) for output in outputs]
 
     labels = {"finest": FINEST, **{_name(changes): changes for changes in SETTINGS}}
     calls: dict[str, Callable[[], object]] = {name: lambda c=changes: draw(c) for name, changes in labels.items()}

@@ -183,12 +183,9 @@ def draw(
     output = scene_renderer.render_frame(
         scene, frame, camera, backend=backend, features=scene.gaussians.identities if classified else None
     )
-    color = scene_renderer.to_numpy(output.color, np.float32)
+    color = output.color
     rendered = time.perf_counter()
-    if classified:
-        ids = classify(scene, scene_renderer.to_numpy(output.features, np.float32))
-    else:
-        ids = np.maximum(scene_renderer.to_numpy(output.ids, np.int32), 0)
+    ids = classify(scene, output.features) if classified else np.maximum(output.ids, 0)
     rounded = images.to_uint8(color).astype(np.float32) / np.float32(255.0)
     return Rendering(rounded, ids, 1e3 * (moved - start), 1e3 * (rendered - moved))
 

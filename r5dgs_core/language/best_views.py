@@ -67,7 +67,7 @@ def find(
     for done, at in enumerate(places):
         small = viewpoints.sized(at.camera, _LOOK)
         output = scene_renderer.render_frame(scene, scene_player.frame(scene, at.t), small, backend=backend)
-        ids = scene_renderer.to_numpy(output.ids, np.int32)
+        ids = output.ids
         for object_id in object_ids:
             mask = ids == object_id
             if mask.sum() >= _LEAST_PIXELS:
@@ -94,7 +94,7 @@ def crops(
     alpha = alone[..., 3:]
     frame = scene_player.frame(scene, sighting.t)
     whole = scene_renderer.render_frame(scene, frame, camera, backend=backend)
-    context = np.clip(scene_renderer.to_numpy(whole.color, np.float32), 0, 1)
+    context = np.clip(whole.color, 0, 1)
     return (alone[..., :3] * alpha + _GRAY * (1 - alpha)).astype(np.float32), context
 
 

@@ -1,4 +1,7 @@
-"""Differentiable Gaussian rasterizer with three backends: `cpu` (numba), `cuda` (gsplat) and `reference` (torch)."""
+"""Gaussian rasterizer for arrays, and for tensors with gradients.
+
+Backends: `cpu` (numba), `cuda` (gsplat) and `reference` (torch).
+"""
 
 from . import environment as environment  # first: validates variables that numba reads
 from .rasterizer import rasterize, rasterize_splats

@@ -1,41 +1,40 @@
-"""Registry of the rasterizer backends, and selection of one for given tensors on this machine."""
+"""Registry of the rasterizer backends, and selection of one for given inputs on this machine."""
 
 from __future__ import annotations
 
 import functools
+import importlib
 import logging
 
-import torch
+import numpy as np
 
 from .. import errors
+from .arrays import Array, device_of
 from .backend import Backend
-from .cpu.backend import CpuBackend
-from .cuda import CudaBackend
-from .reference import ReferenceBackend
 
 log = logging.getLogger(__name__)
 
-# Fastest first: "auto" takes the first that suits the tensors and has no obstacle.
-BACKENDS: list[Backend] = [
-    CpuBackend(),
-    CudaBackend(),
-    ReferenceBackend(),
-]
+# Module of this room that defines `BACKEND`, by the backend's name. Fastest first: "auto" takes the first that suits
+# the inputs and has no obstacle.
+MODULES = {
+    "cpu": "cpu.backend",
+    "cuda": "cuda",
+    "reference": "reference",
+}
 
 
-def choose(name: str, like: torch.Tensor) -> Backend:
-    """Return the backend of that name, or the fastest if "auto", for tensors of the device and dtype of ``like``.
+def choose(name: str, like: Array) -> Backend:
+    """Return the backend of that name, or the fastest if "auto", for inputs of the device and dtype of ``like``.
 
     Raises:
         ValueError: The name is unknown.
-        BackendError: The backend cannot rasterize these tensors here.
+        BackendError: The backend cannot rasterize these inputs here.
     """
     if name == "auto":
         return _fastest(like)
-    found = next((backend for backend in BACKENDS if backend.name == name), None)
-    if found is None:
-        known = ", ".join(["auto", *(backend.name for backend in BACKENDS)])
-        raise ValueError(f"backend: expected one of {known}, got {name!r}")
+    if name not in MODULES:
+        raise ValueError(f"backend: expected one of {', '.join(['auto', *MODULES])}, got {name!r}")
+    found = _load(name, like)
     reason = found.obstacle(like)
     if reason is not None:
         raise errors.BackendError(f"rasterizer '{name}': {reason}")
@@ -43,22 +42,42 @@ def choose(name: str, like: torch.Tensor) -> Backend:
 
 
 def on_cpu() -> Backend:
-    """Return the fastest backend for float32 tensors on the CPU."""
-    return _fastest(torch.empty(0))
+    """Return the fastest backend for float32 arrays."""
+    return _fastest(np.empty(0, np.float32))
 
 
-def _fastest(like: torch.Tensor) -> Backend:
+class _Missing(Backend):
+    """Stand-in for a backend whose module needs a package that is not installed."""
+
+    def __init__(self, package: str):
+        self._package = package
+
+    def obstacle(self, like: Array) -> str:
+        return f"{self._package} is not installed; remedy: pip install {self._package}"
+
+
+def _load(name: str, like: Array) -> Backend:
+    """Import a backend, and return it for inputs of this kind."""
+    try:
+        module = importlib.import_module(f".{MODULES[name]}", __package__)
+    except ModuleNotFoundError as error:
+        return _Missing((error.name or name).partition(".")[0])
+    return module.BACKEND.accepting(like)
+
+
+def _fastest(like: Array) -> Backend:
     missing = []
-    for backend in BACKENDS:
+    for name in MODULES:
+        backend = _load(name, like)
         if not backend.suits(like):
             continue
         reason = backend.obstacle(like)
         if reason is None:
-            for name, why in missing:
-                _warn_once(f"rasterizer: using the slower '{backend.name}', as '{name}' is not available: {why}")
+            for other, why in missing:
+                _warn_once(f"rasterizer: using the slower '{name}', as '{other}' is not available: {why}")
             return backend
-        missing.append((backend.name, reason))
-    raise errors.BackendError(f"rasterizer: no backend for {like.dtype} on {like.device}: {missing}")
+        missing.append((name, reason))
+    raise errors.BackendError(f"rasterizer: no backend for {like.dtype} on {device_of(like)}: {missing}")
 
 
 @functools.cache

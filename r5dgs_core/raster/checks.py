@@ -5,44 +5,47 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import torch
+import numpy as np
 
 from ..scene import cameras
 from ..scene.cameras import Camera
+from .arrays import Array, array_namespace, device_of, is_float, is_whole, like, to_host
 
 
 def check_splats(means, quats, scales, opacities, channels, camera, background, labels) -> None:
     """Raise ValueError or TypeError for the first input with an invalid type, shape, dtype, device or value."""
     inputs = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "channels": channels}
-    for name, tensor in inputs.items():
-        check_tensor(name, tensor)
-        if not tensor.is_floating_point():
-            raise ValueError(f"{name}: expected floating-point values, got {tensor.dtype}; remedy: {name}.float()")
+    xp = array_namespace(*inputs.values())
+    for name, values in inputs.items():
+        check_kind(name, values, xp)
+        if not is_float(values):
+            remedy = f"{name}.astype('float32')" if xp is np else f"{name}.float()"
+            raise ValueError(f"{name}: expected floating-point values, got {values.dtype}; remedy: {remedy}")
     n = len(means) if means.ndim else 0
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
-    for name, tensor in inputs.items():
+    for name, values in inputs.items():
         expected = shapes.get(name, (n, channels.shape[-1] if channels.ndim == 2 and channels.shape[-1] else "D >= 1"))
-        if tuple(tensor.shape) != expected:
+        if tuple(values.shape) != expected:
             wanted = str(expected).replace("'", "")
-            raise ValueError(f"{name}: expected shape {wanted}, got {tuple(tensor.shape)}")
-        if tensor.dtype != means.dtype or tensor.device != means.device:
+            raise ValueError(f"{name}: expected shape {wanted}, got {tuple(values.shape)}")
+        if values.dtype != means.dtype or device_of(values) != device_of(means):
             raise ValueError(
-                f"{name}: expected {means.dtype} on {means.device}, as the means are, got {tensor.dtype} on "
-                f"{tensor.device}; remedy: {name}.to(means), or convert the means"
+                f"{name}: expected {means.dtype} on {device_of(means)}, as the means are, got {values.dtype} on "
+                f"{device_of(values)}; remedy: convert it, or the means"
             )
     cameras.check(camera)
     if background is not None:
         check_background(background, means, camera, channels.shape[-1])
-        inputs["background"] = background.to(means.dtype)
+        inputs["background"] = like(background, means, means.dtype)
     if labels is not None:
         _check_labels(labels, means)
-    for name, tensor in inputs.items():
-        _check_values(name, tensor.detach(), *_RANGES.get(name, (-math.inf, math.inf, "")))
+    for name, values in inputs.items():
+        _check_values(name, values, *_RANGES.get(name, (-math.inf, math.inf, "")))
 
 
 def check_appearance(means: Any, camera: Camera, colors: Any, features: Any, background: Any) -> None:
     """Raise ValueError or TypeError for the first invalid input of `rasterizer.rasterize` that is not a splat's."""
-    check_tensor("means", means)
+    check_kind("means", means, array_namespace(means))
     cameras.check(camera)
     if colors is not None:
         check_companion("colors", colors, means, (len(means), 3))
@@ -52,6 +55,36 @@ def check_appearance(means: Any, camera: Camera, colors: Any, features: Any, bac
         check_background(background, means, camera, 3)
 
 
+def check_raw(gaussians: Any, colors: Any, features: Any) -> None:
+    """Raise ValueError for the first invalid input of `rasterizer.rasterize`, by the caller's names."""
+    n = len(gaussians.means)
+    given: dict[str, Any] = {
+        name: getattr(gaussians, name, None) for name in ("means", "quats", "log_scales", "opacity_logits", "sh")
+    }
+    derived = {"log_scales": ("scales", (n, 3)), "opacity_logits": ("opacities", (n,))}
+    for name, (result, shape) in derived.items():
+        if hasattr(gaussians, result):
+            del given[name]
+        elif given[name] is not None and tuple(given[name].shape) != shape:
+            raise ValueError(f"{name}: expected shape {shape}, got {tuple(given[name].shape)}")
+    if colors is not None:
+        given["sh"] = None
+    for name, values in {**given, "colors": colors, "features": features}.items():
+        if values is None:
+            continue
+        values = to_host(values)
+        if name == "log_scales":
+            with np.errstate(over="ignore"):
+                bad, wanted = ~np.isfinite(np.exp(values)), "values with a finite exponential"
+        elif name == "opacity_logits":
+            bad, wanted = np.isnan(values), "numbers"
+        else:
+            bad, wanted = ~np.isfinite(values), "finite values"
+        if bad.any():
+            at = _first(bad)
+            raise ValueError(f"{name}: expected {wanted}, found {values[at].item()} at index {at}")
+
+
 # Bounds of inputs with a limited range, and the remedy.
 _RANGES: dict[str, tuple[float, float, str]] = {
     "scales": (0.0, math.inf, "pass exp(log_scales)"),
@@ -59,77 +92,84 @@ _RANGES: dict[str, tuple[float, float, str]] = {
 }
 
 
-def check_tensor(name: str, value: Any) -> None:
-    if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; remedy: torch.as_tensor({name})")
+def check_kind(name: str, value: Any, xp: Any) -> None:
+    """Raise TypeError unless a value is an array if ``xp`` is numpy, or a tensor if it is torch."""
+    if not isinstance(value, np.ndarray if xp is np else xp.Tensor):
+        kind, remedy = ("an array", "numpy.asarray") if xp is np else ("a tensor", "torch.as_tensor")
+        raise TypeError(f"{name}: expected {kind}, got {type(value).__name__}; remedy: {remedy}({name})")
 
 
-def _check_device(name: str, tensor: torch.Tensor, means: torch.Tensor) -> None:
-    if tensor.device != means.device:
-        raise ValueError(f"{name}: expected a tensor on {means.device}, as the means are, got one on {tensor.device}")
+def check_companion(name: str, values: Any, means: Array, shape: tuple[int, int | str]) -> None:
+    """Raise unless the value is of the kind and on the device of the means with the given shape.
+
+    A str in the shape matches any size.
+    """
+    check_kind(name, values, array_namespace(means))
+    if values.ndim != 2 or any(isinstance(b, int) and a != b for a, b in zip(values.shape, shape, strict=True)):
+        raise ValueError(f"{name}: expected shape ({shape[0]}, {shape[1]}), got {tuple(values.shape)}")
+    _check_device(name, values, means)
 
 
-def check_companion(name: str, tensor: Any, means: torch.Tensor, shape: tuple[int, int | str]) -> None:
-    """Raise unless the value is a tensor on the device of the means with the given shape; a str matches any size."""
-    check_tensor(name, tensor)
-    if tensor.ndim != 2 or any(isinstance(b, int) and a != b for a, b in zip(tensor.shape, shape, strict=True)):
-        raise ValueError(f"{name}: expected shape ({shape[0]}, {shape[1]}), got {tuple(tensor.shape)}")
-    _check_device(name, tensor, means)
-
-
-def check_background(background: Any, means: torch.Tensor, camera: Camera, depth: int) -> None:
+def check_background(background: Any, means: Array, camera: Camera, depth: int) -> None:
     """Raise unless the value is a background for an image with ``depth`` channels."""
-    check_tensor("background", background)
+    xp = array_namespace(means)
+    check_kind("background", background, xp)
     if tuple(background.shape) not in {(depth,), (camera.height, camera.width, depth)}:
         raise ValueError(
             f"background: expected shape ({depth},) or ({camera.height}, {camera.width}, {depth}), "
             f"got {tuple(background.shape)}"
         )
-    if not background.is_floating_point():
+    if not is_float(background):
+        remedy = "background.astype('float32')" if xp is np else "background.float()"
         raise ValueError(
-            f"background: expected floating-point values, got {background.dtype}; remedy: background.float(), "
+            f"background: expected floating-point values, got {background.dtype}; remedy: {remedy}, "
             "divided by 255 for 8-bit colours"
         )
     _check_device("background", background, means)
 
 
 _MOST_LABEL = (1 << 31) - 1  # ids are int32
-_NARROW = (torch.uint8, torch.int8, torch.int16, torch.int32)  # dtypes that cannot exceed _MOST_LABEL
 
 
-def _check_labels(labels: Any, means: torch.Tensor) -> None:
+def _check_labels(labels: Any, means: Array) -> None:
     """Raise unless the labels are integers in range, one per Gaussian."""
-    check_tensor("labels", labels)
-    whole = not (labels.is_floating_point() or labels.is_complex() or labels.dtype == torch.bool)
-    if tuple(labels.shape) != (len(means),) or not whole:
+    check_kind("labels", labels, array_namespace(means))
+    if tuple(labels.shape) != (len(means),) or not is_whole(labels):
         raise ValueError(f"labels: expected {len(means)} integers, got {labels.dtype} of shape {tuple(labels.shape)}")
     _check_device("labels", labels, means)
-    if labels.dtype in _NARROW or not len(labels):
+    if labels.dtype.itemsize <= 4 and str(labels.dtype)[-6:] != "uint32" or not len(labels):
         return
-    numbers = labels.long()
-    if labels.dtype == torch.uint64:  # values from 2^63 on have become negative
-        numbers = torch.where(numbers < 0, torch.iinfo(torch.int64).max, numbers)
+    numbers = to_host(labels)
     if numbers.max() > _MOST_LABEL:
         at = int(numbers.argmax())
-        raise ValueError(f"labels: expected at most {_MOST_LABEL}, found {labels[at].item()} at index {at}")
+        raise ValueError(f"labels: expected at most {_MOST_LABEL}, found {numbers[at]} at index {at}")
 
 
-def _check_values(name: str, values: torch.Tensor, low: float, high: float, remedy: str) -> None:
+def _check_device(name: str, values: Array, means: Array) -> None:
+    if device_of(values) != device_of(means):
+        expected, found = device_of(means), device_of(values)
+        raise ValueError(f"{name}: expected a tensor on {expected}, as the means are, got one on {found}")
+
+
+def _check_values(name: str, values: Array, low: float, high: float, remedy: str) -> None:
     """Raise ValueError for the first value that is not finite or outside low .. high."""
-    if not values.numel():
+    if not math.prod(values.shape):
         return
     # Minimum and maximum take one fast pass each and propagate NaN; only on failure is the index searched.
     # numpy on the CPU: torch would wake its thread pool.
-    if values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64):
-        smallest, largest = values.numpy().min(), values.numpy().max()
-    else:
-        smallest, largest = (bound.item() for bound in torch.aminmax(values))
+    quick = to_host(values) if device_of(values) == "cpu" else values
+    smallest, largest = quick.min().item(), quick.max().item()
     if smallest >= low and largest <= high and smallest > -math.inf and largest < math.inf:
         return
-    bad = ~(torch.isfinite(values) & (values >= low) & (values <= high))
-    index = tuple(torch.nonzero(bad)[0].tolist())
+    values = to_host(values)
+    index = _first(~(np.isfinite(values) & (values >= low) & (values <= high)))
     found = values[index].item()
     if not math.isfinite(found):
         raise ValueError(f"{name}: expected finite values, found {found} at index {index}")
     wanted = "0 or more" if high == math.inf else f"values from {low:g} to {high:g}"
     raise ValueError(f"{name}: expected {wanted}, found {found:g} at index {index}; remedy: {remedy}")
+
+
+def _first(mask: np.ndarray) -> tuple[int, ...]:
+    """Index of the first True."""
+    return tuple(np.argwhere(mask)[0].tolist())

@@ -23,8 +23,8 @@ import torch
 from .. import errors, extras
 from ..scene.cameras import Camera
 from . import reference
-from .backend import Backend
 from .settings import RasterSettings, RasterStats, SplatImage
+from .torch_backend import TorchBackend
 
 log = logging.getLogger(__name__)
 
@@ -277,7 +277,7 @@ def _fill_stats(
         means2d.register_hook(keep_norm)
 
 
-class CudaBackend(Backend):
+class CudaBackend(TorchBackend):
     """gsplat's kernels, for float32 tensors on a GPU."""
 
     name = "cuda"
@@ -342,3 +342,6 @@ class CudaBackend(Backend):
         if labels is not None:
             ids = _heaviest(splats, labels.to(order.device)[order], alpha, kernels, settings)
         return SplatImage(image, alpha, depth, ids)
+
+
+BACKEND = CudaBackend()

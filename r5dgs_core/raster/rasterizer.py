@@ -4,28 +4,32 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
+import numpy as np
 
 from ..scene.cameras import Camera
+from ..scene.splats import to_opacities
 from . import backends, checks, shade
+from .arrays import Array, array_namespace, like
 from .settings import RasterSettings, RasterStats, RenderOutput, SplatImage
 
 
 def rasterize_splats(
-    means: torch.Tensor,  # [N, 3]
-    quats: torch.Tensor,  # [N, 4]
-    scales: torch.Tensor,  # [N, 3]
-    opacities: torch.Tensor,  # [N]
-    channels: torch.Tensor,  # [N, D]
+    means: Array,  # [N, 3]
+    quats: Array,  # [N, 4]
+    scales: Array,  # [N, 3]
+    opacities: Array,  # [N]
+    channels: Array,  # [N, D]
     camera: Camera,
-    background: torch.Tensor | None = None,  # [D] or [H, W, D]
+    background: Array | None = None,  # [D] or [H, W, D]
     *,
-    labels: torch.Tensor | None = None,  # [N]
+    labels: Array | None = None,  # [N]
     settings: RasterSettings | None = None,
     backend: str = "auto",
     stats: RasterStats | None = None,
 ) -> SplatImage:
-    """Rasterize Gaussians with any number of channels, differentiable in every float input except the camera.
+    """Rasterize Gaussians with any number of channels.
+
+    Inputs are numpy arrays, or torch tensors with gradients for every float input except the camera.
 
     Args:
         means: Centres, world. [N, 3]
@@ -39,14 +43,14 @@ def rasterize_splats(
             most 2^31 - 1, or 2^24 - 1 with backend "cpu". [N]
         settings: Thresholds; those of 3DGS if None.
         backend: "cpu" (numba, float32), "cuda" (gsplat, float32 tensors on a GPU), "reference" (plain torch, any float
-            dtype and device), or "auto": the fastest that supports these tensors.
+            dtype and device), or "auto": the fastest that supports these inputs.
         stats: Receives visibility and radii from this call, and screen-space gradients from the backward pass.
 
     Returns:
-        Image, alpha and depth, with device and dtype of ``means``.
+        Image, alpha and depth: arrays or tensors, as the inputs are, with device and dtype of ``means``.
 
     Raises:
-        TypeError: An input is not a tensor.
+        TypeError: An input is neither an array nor a tensor, or arrays and tensors are mixed.
         ValueError: An input has a wrong shape, dtype or device, or an input or the camera has a value that is not
             finite or out of range; the message names the input and the first index.
         BackendError: The backend is not available.
@@ -59,7 +63,7 @@ def rasterize_splats(
     checks.check_splats(means, quats, scales, opacities, channels, camera, background, labels)
     chosen = backends.choose(backend, means)
     if background is not None:
-        background = background.to(means.dtype)
+        background = like(background, means, means.dtype)
     return chosen.rasterize_splats(
         means, quats, scales, opacities, channels, camera, background, labels, settings, stats
     )
@@ -68,10 +72,10 @@ def rasterize_splats(
 def rasterize(
     gaussians: Any,
     camera: Camera,
-    features: torch.Tensor | None = None,  # [N, F]
-    background: torch.Tensor | None = None,  # [3] or [H, W, 3]
+    features: Array | None = None,  # [N, F]
+    background: Array | None = None,  # [3] or [H, W, 3]
     *,
-    colors: torch.Tensor | None = None,  # [N, 3]
+    colors: Array | None = None,  # [N, 3]
     ids: bool = True,
     settings: RasterSettings | None = None,
     backend: str = "auto",
@@ -101,25 +105,22 @@ def rasterize(
     try:
         channels = seen_colors(gaussians, camera, backend=backend) if colors is None else colors
         if features is not None and features.shape[1]:
-            channels = torch.cat([channels.to(means.dtype), features.to(means.dtype)], 1)
-            if background is not None:
-                zeros = background.new_zeros((*background.shape[:-1], features.shape[1]))
-                background = torch.cat([background, zeros], -1)
+            channels, background = _appended(channels, features, background)
         splats = rasterize_splats(
             means,
             gaussians.quats,
-            gaussians.scales if hasattr(gaussians, "scales") else torch.exp(gaussians.log_scales),
-            gaussians.opacities if hasattr(gaussians, "opacities") else torch.sigmoid(gaussians.opacity_logits),
-            channels.to(means.dtype),
+            *_shapes(gaussians),
+            like(channels, means, means.dtype),
             camera,
             background,
-            labels=None if object_ids is None else torch.as_tensor(object_ids, device=means.device),
+            labels=None if object_ids is None else like(object_ids, means),
             settings=settings,
             backend=backend,
             stats=stats,
         )
-    except ValueError as error:
-        raise (_raw_culprit(gaussians, colors, features) or error) from None
+    except ValueError:
+        checks.check_raw(gaussians, colors, features)
+        raise
     return RenderOutput(
         color=splats.image[..., :3],
         alpha=splats.alpha,
@@ -129,7 +130,27 @@ def rasterize(
     )
 
 
-def seen_colors(gaussians: Any, camera: Camera, *, backend: str = "auto") -> torch.Tensor:
+def _appended(colors: Array, features: Array, background: Array | None) -> tuple[Array, Array | None]:
+    """Append features to colours, and zeros to the background."""
+    xp = array_namespace(colors)
+    channels = xp.concatenate([colors, like(features, colors, colors.dtype)], 1)
+    if background is not None:
+        zeros = np.zeros((*background.shape[:-1], features.shape[1]))
+        background = xp.concatenate([background, like(zeros, background, background.dtype)], -1)
+    return channels, background
+
+
+def _shapes(gaussians: Any) -> tuple[Array, Array]:
+    """Scales and opacities of Gaussians that store them or their raw parameters."""
+    xp = array_namespace(gaussians.means)
+    scales = gaussians.scales if hasattr(gaussians, "scales") else xp.exp(gaussians.log_scales)
+    if hasattr(gaussians, "opacities"):
+        return scales, gaussians.opacities
+    logits = gaussians.opacity_logits
+    return scales, to_opacities(logits).astype(logits.dtype) if xp is np else xp.sigmoid(logits)
+
+
+def seen_colors(gaussians: Any, camera: Camera, *, backend: str = "auto") -> Array:
     """Return the display-referred colour of each Gaussian for a camera: max(0, 0.5 + harmonics). [N, 3]
 
     Args:
@@ -138,33 +159,3 @@ def seen_colors(gaussians: Any, camera: Camera, *, backend: str = "auto") -> tor
         backend: As for `rasterize_splats`.
     """
     return shade.seen_colors(gaussians.means, gaussians.sh, camera.center, backend=backend)
-
-
-def _raw_culprit(gaussians: Any, colors: Any, features: Any) -> ValueError | None:
-    """Find the invalid input of `rasterize` after a failure: an error that uses the caller's names, or None."""
-    n = len(gaussians.means)
-    given: dict[str, Any] = {
-        name: getattr(gaussians, name, None) for name in ("means", "quats", "log_scales", "opacity_logits", "sh")
-    }
-    derived = {"log_scales": ("scales", (n, 3)), "opacity_logits": ("opacities", (n,))}
-    for name, (result, shape) in derived.items():
-        if hasattr(gaussians, result):
-            del given[name]
-        elif given[name] is not None and tuple(given[name].shape) != shape:
-            return ValueError(f"{name}: expected shape {shape}, got {tuple(given[name].shape)}")
-    if colors is not None:
-        given["sh"] = None
-    for name, values in {**given, "colors": colors, "features": features}.items():
-        if not isinstance(values, torch.Tensor):
-            continue
-        values = values.detach()
-        if name == "log_scales":
-            bad, wanted = ~torch.isfinite(torch.exp(values)), "values with a finite exponential"
-        elif name == "opacity_logits":
-            bad, wanted = torch.isnan(values), "numbers"
-        else:
-            bad, wanted = ~torch.isfinite(values), "finite values"
-        if bad.any():
-            at = tuple(torch.nonzero(bad)[0].tolist())
-            return ValueError(f"{name}: expected {wanted}, found {values[at].item()} at index {at}")
-    return None

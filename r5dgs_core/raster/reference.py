@@ -18,8 +18,8 @@ import torch
 from torch.utils.checkpoint import checkpoint
 
 from ..scene.cameras import Camera
-from .backend import Backend
 from .settings import RasterSettings, RasterStats, SplatImage, frustum_slopes
+from .torch_backend import TorchBackend
 
 # A tile is the unit of work: all its pixels with all Gaussians that reach it. Neither constant affects results.
 TILE = 32  # px; smaller tiles skip more Gaussians
@@ -192,7 +192,7 @@ def _keep_norm(stats: RasterStats, gradient: torch.Tensor, dtype: torch.dtype) -
     stats.grad_norm = gradient.norm(dim=1).to(dtype)
 
 
-class ReferenceBackend(Backend):
+class ReferenceBackend(TorchBackend):
     """Plain torch, for tensors of any float dtype on any device."""
 
     name = "reference"
@@ -247,3 +247,6 @@ class ReferenceBackend(Backend):
         if background is not None:
             image = image + transmittance[..., None] * background.double()
         return SplatImage(image.to(dtype), alpha.to(dtype), depth.to(dtype), None if labels is None else ids)
+
+
+BACKEND = ReferenceBackend()

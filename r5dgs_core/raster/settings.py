@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import torch
-
-    from ..scene.cameras import Camera
+from ..scene.cameras import Camera
+from .arrays import Array, array_namespace
 
 
 @dataclass(frozen=True)
@@ -77,9 +74,14 @@ class RasterStats:
             visible. [N]
     """
 
-    visible: torch.Tensor | None = None
-    radii: torch.Tensor | None = None
-    grad_norm: torch.Tensor | None = None
+    visible: Array | None = None
+    radii: Array | None = None
+    grad_norm: Array | None = None
+
+    def fill(self, radii: Array) -> None:
+        """Set all statistics before a backward pass, from the radii. [N]"""
+        self.radii, self.visible = radii, radii > 0
+        self.grad_norm = array_namespace(radii).zeros_like(radii)
 
 
 @dataclass(frozen=True)
@@ -93,10 +95,10 @@ class SplatImage:
         ids: Label with the largest weight, -1 if alpha is small; None without labels. [H, W] int32
     """
 
-    image: torch.Tensor
-    alpha: torch.Tensor
-    depth: torch.Tensor
-    ids: torch.Tensor | None = None
+    image: Array
+    alpha: Array
+    depth: Array
+    ids: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -112,12 +114,12 @@ class RenderOutput:
         holdout: Coverage of hold-outs, which alpha and depth leave out, or None without hold-outs. [H, W]
     """
 
-    color: torch.Tensor
-    alpha: torch.Tensor
-    depth: torch.Tensor
-    features: torch.Tensor | None = None
-    ids: torch.Tensor | None = None
-    holdout: torch.Tensor | None = None
+    color: Array
+    alpha: Array
+    depth: Array
+    features: Array = None
+    ids: Array = None
+    holdout: Array = None
 
 
 def frustum_slopes(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:

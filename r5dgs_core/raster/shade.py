@@ -8,25 +8,25 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 
 from ..scene import sh_color
 from ..scene.cameras import Camera
 from . import backends
+from .arrays import Array, array_namespace, to_host
 from .backend import ViewPoses
 
 
 def seen_colors(
-    means: torch.Tensor,  # [N, 3]
-    sh: torch.Tensor,  # [N, K, 3] or [N, 1, 3]
+    means: Array,  # [N, 3]
+    sh: Array,  # [N, K, 3] or [N, 1, 3]
     eyes: np.ndarray,  # [3] or [P, 3]
     *,
-    rest: torch.Tensor | None = None,  # [N, K - 1, 3]
+    rest: Array | None = None,  # [N, K - 1, 3]
     view_maps: np.ndarray | None = None,  # [P, 3, 3]
     pose_ids: Any = None,  # [N]
-    factor: torch.Tensor | None = None,  # [N]
+    factor: Array | None = None,  # [N]
     backend: str = "auto",
-) -> torch.Tensor:
+) -> Array:
     """Return the display-referred colour of each Gaussian: factor * max(0, 0.5 + harmonics along the line of sight).
 
     Differentiable in means, coefficients and factor. A Gaussian at the eye has its degree-0 colour. Clamped colours
@@ -60,7 +60,7 @@ def seen_colors(
         if tensor is not None and tuple(tensor.shape) != shape:
             raise ValueError(f"{name}: expected shape {shape}, got {tuple(tensor.shape)}")
     if sh_color.degree_of(count) == 0:
-        colors = sh_color.dc_to_rgb(sh[:, 0]).clamp_min(0)
+        colors = array_namespace(sh).clip(sh_color.dc_to_rgb(sh[:, 0]), 0, None)
         return colors if factor is None else colors * factor[:, None]
     poses = _poses(eyes, view_maps, pose_ids, n)
     return backends.choose(backend, means).seen_colors(means, sh, rest, factor, poses)
@@ -92,8 +92,7 @@ def _poses(eyes: np.ndarray, view_maps: np.ndarray | None, pose_ids: Any, n: int
         raise ValueError(f"view_maps: expected one for each of {len(eyes)} eyes, got {len(maps)}")
     ids = np.empty(0, np.int64)
     if pose_ids is not None:
-        host = pose_ids.detach().cpu().numpy() if isinstance(pose_ids, torch.Tensor) else pose_ids
-        ids = np.array(host, np.int64)
+        ids = np.array(to_host(pose_ids), np.int64)
         if ids.shape != (n,) or (n and not 0 <= ids.min() <= ids.max() < count):
             raise ValueError(f"pose_ids: expected {n} rows of {count} poses, got {ids!r}")
     # Copies: contiguous and writable, so that the kernels compile for one array type, and independent of changes that

@@ -7,7 +7,6 @@ pixel in which the group is visible; the shares of all groups sum to the pixel's
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from ..raster import rasterize
 from ..raster.settings import RasterSettings
@@ -48,15 +47,13 @@ def shares(
     present = np.unique(groups[groups >= 0])
     for first in range(0, len(present), CHANNELS):
         chosen = present[first : first + CHANNELS]
-        channels = torch.zeros((len(groups), max(len(chosen), 3)))
-        channels[:, : len(chosen)] = torch.from_numpy((groups[:, None] == chosen).astype(np.float32))
-        with torch.no_grad():
-            output = rasterize(
-                gaussians, seen, channels[:, 3:], None, colors=channels[:, :3], settings=settings, backend=backend
-            )
+        channels = np.zeros((len(groups), max(len(chosen), 3)), np.float32)
+        channels[:, : len(chosen)] = groups[:, None] == chosen
+        output = rasterize(
+            gaussians, seen, channels[:, 3:], None, colors=channels[:, :3], settings=settings, backend=backend
+        )
         assert output.features is not None  # features were passed
-        image = torch.cat([output.color, output.features], -1)[..., : len(chosen)]
-        values = scene_renderer.to_numpy(image, np.float32).reshape(-1, len(chosen))
+        values = np.concatenate([output.color, output.features], -1)[..., : len(chosen)].reshape(-1, len(chosen))
         for column, group in enumerate(chosen):
             _insert(best, found, values[:, column], int(group))
     shape = (camera.height, camera.width, ranks)

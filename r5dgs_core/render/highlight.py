@@ -48,8 +48,8 @@ def isolate(
         frame, opacity_logits=np.where(wanted, frame.opacity_logits, np.float32(_ABSENT)).astype(np.float32)
     )
     output = scene_renderer.render_frame(scene, alone, camera, background=None, backend=backend)
-    color = scene_renderer.to_numpy(output.color, np.float32)  # premultiplied: blended over black
-    alpha = np.clip(scene_renderer.to_numpy(output.alpha, np.float32), 0, 1)[..., None]
+    color = output.color  # premultiplied: blended over black
+    alpha = np.clip(output.alpha, 0, 1)[..., None]
     straight = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 1e-6)
     return np.concatenate([np.clip(straight, 0, 1), alpha], axis=-1)
 
@@ -73,7 +73,7 @@ def highlight(
     frame = scene_player.frame(scene, t, mode)
     wanted = np.isin(frame.object_ids, list(object_ids)).astype(np.float32)
     output = scene_renderer.render_frame(scene, frame, camera, backend=backend, features=wanted[:, None])
-    color = np.clip(scene_renderer.to_numpy(output.color, np.float32), 0, 1)
-    share = np.clip(scene_renderer.to_numpy(output.features, np.float32), 0, 1)
+    color = np.clip(output.color, 0, 1)
+    share = np.clip(output.features, 0, 1)
     dark = (DIMMED * (color @ _LUMA))[..., None]
     return (share * color + (1 - share) * dark).astype(np.float32)

@@ -13,7 +13,6 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from ..playback.instance import Instance, Sky
 from ..raster import backends, rasterize
@@ -70,7 +69,7 @@ class Stage:
 
         Returns:
             Colour (not clamped at 1), alpha, depth and, as ``ids``, the instance with the largest share of each pixel,
-            -1 if the pixel is nearly empty; tensors without gradient. Hold-outs are black in the colour, and
+            -1 if the pixel is nearly empty; arrays. Hold-outs are black in the colour, and
             ``holdout`` is their share of each pixel; alpha, depth and ids describe the other instances only.
 
         Raises:
@@ -164,13 +163,13 @@ class Stage:
         }
         return min((plane for plane in planes if plane > 0), default=NEAR_PLANE)
 
-    def _sky(self, sky: Sky | None, camera: Camera) -> torch.Tensor | None:
+    def _sky(self, sky: Sky | None, camera: Camera) -> np.ndarray | None:
         if sky is None:
             return None
         if not 0 <= sky.scene < len(self._scenes):
             raise ValueError(f"sky: expected a scene below {len(self._scenes)}, got {sky.scene}")
         scene, turned = self._scenes[sky.scene], scene_renderer.in_world_of(camera, sky.matrix)
-        return scene_renderer.tensor(scene_renderer.behind(scene, turned))
+        return np.asarray(scene_renderer.behind(scene, turned), np.float32)
 
     def _wants_static_layer(self, instances: Sequence[Instance], still: list[int], moving: list[int]) -> bool:
         if not self._backend.has_static_layer:
@@ -190,7 +189,7 @@ class Stage:
         means, quats, scales, opacities, channels, labels = self._splats(instances, still, camera, distance)
         background = self._sky(sky, camera)
         if background is not None and distance:
-            background = torch.cat([background, torch.zeros_like(background[..., :1])], -1)
+            background = np.concatenate([background, np.zeros_like(background[..., :1])], -1)
         return self._backend.static_layer(
             means, quats, scales, opacities, channels, camera, background,
             labels=labels, ranks=_ranks(instances, still), settings=settings,
@@ -198,14 +197,14 @@ class Stage:
 
     def _splats(
         self, instances: Sequence[Instance], part: list[int], camera: Camera, distance: float
-    ) -> tuple[torch.Tensor, ...]:
+    ) -> tuple[np.ndarray, ...]:
         """Means, quats, scales, opacities, channels and owners of some instances; channels are colours, then depths."""
         posed = self._pose([instances[i] for i in part])
         gaussians = scene_renderer.PosedGaussians(posed)
-        channels = scene_renderer.tensor(scene_renderer.colors(posed, camera))
+        channels = scene_renderer.colors(posed, camera)
         if distance:
-            channels = torch.cat([channels, _depths(posed, camera, distance)], 1)
-        labels = torch.from_numpy(_owners(instances, part))
+            channels = np.concatenate([channels, _depths(posed, camera, distance)], 1)
+        labels = _owners(instances, part)
         return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, channels, labels
 
     def _render_all(
@@ -218,28 +217,27 @@ class Stage:
     ) -> RenderOutput:
         posed = self._pose(instances)
         gaussians = scene_renderer.PosedGaussians(posed)
-        gaussians.object_ids = torch.from_numpy(_owners(instances, range(len(instances))))
-        colors = scene_renderer.tensor(scene_renderer.colors(posed, camera))
-        held = torch.tensor([one.holdout for one in instances]) if any(one.holdout for one in instances) else None
+        gaussians.object_ids = _owners(instances, range(len(instances)))
+        colors = scene_renderer.colors(posed, camera)
+        held = np.array([one.holdout for one in instances]) if any(one.holdout for one in instances) else None
         features = _depths(posed, camera, distance) if distance or held is not None else None
         if held is not None and features is not None:
-            hidden = held[gaussians.object_ids.long()][:, None]
-            colors, features = colors * ~hidden, torch.cat([features * ~hidden, hidden], 1)
-        with torch.no_grad():
-            found = rasterize(
-                gaussians,
-                camera,
-                features,
-                background=self._sky(sky, camera),
-                colors=colors,
-                settings=settings,
-            )
+            hidden = held[gaussians.object_ids][:, None]
+            colors, features = colors * ~hidden, np.concatenate([features * ~hidden, hidden], 1)
+        found = rasterize(
+            gaussians,
+            camera,
+            features,
+            background=self._sky(sky, camera),
+            colors=colors,
+            settings=settings,
+        )
         if found.features is None or features is None:
             return found
         alpha, ids, holdout = found.alpha, found.ids, None
         if held is not None and ids is not None:
             holdout = found.features[..., 1]
-            alpha, ids = (alpha - holdout).clamp_min(0), torch.where((ids >= 0) & held[ids.long()], -1, ids)
+            alpha, ids = np.maximum(alpha - holdout, 0), np.where((ids >= 0) & held[ids], np.int32(-1), ids)
         depth = _mean(found.features[..., 0], alpha)
         return RenderOutput(found.color, alpha, depth, None, ids, holdout)
 
@@ -250,15 +248,15 @@ class Stage:
         return posed
 
 
-def _depths(posed: scene_renderer.PosedScene, camera: Camera, distance: float) -> torch.Tensor:
+def _depths(posed: scene_renderer.PosedScene, camera: Camera, distance: float) -> np.ndarray:
     """Depths of centres minus ``distance``, computed in float64. [N, 1] float32"""
     depths = (posed.means + posed.origin) @ camera.T_cam_world[2, :3] + (camera.T_cam_world[2, 3] - distance)
-    return scene_renderer.tensor(depths[:, None])
+    return np.asarray(depths[:, None], np.float32)
 
 
-def _mean(blended: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
+def _mean(blended: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Divide a blend without background by its alpha; 0 if alpha is 0. [H, W]"""
-    return torch.where(alpha > 0, blended / torch.where(alpha > 0, alpha, 1), 0)
+    return np.divide(blended, alpha, out=np.zeros_like(blended), where=alpha > 0)
 
 
 def _look(instance: Instance) -> tuple | None:

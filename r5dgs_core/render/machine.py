@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from .. import __version__
 from ..raster import compilation
@@ -18,6 +17,7 @@ def versions() -> dict[str, str]:
     """Versions of Python and of the packages that affect results."""
     import numba
     import OpenImageIO as oiio
+    import torch
 
     return {
         "r5dgs": __version__,
@@ -31,6 +31,8 @@ def versions() -> dict[str, str]:
 
 def describe() -> dict[str, Any]:
     """Description of the machine: system, processor, cores, threads and GPU."""
+    import torch
+
     processor = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()

@@ -8,10 +8,8 @@ the spherical harmonics `Scene.background_sh` along each pixel's ray, clamped to
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
-import torch
 
 from ..playback import scene_player
 from ..raster import RasterSettings, RenderOutput, rasterize, shade
@@ -23,7 +21,7 @@ from .posed_scene import Gathered, Instance, PosedScene, gather, pose_frame, pos
 
 __all__ = (
     "Gathered", "Instance", "PosedGaussians", "PosedScene", "behind", "colors", "gather", "in_world_of", "pose_frame",
-    "pose_instances", "render_frame", "sky", "tensor", "to_numpy",
+    "pose_instances", "render_frame", "sky",
 )  # fmt: skip
 
 
@@ -49,23 +47,22 @@ def render_frame(
         settings: Rasterizer settings; None for the defaults with the scene's near plane.
 
     Returns:
-        Colour (not clamped at 1), alpha, depth, features and object ids, tensors without gradient.
+        Colour (not clamped at 1), alpha, depth, features and object ids, arrays.
     """
     posed = pose_frame(scene, pose) if isinstance(pose, scene_player.Frame) else pose
     if isinstance(background, str):
         if background != "scene":
             raise ValueError(f"background: expected 'scene', None or an array, got {background!r}")
         background = behind(scene, camera)
-    with torch.no_grad():
-        return rasterize(
-            PosedGaussians(posed),
-            cameras.moved(camera, -posed.origin),
-            None if features is None else torch.from_numpy(np.ascontiguousarray(features, np.float32)),
-            None if background is None else tensor(background),
-            colors=tensor(colors(posed, camera)),
-            settings=settings or RasterSettings(near_plane=scene.near_plane),
-            backend=backend,
-        )
+    return rasterize(
+        PosedGaussians(posed),
+        cameras.moved(camera, -posed.origin),
+        None if features is None else np.asarray(features, np.float32),
+        None if background is None else np.asarray(background, np.float32),
+        colors=colors(posed, camera),
+        settings=settings or RasterSettings(near_plane=scene.near_plane),
+        backend=backend,
+    )
 
 
 def sky(scene: Scene, camera: Camera) -> np.ndarray:
@@ -101,15 +98,14 @@ def colors(posed: PosedScene, camera: Camera) -> np.ndarray:
             for channel in range(3):  # by column, as numpy is slow on rows of three
                 rgb[:, channel] *= factor
     else:
-        with torch.no_grad():
-            rgb = shade.seen_colors(
-                tensor(posed.means),
-                tensor(posed.sh),
-                camera.center - posed.origin,
-                view_maps=posed.view_maps,
-                pose_ids=posed.pose_ids,
-                factor=None if factor is None else tensor(factor),
-            ).numpy()
+        rgb = shade.seen_colors(
+            np.asarray(posed.means, np.float32),
+            np.asarray(posed.sh, np.float32),
+            camera.center - posed.origin,
+            view_maps=posed.view_maps,
+            pose_ids=posed.pose_ids,
+            factor=None if factor is None else np.asarray(factor, np.float32),
+        )
     if posed.tints is not None:  # commutes with the clamp at 0, as tints are >= 0
         for channel in range(3):
             rgb[:, channel] *= posed.tints[:, channel][posed.pose_ids]
@@ -122,27 +118,13 @@ def behind(scene: Scene, camera: Camera) -> np.ndarray:
     return image[0, 0] if len(scene.background_sh) == 1 else image
 
 
-def to_numpy(value: Any, dtype: type) -> np.ndarray:
-    """Copy a tensor of a `RenderOutput` to a host array."""
-    return value.detach().cpu().numpy().astype(dtype, copy=False)
-
-
 class PosedGaussians:
-    """Rasterizer inputs of a posed scene, except colours.
-
-    Computed with numpy, because waking torch's threads would slow down the numba kernels.
-    """
+    """Rasterizer inputs of a posed scene, except colours."""
 
     def __init__(self, posed: PosedScene):
-        self.means = tensor(posed.means)
-        self.quats = tensor(posed.quats)
-        self.scales = tensor(np.exp(posed.log_scales))
+        self.means = np.asarray(posed.means, np.float32)
+        self.quats = np.asarray(posed.quats, np.float32)
+        self.scales = np.asarray(np.exp(posed.log_scales), np.float32)
         with np.errstate(over="ignore"):
-            self.opacities = tensor(1 / (1 + np.exp(-posed.opacity_logits)))
-        self.object_ids = torch.from_numpy(np.ascontiguousarray(posed.object_ids))
-
-
-def tensor(array: np.ndarray) -> torch.Tensor:
-    """Convert an array to a float32 tensor that never aliases read-only memory."""
-    array = np.ascontiguousarray(array, np.float32)
-    return torch.from_numpy(array if array.flags.writeable else array.copy())
+            self.opacities = np.asarray(1 / (1 + np.exp(-posed.opacity_logits)), np.float32)
+        self.object_ids = posed.object_ids

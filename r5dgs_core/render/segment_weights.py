@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from scipy import sparse
-from torch import Tensor
 
 from ..raster import backends, checks
+from ..raster.arrays import Array
 from ..raster.settings import RasterSettings
 from ..scene.cameras import Camera
 
 
 def segment_weights(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
+    means: Array,  # [N, 3]
+    quats: Array,  # [N, 4]
+    scales: Array,  # [N, 3]
+    opacities: Array,  # [N]
     camera: Camera,
-    segments: Tensor,  # [H, W]
+    segments: Array,  # [H, W]
     count: int,
     *,
     settings: RasterSettings | None = None,
@@ -42,13 +42,13 @@ def segment_weights(
     Raises:
         ValueError, BackendError: As for `rasterizer.rasterize_splats`.
     """
-    fixed = means.detach(), quats.detach(), scales.detach(), opacities.detach()
     if tuple(segments.shape) != (camera.height, camera.width):
         raise ValueError(
             f"segments: expected shape ({camera.height}, {camera.width}), the image's, got {tuple(segments.shape)}"
         )
-    checks.check_splats(*fixed, fixed[0], camera, None, None)
-    chosen = backends.choose(backend, fixed[0])
-    rows, names, weights = chosen.segment_weights(*fixed, camera, segments, count, settings or RasterSettings())
+    splats = means, quats, scales, opacities
+    checks.check_splats(*splats, means, camera, None, None)
+    chosen = backends.choose(backend, means)
+    rows, names, weights = chosen.segment_weights(*splats, camera, segments, count, settings or RasterSettings())
     by_gaussian = sparse.coo_matrix((weights, (rows, names)), (len(means), count)).tocsr()  # adds entries up
     return sparse.csr_matrix(by_gaussian.T)

@@ -7,7 +7,6 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from ..raster import backends, rasterize_splats
 from ..scene.cameras import Camera
@@ -44,18 +43,17 @@ def run() -> Trial:
     )
     scales = 0.015 * np.exp(0.5 * random.normal(size=(GAUSSIANS, 3)))
     quats, colors = (random.uniform(0.1, 0.9, (GAUSSIANS, width)) for width in (4, 3))
-    places, axes, turns, values = (torch.from_numpy(a.astype(np.float32)) for a in (means, scales, quats, colors))
-    opacities = torch.from_numpy(random.uniform(0.1, 0.9, GAUSSIANS).astype(np.float32))
+    places, axes, turns, values = (a.astype(np.float32) for a in (means, scales, quats, colors))
+    opacities = random.uniform(0.1, 0.9, GAUSSIANS).astype(np.float32)
     T_cam_world = np.eye(4)
     T_cam_world[2, 3] = 3.0
     half = SIZE / 2
     camera = Camera(SIZE, SIZE, np.array([[2.2 * half, 0, half], [0, 2.2 * half, half], [0, 0, 1]]), T_cam_world)
     warm_up.warm_up(gradients=False)
     milliseconds = []
-    with torch.no_grad():
-        for _ in range(REPEATS):
-            start = time.perf_counter()
-            rasterize_splats(places, turns, axes, opacities, values, camera)
-            milliseconds.append(1e3 * (time.perf_counter() - start))
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        rasterize_splats(places, turns, axes, opacities, values, camera)
+        milliseconds.append(1e3 * (time.perf_counter() - start))
     hardware = backends.choose("auto", places).hardware()
     return Trial(statistics.median(milliseconds), GAUSSIANS, (SIZE, SIZE), hardware)

@@ -143,7 +143,7 @@ def _score(
     """Number of visible objects, and sum of the square roots of their shares, halved for those at the border."""
     frame = player.frame(standpoint.t)
     output = scene_renderer.render_frame(scene, frame, sized(standpoint.camera, LOOK), backend=backend)
-    ids = scene_renderer.to_numpy(output.ids, np.int32)
+    ids = output.ids
     border = np.concatenate([ids[0], ids[-1], ids[:, 0], ids[:, -1]])
     count, quality = 0, 0.0
     for object_id in object_ids:

@@ -6,12 +6,13 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-import torch
 
 from ..raster import backends, rasterizer, shade
+from ..raster.arrays import Array, like
 from ..scene.cameras import Camera
 
 _VIEW = Camera(4, 4, np.array([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]), np.eye(4))
+_ROW = np.ones((1, 3), np.float32)
 _SH = 4  # coefficients: degree 1, the least that has kernels
 
 
@@ -40,53 +41,59 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
     for name, stage in stages:
         if progress is not None:
             progress(name)
-        with torch.inference_mode(False), torch.enable_grad():  # independent of the caller's grad mode
-            stage()
+        stage()
     return time.perf_counter() - start
 
 
-def _inputs(row: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    return row, torch.ones(1, 4), row, row[:, 0], row
+def _inputs(row: Array) -> tuple[Array, Array, Array, Array, Array]:
+    return row, like(np.ones((1, 4), np.float32), row), row, row[:, 0], row
 
 
-def _draw(row: torch.Tensor) -> torch.Tensor:
-    labels = torch.zeros(1, dtype=torch.int32)
+def _draw(row: Array) -> Array:
+    labels = like(np.zeros(1, np.int32), row)
     return rasterizer.rasterize_splats(*_inputs(row), _VIEW, labels=labels).image
 
 
-def _shade(row: torch.Tensor) -> torch.Tensor:
-    return shade.seen_colors(row, row.expand(1, _SH, 3), np.zeros(3))
+def _shade(row: Array) -> Array:
+    return shade.seen_colors(row, like(np.ones((1, _SH, 3), np.float32), row), np.zeros(3))
 
 
 def _splats() -> None:
-    _draw(torch.ones(1, 3))
+    _draw(_ROW)
 
 
 def _static_layer() -> None:
     backend = backends.on_cpu()
     if backend.has_static_layer:
-        still = moving = _inputs(torch.ones(1, 3))
+        still = moving = _inputs(_ROW)
         backend.static_layer(*still, _VIEW).draw(*moving)
-
-
-def _splat_gradients() -> None:
-    _draw(torch.ones(1, 3, requires_grad=True)).sum().backward()
 
 
 def _segment_weights() -> None:
     from . import segment_weights  # imports scipy, which is slow
 
-    segments = torch.zeros(_VIEW.height, _VIEW.width, dtype=torch.int64)
-    segment_weights.segment_weights(*_inputs(torch.ones(1, 3))[:4], _VIEW, segments, 1)
+    segments = np.zeros((_VIEW.height, _VIEW.width), np.int64)
+    segment_weights.segment_weights(*_inputs(_ROW)[:4], _VIEW, segments, 1)
 
 
 def _colors() -> None:
-    _shade(torch.ones(1, 3))
-
-
-def _color_gradients() -> None:
-    _shade(torch.ones(1, 3, requires_grad=True)).sum().backward()
+    _shade(_ROW)
 
 
 def _sky() -> None:
     shade.sky(np.zeros((_SH, 3)), _VIEW)
+
+
+def _splat_gradients() -> None:
+    _differentiate(_draw)
+
+
+def _color_gradients() -> None:
+    _differentiate(_shade)
+
+
+def _differentiate(draw: Callable[[Array], Array]) -> None:
+    import torch
+
+    with torch.inference_mode(False), torch.enable_grad():  # independent of the caller's grad mode
+        draw(torch.ones(1, 3, requires_grad=True)).sum().backward()

@@ -137,7 +137,7 @@ class Server:
         wanted = messages.RenderRequest.from_json(request, self._numbers)
         ranks = 0 if wanted.coverage is None else wanted.coverage.ranks
         fields.check_size(wanted.camera, 0, ranks)
-        scene_render = self._rasterizer()
+        self._wait_for_kernels()
         started = time.perf_counter()
         instances = []
         if wanted.t is None:
@@ -156,11 +156,10 @@ class Server:
         except (ValueError, OverflowError, FloatingPointError) as error:  # Gaussians out of the numeric range
             raise errors.ConfigError(f"worker: this picture cannot be drawn: {error}") from error
         ms_raster = 1e3 * (time.perf_counter() - started) - ms_motion
-        arrays = {"color": scene_render.to_numpy(output.color, np.float32)}
+        arrays = {"color": output.color}
         for name in wanted.want:
             value = output.ids if name in ("ids", "owners") else getattr(output, name)
-            value = 0 * output.alpha if value is None else value  # no hold-outs
-            arrays[name] = scene_render.to_numpy(value, np.int32 if value is output.ids else np.float32)
+            arrays[name] = 0 * output.alpha if value is None else value  # no hold-outs
         arrays |= covered
         result = {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count, "scenes": self._known(wanted)}
         return result, arrays
@@ -216,7 +215,7 @@ class Server:
 
     def _warm_up(self, _: dict[str, Any]) -> Answer:
         """Load the rasterizer; returns the number of kernels that this process ``compiled``."""
-        self._rasterizer()
+        self._wait_for_kernels()
         from ..raster import compilation
         from ..render import warm_up
 
@@ -266,17 +265,9 @@ class Server:
             raise errors.ConfigError("worker: no scene is loaded; send 'load' first")
         return list(self._scenes.values())
 
-    def _rasterizer(self):
-        """Return `render.scene_renderer`, whose import needs torch and numba, after its kernels are loaded."""
+    def _wait_for_kernels(self) -> None:
         if self._warming is not None:
             self._warming.wait()
-        try:
-            from ..render import scene_renderer
-        except ImportError as error:
-            raise errors.BackendError(
-                f"worker: {sys.executable} lacks '{error.name}'; install the core there ('pip install r5dgs')"
-            ) from error
-        return scene_renderer
 
 
 def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:

@@ -153,9 +153,7 @@ def use_scene(scene: Scene, path: Path) -> None:
             if camera is not None and len(scene.gaussians.means):
                 small = cameras.crop(camera, (camera.width - SIDE) // 2, (camera.height - SIDE) // 2, SIDE, SIDE)
                 output = scene_renderer.render_frame(scene, frame, small, backend="reference")
-                assert torch.isfinite(output.color).all() and torch.isfinite(output.alpha).all(), (
-                    "picture is not finite"
-                )
+                assert np.isfinite(output.color).all() and np.isfinite(output.alpha).all(), "picture is not finite"
         stored = embedding_search.Meanings.of(scene)
         if stored is not None:
             embedding_search.ask(stored, stored.vocabulary_embeddings[0] if len(stored.vocabulary) else np.zeros(0))

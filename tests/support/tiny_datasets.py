@@ -128,14 +128,14 @@ def make_dataset(
                 camera,
                 background=None if alpha else "scene",
             )
-            color = output.color.numpy()
+            color = output.color
             if alpha:
-                opacity = output.alpha.numpy()[..., None]
+                opacity = output.alpha[..., None]
                 color = np.concatenate([np.where(opacity > 0, color / np.maximum(opacity, 1e-6), 0), opacity], -1)
             images.write_png(folder / split / f"r_{i:03d}.png", color)
             if masks:
                 assert output.ids is not None
-                ids = np.maximum(output.ids.numpy(), 0).astype(np.uint8)
+                ids = np.maximum(output.ids, 0).astype(np.uint8)
                 images.write_png(folder / "object_mask" / split / f"r_{i:03d}.png", ids)
             matrix = cameras.cam_world_to_opengl(camera.T_cam_world)
             matrix[:3, 3] = scale * matrix[:3, 3] + offset

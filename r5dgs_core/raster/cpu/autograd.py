@@ -3,42 +3,25 @@
 from __future__ import annotations
 
 import math
-from typing import overload
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from ...scene.cameras import Camera
+from ..arrays import to_array
 from ..backend import ViewPoses
 from ..compilation import run
-from ..settings import RasterSettings, RasterStats, SplatImage
+from ..settings import RasterStats
 from . import blend_backward, forward, projection, sh_kernels
 
 _EMPTY = np.empty((0, 0), np.float32)
-_NO_FACTOR = np.empty(0, np.float32)
 
 
-def rasterize_splats(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    channels: torch.Tensor,
-    camera: Camera,
-    background: torch.Tensor | None,
-    labels: torch.Tensor | None,
-    settings: RasterSettings,
-    stats: RasterStats | None,
-) -> SplatImage:
-    """Implement `rasterizer.rasterize_splats`, which checks the inputs."""
-    plan = forward.Plan.of(camera, settings, to_array(labels))
-    inputs = (means, quats, scales, opacities, channels, background)
-    if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs):
-        image, alpha, depth, ids = _Rasterize.apply(*inputs, plan, stats)
-    else:
-        _, *results = _forward(inputs, plan, stats, False)
-        image, alpha, depth, ids = (torch.from_numpy(result) for result in results)
-    return SplatImage(image, alpha, depth, ids if labels is not None else None)
+def rasterize(
+    inputs: Sequence[torch.Tensor | None], plan: forward.Plan, stats: RasterStats | None
+) -> tuple[torch.Tensor, ...]:
+    """Image, alpha, depth and ids of means, quats, scales, opacities, channels and background, float32."""
+    return _Rasterize.apply(*inputs, plan, stats)
 
 
 def seen_colors(
@@ -48,31 +31,14 @@ def seen_colors(
     return _Shade.apply(means, sh, rest, factor, poses)
 
 
-@overload
-def to_array(tensor: None) -> None: ...
-@overload
-def to_array(tensor: torch.Tensor) -> np.ndarray: ...
-def to_array(tensor):
-    """View a tensor's memory as a C-contiguous array; None stays None."""
-    return None if tensor is None else tensor.detach().contiguous().numpy()
-
-
-def _forward(inputs, plan: forward.Plan, stats: RasterStats | None, with_state: bool):
-    """Return the state or None, image, alpha, depth and ids, as arrays, and fill ``stats``."""
-    arrays = [to_array(t) for t in inputs]
-    *results, radii = forward.rasterize(arrays[:5], arrays[5], plan, with_state)
-    if stats is not None:
-        stats.radii = torch.from_numpy(radii)
-        stats.visible = stats.radii > 0
-        stats.grad_norm = torch.zeros(len(radii))
-    return results
-
-
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, channels, background, plan, stats):
         inputs = (means, quats, scales, opacities, channels, background)
-        ctx.state, *results = _forward(inputs, plan, stats, True)
+        arrays = [to_array(t) for t in inputs]
+        ctx.state, *results, radii = forward.rasterize(arrays[:5], arrays[5], plan, True)
+        if stats is not None:
+            stats.fill(torch.from_numpy(radii))
         ctx.set_materialize_grads(False)
         image, alpha, depth, ids = (torch.from_numpy(result) for result in results)
         # Saved as tensors, so that in-place changes raise torch's error instead of giving a wrong gradient.
@@ -140,9 +106,7 @@ def _backward(
 class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, sh, rest, factor, poses):
-        colors = np.empty((len(means), 3), np.float32)
-        inputs = _kernel_inputs(means, sh, rest, factor, poses)
-        run(sh_kernels.shade, len(means) // forward.WORTH_A_THREAD, *inputs, colors)
+        colors = forward.seen_colors(to_array(means), to_array(sh), to_array(rest), to_array(factor), poses)
         ctx.save_for_backward(means, sh, rest, factor)
         ctx.poses = poses
         return torch.from_numpy(colors)
@@ -157,22 +121,10 @@ class _Shade(torch.autograd.Function):
         d_factor = np.empty(len(means) if ctx.needs_input_grad[3] else 0, np.float32)
         run(
             sh_kernels.shade_backward, len(means) // forward.WORTH_A_THREAD,
-            *_kernel_inputs(means, sh, rest, factor, ctx.poses), to_array(d_colors),
+            *forward.shade_inputs(to_array(means), to_array(sh), to_array(rest), to_array(factor), ctx.poses),
+            to_array(d_colors),
             d_sh.reshape(-1), d_rest.reshape(-1), d_means, d_factor,
         )  # fmt: skip
         gradients = (d_means, d_sh, d_rest, d_factor)
         wanted = ctx.needs_input_grad[:4]
         return *(torch.from_numpy(g) if w else None for g, w in zip(gradients, wanted, strict=True)), None
-
-
-def _kernel_inputs(means, sh, rest, factor, poses: ViewPoses) -> tuple:
-    """Arguments of both kernels, in their order."""
-    constants = to_array(sh).reshape(-1)
-    if rest is None:
-        count = sh.shape[1]
-        coefficients = (constants, 3 * count, constants, 3, 3 * count, count)
-    else:
-        count = 1 + rest.shape[1]
-        coefficients = (constants, 3, to_array(rest).reshape(-1), 0, 3 * (count - 1), count)
-    strength = _NO_FACTOR if factor is None else to_array(factor)
-    return to_array(means), poses.eyes, poses.maps, poses.ids, *coefficients, strength

@@ -6,10 +6,9 @@ import importlib.util
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ...scene.cameras import Camera
+from ..arrays import Array, device_of, is_float32, is_tensor, like, need_gradients, to_array
 from ..backend import Backend, StaticLayer, ViewPoses
 from ..settings import RasterSettings, RasterStats, SplatImage
 
@@ -17,7 +16,7 @@ _ROWS_WORTH_A_THREAD = 64  # rows of a sky per thread
 
 
 class CpuBackend(Backend):
-    """Kernels for float32 tensors on the CPU."""
+    """Kernels for float32 arrays, and tensors on the CPU."""
 
     name = "cpu"
     has_static_layer = True
@@ -28,50 +27,67 @@ class CpuBackend(Backend):
 
         return f"CPU, {threads()} threads" if threads() > 1 else "CPU, 1 thread"
 
-    def suits(self, like: Tensor) -> bool:
+    def suits(self, like: Array) -> bool:
         """See `Backend.suits`."""
-        return like.device.type == "cpu" and like.dtype == torch.float32
+        return device_of(like) == "cpu" and is_float32(like)
 
-    def obstacle(self, like: Tensor) -> str | None:
+    def obstacle(self, like: Array) -> str | None:
         """See `Backend.obstacle`."""
         if importlib.util.find_spec("numba") is None:
             return "numba is not installed; remedy: pip install numba"
         if self.suits(like):
             return None
         return (
-            f"expected float32 tensors on the CPU, got {like.dtype} on {like.device}; "
+            f"expected float32 values on the CPU, got {like.dtype} on {device_of(like)}; "
             "remedy: convert them, or use backend='reference'"
         )
 
     def rasterize_splats(
         self,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        channels: Tensor,
+        means: Array,
+        quats: Array,
+        scales: Array,
+        opacities: Array,
+        channels: Array,
         camera: Camera,
-        background: Tensor | None,
-        labels: Tensor | None,
+        background: Array | None,
+        labels: Array | None,
         settings: RasterSettings,
         stats: RasterStats | None,
     ) -> SplatImage:
         """See `Backend.rasterize_splats`."""
-        from . import autograd
+        from . import forward
 
-        return autograd.rasterize_splats(
-            means, quats, scales, opacities, channels, camera, background, labels, settings, stats
-        )
+        inputs = (means, quats, scales, opacities, channels, background)
+        plan = forward.Plan.of(camera, settings, to_array(labels))
+        if need_gradients(*inputs):
+            from . import autograd
 
-    def seen_colors(
-        self, means: Tensor, sh: Tensor, rest: Tensor | None, factor: Tensor | None, poses: ViewPoses
-    ) -> Tensor:
+            results = autograd.rasterize(inputs, plan, stats)
+        else:
+            arrays = [to_array(values) for values in inputs]
+            _, *found, radii = forward.rasterize(arrays[:5], arrays[5], plan, False)
+            results = [like(array, means) for array in found]
+            if stats is not None:
+                stats.fill(like(radii, means))
+        image, alpha, depth, ids = results
+        return SplatImage(image, alpha, depth, ids if labels is not None else None)
+
+    def seen_colors(self, means: Array, sh: Array, rest: Array | None, factor: Array | None, poses: ViewPoses) -> Array:
         """See `Backend.seen_colors`."""
-        if not all(t is None or self.suits(t) for t in (sh, rest, factor)):
-            return super().seen_colors(means, sh, rest, factor, poses)
-        from . import autograd
+        if is_tensor(means) and not all(values is None or self.suits(values) for values in (sh, rest, factor)):
+            from .. import torch_backend
 
-        return autograd.seen_colors(means, sh, rest, factor, poses)
+            return torch_backend.seen_colors(means, sh, rest, factor, poses)
+        if need_gradients(means, sh, rest, factor):
+            from . import autograd
+
+            return autograd.seen_colors(means, sh, rest, factor, poses)
+        from . import forward
+
+        sh, rest, factor = (None if given is None else like(given, means, means.dtype) for given in (sh, rest, factor))
+        colors = forward.seen_colors(to_array(means), to_array(sh), to_array(rest), to_array(factor), poses)
+        return like(colors, means)
 
     def sky(self, sh: np.ndarray, camera: Camera) -> np.ndarray:
         """See `Backend.sky`."""
@@ -85,20 +101,22 @@ class CpuBackend(Backend):
 
     def segment_weights(
         self,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
+        means: Array,
+        quats: Array,
+        scales: Array,
+        opacities: Array,
         camera: Camera,
-        segments: Tensor,
+        segments: Array,
         count: int,
         settings: RasterSettings,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `Backend.segment_weights`."""
-        from . import autograd, forward
+        from . import forward
 
-        shapes = [autograd.to_array(t) for t in (means, quats, scales, opacities)]
-        known = torch.where((segments >= 0) & (segments < count), segments, -1).to(torch.int32).contiguous().numpy()
+        shapes = [to_array(values) for values in (means, quats, scales, opacities)]
+        numbers = to_array(segments)
+        known = np.full(numbers.shape, -1, np.int32)
+        np.copyto(known, numbers, casting="unsafe", where=(numbers >= 0) & (numbers < count))
         return forward.segment_weights(shapes, camera, known, count, settings)
 
     def static_layer(self, *splats: Any, **options: Any) -> StaticLayer:
@@ -106,3 +124,6 @@ class CpuBackend(Backend):
         from .static_layer import StaticLayer
 
         return StaticLayer(*splats, **options)
+
+
+BACKEND = CpuBackend()

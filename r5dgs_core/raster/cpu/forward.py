@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...scene.cameras import Camera
+from ..backend import ViewPoses
 from ..compilation import run
 from ..settings import RasterSettings, frustum_slopes
-from . import blend, projection
+from . import blend, projection, sh_kernels
 from . import segments as cpu_segments
 from . import tiles as cpu_tiles
 
@@ -24,6 +25,7 @@ _MOST_LABEL = 1 << 24  # labels below this are exact in float32
 # Distance of log2(alpha) from a threshold below which float64 decides: several times the largest rounding error of thin
 # Gaussians at the usual dilation. The error grows with the whitening.
 _CLOSE_LOG2, _USUAL_DILATION = 2e-4, 0.3
+_NO_FACTOR = np.empty(0, np.float32)
 
 
 @dataclass(frozen=True)
@@ -210,3 +212,26 @@ def rasterize(
             last_pairs,
         )  # fmt: skip
     return state, image, alpha, depth, ids, radii[:n]
+
+
+def seen_colors(
+    means: np.ndarray, sh: np.ndarray, rest: np.ndarray | None, factor: np.ndarray | None, poses: ViewPoses
+) -> np.ndarray:
+    """Implement `shade.seen_colors`. [N, 3] float32"""
+    colors = np.empty((len(means), 3), np.float32)
+    run(sh_kernels.shade, len(means) // WORTH_A_THREAD, *shade_inputs(means, sh, rest, factor, poses), colors)
+    return colors
+
+
+def shade_inputs(
+    means: np.ndarray, sh: np.ndarray, rest: np.ndarray | None, factor: np.ndarray | None, poses: ViewPoses
+) -> tuple:
+    """Arguments of `sh_kernels.shade` and `sh_kernels.shade_backward`, in their order."""
+    constants = sh.reshape(-1)
+    if rest is None:
+        count = sh.shape[1]
+        coefficients = (constants, 3 * count, constants, 3, 3 * count, count)
+    else:
+        count = 1 + rest.shape[1]
+        coefficients = (constants, 3, rest.reshape(-1), 0, 3 * (count - 1), count)
+    return means, poses.eyes, poses.maps, poses.ids, *coefficients, _NO_FACTOR if factor is None else factor

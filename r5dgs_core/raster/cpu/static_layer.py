@@ -10,15 +10,14 @@ from __future__ import annotations
 import threading
 
 import numpy as np
-import torch
 
 from ...scene.cameras import Camera
 from .. import checks
+from ..arrays import Array, like, to_array
 from ..compilation import run
 from ..settings import RasterSettings, SplatImage
 from . import blend, forward, projection
 from . import tiles as cpu_tiles
-from .autograd import to_array
 
 _NOTHING = np.empty((0, 0), np.float32)
 
@@ -39,15 +38,15 @@ class StaticLayer:
 
     def __init__(
         self,
-        means: torch.Tensor,  # [N, 3]
-        quats: torch.Tensor,  # [N, 4]
-        scales: torch.Tensor,  # [N, 3]
-        opacities: torch.Tensor,  # [N]
-        channels: torch.Tensor,  # [N, D]
+        means: Array,  # [N, 3]
+        quats: Array,  # [N, 4]
+        scales: Array,  # [N, 3]
+        opacities: Array,  # [N]
+        channels: Array,  # [N, D]
         camera: Camera,
-        background: torch.Tensor | None = None,  # [D] or [H, W, D]
+        background: Array | None = None,  # [D] or [H, W, D]
         *,
-        labels: torch.Tensor | None = None,  # [N]
+        labels: Array | None = None,  # [N]
         ranks: np.ndarray | None = None,  # [N]
         settings: RasterSettings | None = None,
     ):
@@ -83,12 +82,12 @@ class StaticLayer:
 
     def draw(
         self,
-        means: torch.Tensor,  # [M, 3]
-        quats: torch.Tensor,  # [M, 4]
-        scales: torch.Tensor,  # [M, 3]
-        opacities: torch.Tensor,  # [M]
-        channels: torch.Tensor,  # [M, D]
-        labels: torch.Tensor | None = None,  # [M]
+        means: Array,  # [M, 3]
+        quats: Array,  # [M, 4]
+        scales: Array,  # [M, 3]
+        opacities: Array,  # [M]
+        channels: Array,  # [M, D]
+        labels: Array | None = None,  # [M]
         ranks: np.ndarray | None = None,  # [M]
     ) -> SplatImage:
         """Draw moving Gaussians into the static layer. Thread-safe; concurrent calls are serialized.
@@ -119,7 +118,7 @@ class StaticLayer:
             starts, merged = self._merge(touched, moving_starts, moving_rows)
             results = tuple(array.copy() for array in (self._image, self._alpha, self._depth, self._ids))
             self._blend(touched, starts, merged, results)
-        image, alpha, depth, ids = (torch.from_numpy(result) for result in results)
+        image, alpha, depth, ids = (like(result, means) for result in results)
         return SplatImage(image, alpha, depth, None if labels is None else ids)
 
     def _place(self, shapes, channels, numbers, ranks) -> None:

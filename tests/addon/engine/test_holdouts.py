@@ -34,8 +34,8 @@ def shares(scene, rows):
     z = pose.means @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]
     features = np.stack([held, (1 - held) * z], axis=-1)
     found = scene_renderer.render_frame(scene, pose, camera, features=features)
-    share, depth = found.features.numpy().transpose(2, 0, 1)
-    kept = found.alpha.numpy() - share
+    share, depth = found.features.transpose(2, 0, 1)
+    kept = found.alpha - share
     return share, depth / np.maximum(kept, 1e-6), kept
 
 

@@ -76,7 +76,7 @@ def pixels_of(image):
 
 
 def core_picture(scene, pose):
-    return np.clip(scene_renderer.render_frame(scene, pose, scene.cameras[0]).color.numpy(), 0, 1)
+    return np.clip(scene_renderer.render_frame(scene, pose, scene.cameras[0]).color, 0, 1)
 
 
 def psnr(a, b):

@@ -69,7 +69,7 @@ def everything(scene, matrix, number=0):
 
 
 def core_color(several, instances, camera, sky=None):
-    return incremental_renderer.Stage(several).render(instances, camera, sky=sky).color.numpy()
+    return incremental_renderer.Stage(several).render(instances, camera, sky=sky).color
 
 
 def test_two_scenes_that_are_loaded_are_both_in_the_picture(blender, picture, load, kitchen):
@@ -111,7 +111,7 @@ def test_what_bends_is_seen_bent_in_exact_mode(blender, picture, load, tmp_path)
     place_camera(blender, collection, made.cameras[0], made.world_convention)
     scene, t = scene_file.read(path), 0.2
     blender.context.scene.frame_set(int(1 + scene.frames_per_unit * t))
-    expected = scene_renderer.render_frame(scene, scene_player.frame(scene, t), scene.cameras[0]).color.numpy()
+    expected = scene_renderer.render_frame(scene, scene_player.frame(scene, t), scene.cameras[0]).color
     stiff = drawn(blender, picture)[1]["color"]
     collection.r5dgs_exact.enabled = True
     exact = drawn(blender, picture)[1]["color"]

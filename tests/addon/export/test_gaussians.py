@@ -73,7 +73,7 @@ def render(splats, scene, camera, backend="reference"):
     )  # fmt: skip
     background = sh_color.dc_to_rgb(scene.background_sh[0])
     picture = scene_renderer.render_frame(scene, posed, camera, background=background, backend=backend)
-    return np.clip(picture.color.numpy(), 0, 1)
+    return np.clip(picture.color, 0, 1)
 
 
 def psnr(a, b):
@@ -89,7 +89,7 @@ def shown(scene, collection, camera):
     ]
     background = sh_color.dc_to_rgb(scene.background_sh[0])
     pose = scene_renderer.pose_instances(scene, instances)
-    return np.clip(scene_renderer.render_frame(scene, pose, camera, background=background).color.numpy(), 0, 1)
+    return np.clip(scene_renderer.render_frame(scene, pose, camera, background=background).color, 0, 1)
 
 
 def in_blender(camera):
@@ -175,7 +175,7 @@ def test_an_unedited_scene_is_that_of_playback(blender, scene, loaded, tmp_path)
     wanted = np.clip(
         scene_renderer.render_frame(
             scene, frame, scene.cameras[0], background=sh_color.dc_to_rgb(scene.background_sh[0])
-        ).color.numpy(), 0, 1,
+        ).color, 0, 1,
     )  # fmt: skip
     assert psnr(render(splats, scene, scene.cameras[0]), wanted) > 50
 

@@ -62,15 +62,15 @@ def test_masks_and_index_of_a_range_are_the_cores(blender, scene, loaded, tmp_pa
         mask = images.read_png(folder / "object_mask" / "images" / f"frame_{frame:04d}.png")
         assert mask.dtype == np.uint8 and mask.shape[:2] == (72, 96)
         wanted = truth(scene, frame)
-        alpha = wanted.alpha.numpy()
-        ids = np.where(alpha >= 0.5, np.maximum(wanted.ids.numpy(), 0), 0)
+        alpha = wanted.alpha
+        ids = np.where(alpha >= 0.5, np.maximum(wanted.ids, 0), 0)
         assert set(np.unique(mask)) == {0, 1, 2, 3}
         assert (mask[..., 0] == ids).mean() > 0.98  # of a pixel, the cloud with the largest share against the object's
         found = channels(folder / "object_index" / f"frame_{frame:04d}.exr")
         np.testing.assert_array_equal(found["R5DGS.IndexOB.X"], mask[..., 0])
         np.testing.assert_allclose(found["R5DGS.Alpha.V"], alpha, atol=1e-3)
         solid = alpha > 0.6
-        np.testing.assert_allclose(found["R5DGS.Depth.Z"][solid], wanted.depth.numpy()[solid], rtol=1e-3)
+        np.testing.assert_allclose(found["R5DGS.Depth.Z"][solid], wanted.depth[solid], rtol=1e-3)
 
 
 def test_blender_reads_the_index_as_passes_of_a_layer(blender, loaded, tmp_path):

@@ -149,7 +149,7 @@ def picture_of(splats, scene, view):
         splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh,
         np.zeros(count, np.int32), np.eye(3)[None], np.zeros(count, np.int64), None,
     )  # fmt: skip
-    return scene_renderer.render_frame(scene, posed, view, background=None).color.numpy()
+    return scene_renderer.render_frame(scene, posed, view, background=None).color
 
 
 def psnr(a, b):

@@ -34,10 +34,7 @@ def psnr(a, b):
 
 
 def drawn(scene, views):
-    return [
-        scene_renderer.render_frame(scene, scene_player.frame(scene, view.t), view.camera).color.numpy()
-        for view in views
-    ]
+    return [scene_renderer.render_frame(scene, scene_player.frame(scene, view.t), view.camera).color for view in views]
 
 
 def test_near_scenes_keep_the_origin_of_their_world(tiny):

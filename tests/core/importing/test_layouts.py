@@ -39,9 +39,7 @@ def assert_drawn(scene, t: float, expected: Drawn, mode: str = "rigid", toleranc
 def assert_pictured(scene, t: float, cloud, expected: Drawn, background: float, mode: str = "rigid") -> None:
     """The scene's picture is the one that the rule of its layout blends."""
     camera = scene.cameras[0]
-    seen = scene_renderer.render_frame(
-        scene, scene_player.frame(scene, t, mode), camera, backend="reference"
-    ).color.numpy()
+    seen = scene_renderer.render_frame(scene, scene_player.frame(scene, t, mode), camera, backend="reference").color
     wanted = foreign.picture(cloud, expected, camera, background)
     np.testing.assert_allclose(seen, wanted, atol=2e-3)
     assert wanted.std() > 0.05

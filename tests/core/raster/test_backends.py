@@ -1,5 +1,8 @@
 """The backend of docs/developer/extending.md: one class and one line in the registry, used by all rooms."""
 
+import sys
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -14,8 +17,8 @@ from tests.support.splats import camera, splats
 
 @pytest.fixture(autouse=True)
 def points(monkeypatch):
-    module = pages.load("Rasterizer backend", "r5dgs_core.raster.points", monkeypatch)
-    monkeypatch.setattr(backends, "BACKENDS", [*backends.BACKENDS, module.PointsBackend()])
+    pages.load("Rasterizer backend", "r5dgs_core.raster.points", monkeypatch)
+    monkeypatch.setitem(backends.MODULES, "points", "points")
 
 
 def single(*args, **kwargs):
@@ -42,8 +45,8 @@ def test_a_scene_is_rendered_with_its_colours_and_sky():
         for backend in ("points", "reference")
     )
     behind = scene_renderer.sky(scene, scenes.orbit_camera(0.4))
-    empty = drawn.alpha.numpy() == 0
-    np.testing.assert_allclose(drawn.color.numpy()[empty], behind[empty], atol=1e-6)
+    empty = drawn.alpha == 0
+    np.testing.assert_allclose(drawn.color[empty], behind[empty], atol=1e-6)
     assert drawn.ids is not None and solid.ids is not None
     assert set(np.unique(drawn.ids)) <= set(scene.gaussians.object_ids) | {-1}
 
@@ -63,7 +66,8 @@ def test_a_backend_that_cannot_draw_is_passed_over_with_its_reason(monkeypatch, 
             return "no licence; remedy: buy one"
 
     backends._warn_once.cache_clear()
-    monkeypatch.setattr(backends, "BACKENDS", [Broken(), *backends.BACKENDS])
+    monkeypatch.setitem(sys.modules, "r5dgs_core.raster.broken", SimpleNamespace(BACKEND=Broken()))
+    monkeypatch.setattr(backends, "MODULES", {"broken": "broken", **backends.MODULES})
     for _ in range(2):
         assert backends.choose("auto", torch.zeros(1, 3)).name == "cpu"
     assert caplog.text.count("no licence") == 1

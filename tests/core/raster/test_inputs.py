@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.raster import RasterSettings, rasterize, rasterize_splats
+from r5dgs_core.raster import RasterSettings, RasterStats, rasterize, rasterize_splats
 from r5dgs_core.raster.cpu import projection
 from r5dgs_core.scene import cameras
 from tests.support.splats import camera, splats
@@ -244,3 +244,48 @@ def test_what_is_no_camera_and_what_are_no_settings_is_said():
         rasterize_splats(*scene, None)
     with pytest.raises(TypeError, match="settings: expected RasterSettings, got dict"):
         rasterize_splats(*scene, camera(), settings={"alpha_min": 0.1})
+
+
+# Arrays
+
+
+@pytest.mark.parametrize("backend", ["auto", *BACKENDS])
+def test_arrays_give_the_bits_of_tensors_as_arrays(backend):
+    inputs, background, labels = scene(60), torch.full((3,), 0.25), torch.arange(60)
+    found, expected = RasterStats(), RasterStats()
+    tensors = rasterize_splats(*inputs, camera(), background, labels=labels, backend=backend, stats=expected)
+    arrays = rasterize_splats(
+        *(t.numpy() for t in inputs), camera(), background.numpy(), labels=labels.numpy(), backend=backend, stats=found
+    )
+    for name in ("image", "alpha", "depth", "ids"):
+        assert type(getattr(arrays, name)) is np.ndarray
+        np.testing.assert_array_equal(getattr(arrays, name), getattr(tensors, name).numpy())
+    for name in ("visible", "radii", "grad_norm"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name).numpy())
+
+
+@pytest.mark.parametrize("backend", ["auto", *BACKENDS])
+def test_raw_parameters_may_be_arrays(backend):
+    raw, features = gaussians(9), torch.rand(10, 2)
+    arrays = SimpleNamespace(**{name: value.numpy() for name, value in vars(raw).items()})
+    expected = rasterize(raw, camera(), features, torch.full((3,), 0.5), backend=backend)
+    found = rasterize(arrays, camera(), features.numpy(), np.full(3, 0.5), backend=backend)
+    for name in ("color", "alpha", "depth", "features", "ids"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name).numpy(), atol=1e-6)
+
+
+def test_arrays_that_kernels_cannot_take_as_they_are_are_copied():
+    inputs = [t.numpy() for t in scene()]
+    expected = rasterize_splats(*inputs, camera()).image
+    frozen = [np.asfortranarray(a) for a in inputs]
+    for array in frozen:
+        array.flags.writeable = False
+    np.testing.assert_array_equal(rasterize_splats(*frozen, camera()).image, expected)
+
+
+def test_arrays_and_tensors_are_not_mixed():
+    inputs = [t.numpy() for t in scene()]
+    with pytest.raises(TypeError, match="^labels: expected an array, got Tensor; remedy: numpy.asarray"):
+        rasterize_splats(*inputs, camera(), labels=torch.arange(10))
+    with pytest.raises(ValueError, match=r"^means: expected floating-point values, got int64; .*astype\('float32'\)"):
+        rasterize_splats(*(a.astype(np.int64) for a in inputs), camera())

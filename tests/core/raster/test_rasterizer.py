@@ -21,7 +21,7 @@ from r5dgs_core.raster import (
     rasterize_splats,
     rasterizer,
 )
-from r5dgs_core.raster.cpu import autograd, blend, blend_backward, projection, tiles
+from r5dgs_core.raster.cpu import blend, blend_backward, forward, projection, tiles
 from r5dgs_core.render import warm_up
 from r5dgs_core.scene import cameras, sh_color
 from tests.support.splats import camera, draw, relative, splats
@@ -323,8 +323,8 @@ def test_the_image_may_be_changed_in_place():
 @pytest.mark.parametrize("without", [torch.no_grad, torch.inference_mode])
 def test_without_gradients_nothing_is_kept_for_them(without, monkeypatch):
     leaves, kept = [t.float().requires_grad_() for t in splats(50, 3)], []
-    original = autograd._forward
-    monkeypatch.setattr(autograd, "_forward", lambda *arguments: kept.append(original(*arguments)) or kept[-1])
+    original = forward.rasterize
+    monkeypatch.setattr(forward, "rasterize", lambda *arguments: kept.append(original(*arguments)) or kept[-1])
     with without():
         still = rasterize_splats(*leaves, camera()).image
     assert kept[0][0] is None and not still.requires_grad

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.raster import backends, compilation, rasterize, rasterizer, reference, shade
-from r5dgs_core.raster.cpu import autograd
+from r5dgs_core.raster import backends, compilation, rasterize, rasterizer, shade
+from r5dgs_core.raster.cpu import forward
 from r5dgs_core.scene import sh_color
 from r5dgs_core.scene.cameras import Camera
 from tests.support import scenes, splats
@@ -225,7 +225,7 @@ def test_degree_zero_needs_no_kernel_and_other_tensors_take_none(monkeypatch):
     def refuse(*_):
         raise AssertionError("a kernel ran")
 
-    monkeypatch.setattr(autograd, "run", refuse)
+    monkeypatch.setattr(forward, "run", refuse)
     constant, _ = draw(5, 1)
     expected = (0.5 + 0.28209479177387814 * constant["sh"][:, 0]).clamp_min(0) * constant["factor"][:, None]
     torch.testing.assert_close(shade.seen_colors(**constant, eyes=EYE), expected)
@@ -246,7 +246,7 @@ def test_the_sky_is_the_harmonics_along_each_ray(count, monkeypatch):
         assert image.shape == (camera.height, camera.width, 3) and image.dtype == np.float32
         assert count == 1 or ((image == 0).any() and (image == 1).any())
         with monkeypatch.context() as without_numba:
-            without_numba.setattr(backends, "BACKENDS", [reference.ReferenceBackend()])
+            without_numba.setattr(backends, "MODULES", {"reference": "reference"})
             np.testing.assert_allclose(image, shade.sky(sh, camera), atol=1e-6)
 
 
@@ -257,5 +257,5 @@ def test_without_numba_scenes_keep_their_colours(monkeypatch):
     scene, camera = scenes.make_scene(300, sh_degree=3), scenes.orbit_camera(0.4)
     posed = scene_renderer.pose_frame(scene, scene_player.frame(scene, 1.1))
     fused = scene_renderer.colors(posed, camera)
-    monkeypatch.setattr(backends, "BACKENDS", [reference.ReferenceBackend()])
+    monkeypatch.setattr(backends, "MODULES", {"reference": "reference"})
     np.testing.assert_allclose(scene_renderer.colors(posed, camera), fused, atol=2e-6)

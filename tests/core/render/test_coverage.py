@@ -28,7 +28,7 @@ def picture(posed):
 def test_the_shares_of_all_groups_are_alpha_in_falling_order(posed):
     groups = posed[0].gaussians.object_ids + 1
     found, parts = shares(posed, groups, 6)
-    np.testing.assert_allclose(parts.sum(-1), picture(posed).alpha.numpy(), atol=1e-5)
+    np.testing.assert_allclose(parts.sum(-1), picture(posed).alpha, atol=1e-5)
     assert (np.diff(parts, axis=-1) <= 0).all() and (found[parts == 0] == -1).all()
     assert set(np.unique(found)) - {-1} <= set(groups.tolist())
 
@@ -45,7 +45,7 @@ def test_more_groups_than_one_pass_holds_are_as_exact(posed):
     scene, _ = posed
     many = np.arange(len(scene.gaussians.means)) % (2 * coverage.CHANNELS + 3)
     found, parts = shares(posed, many, len(np.unique(many)))
-    np.testing.assert_allclose(parts.sum(-1), picture(posed).alpha.numpy(), atol=1e-5)
+    np.testing.assert_allclose(parts.sum(-1), picture(posed).alpha, atol=1e-5)
     alone = np.where(many == 17, 17, -1)
     _, part = shares(posed, alone, 1)
     np.testing.assert_allclose(np.where(found == 17, parts, 0).sum(-1), part[..., 0], atol=1e-6)

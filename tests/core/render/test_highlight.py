@@ -33,8 +33,8 @@ def rows_of(scene, object_id):
 def test_an_object_alone_is_a_scene_of_its_own_gaussians(scene, t):
     found = highlight.isolate(scene, [2], CAMERA, t, backend=BACKEND)
     alone = drawn(rows_of(scene, 2), t, None)
-    np.testing.assert_allclose(found[..., 3], alone.alpha.numpy(), atol=1e-6)
-    premultiplied = np.clip(alone.color.numpy(), 0, found[..., 3:])
+    np.testing.assert_allclose(found[..., 3], alone.alpha, atol=1e-6)
+    premultiplied = np.clip(alone.color, 0, found[..., 3:])
     np.testing.assert_allclose(found[..., :3] * found[..., 3:], premultiplied, atol=1e-5)
     assert found[..., 3].max() > 0.5 and found[..., 3].min() == 0
 
@@ -42,16 +42,16 @@ def test_an_object_alone_is_a_scene_of_its_own_gaussians(scene, t):
 def test_all_objects_together_are_the_whole_picture(scene):
     everything = [item.id for item in scene.objects]
     alone = highlight.isolate(scene, everything, CAMERA, 0.4, backend=BACKEND)
-    np.testing.assert_allclose(alone[..., 3], drawn(scene, 0.4, None).alpha.numpy(), atol=1e-6)
+    np.testing.assert_allclose(alone[..., 3], drawn(scene, 0.4, None).alpha, atol=1e-6)
     shown = highlight.highlight(scene, everything, CAMERA, 0.4, backend=BACKEND)
-    whole = np.clip(drawn(scene, 0.4, "scene").color.numpy(), 0, 1)
+    whole = np.clip(drawn(scene, 0.4, "scene").color, 0, 1)
     solid = alone[..., 3] > 0.999
     assert solid.any()
     np.testing.assert_allclose(shown[solid], whole[solid], atol=2e-3)
 
 
 def test_what_is_not_asked_for_is_gray_and_dim(scene):
-    whole = np.clip(drawn(scene, 0.4, "scene").color.numpy(), 0, 1)
+    whole = np.clip(drawn(scene, 0.4, "scene").color, 0, 1)
     nothing = highlight.highlight(scene, [], CAMERA, 0.4, backend=BACKEND)
     assert np.ptp(nothing, axis=-1).max() < 1e-6
     assert (nothing.max(axis=-1) <= highlight.DIMMED * whole.max(axis=-1) + 1e-6).all()

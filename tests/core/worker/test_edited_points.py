@@ -59,7 +59,7 @@ def test_edited_points_are_drawn_beside_untouched_rows(path, scene):
     extended, (place,) = point_edits.extend(scene, [edit])
     rows = ((100, 50, np.eye(4)), (place.start, place.count, place.matrix))
     pose = scene_renderer.pose_instances(extended, [scene_renderer.Instance(*one) for one in rows])
-    expected = scene_renderer.render_frame(scene, pose, CAMERA, background=None).color.numpy()
+    expected = scene_renderer.render_frame(scene, pose, CAMERA, background=None).color
     *_, (header, arrays) = talk(load(path), points("a", a=edit), picture(whole, entry("a")))
     assert header["ok"], header
     assert header["result"]["gaussians"] == 85 and set(np.unique(arrays["owners"])) == {-1, 0, 1}
