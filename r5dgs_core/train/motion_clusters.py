@@ -209,9 +209,10 @@ def _attached(
 ) -> np.ndarray:
     """Return the labels, extended to points near a part that move with it. [R]"""
     labels = labels.copy()
-    open_rows, features = np.flatnonzero(labels < 0), _features(paths)
+    open_rows = np.flatnonzero(labels < 0)
     if len(open_rows) == 0 or not motions:
         return labels
+    features = _features(paths)
     best = np.full(len(open_rows), np.inf)
     for k, motion in enumerate(motions):
         if motion is None:

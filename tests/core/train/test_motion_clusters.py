@@ -85,6 +85,11 @@ def test_the_fit_is_the_motion_of_a_rigid_body(seed, count):
     np.testing.assert_allclose(motion.rotmats[4], np.eye(3), atol=1e-9)
 
 
+def test_without_moving_points_no_labels_are_extended():
+    found = motion_clusters.attach(np.zeros((0, 5, 3)), np.zeros(0), 0.01, np.zeros(0, np.int64))
+    assert found.shape == (0,)
+
+
 def test_points_that_were_not_asked_about_join_the_part_that_they_move_with():
     rng = np.random.default_rng(5)
     paths, truth = scene(rng, 0.01)
