@@ -11,7 +11,7 @@ from ..color import tints
 from ..motion import rotations
 from ..playback import affine_transform, posing
 from ..scene.scene import Scene
-from .edited_motion import Cluster
+from .piece_clusters import Cluster
 
 TOLERANCE = 1e-5  # smallest displacement that counts, relative to the scene's extent
 

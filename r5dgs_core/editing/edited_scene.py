@@ -14,8 +14,9 @@ import numpy as np
 from ..playback import group_dynamics
 from ..scene.lookup_table import Table
 from ..scene.scene import MotionGroup, Scene, SceneObject
-from . import edited_gaussians, edited_motion
-from .edited_motion import Moved, Piece
+from . import edited_gaussians, edited_motion, piece_clusters
+from .edited_motion import Moved
+from .piece_clusters import Piece
 
 __all__ = ("Piece", "edit")
 
@@ -43,7 +44,7 @@ def edit(
     for piece in pieces:
         if not 0 <= piece.start <= piece.start + piece.count <= len(scene.gaussians.means):
             raise ValueError(f"{piece.name}: its rows leave the scene's {len(scene.gaussians.means)} Gaussians")
-    clusters = edited_motion.move(scene, edited_motion.clusters(scene, pieces, notes), times, notes)
+    clusters = edited_motion.move(scene, piece_clusters.clusters(scene, pieces, notes), times, notes)
     kept, arrays, untouched = edited_gaussians.gather(scene, clusters)
     objects = _objects(scene, table, arrays["object_ids"])
     groups = _groups(clusters, scene, objects, kept, arrays["motion_ids"])

@@ -38,14 +38,7 @@ def check(
     count = _gaussians(shapes)
     knots, strays = (_length(shapes, name, rank=1) for name in ("track_times", "residual_rows"))
     classes = _number(guard, lambda: sum(item.id >= 0 for item in objects))
-    bases: dict[str, int] = {}
-    for name, rank in (("sh", 3), ("background_sh", 2)):
-        with guard():
-            shape = shapes[name]
-            if shape is not findings.UNREAD and (len(shape) != rank or shape[-2] not in SH_BASES):
-                wanted = f"({count}, K, 3)" if name == "sh" else "(K, 3)"
-                fail(place, name, f"{wanted} with K one of {SH_BASES}", shape)
-            bases[name] = shape[-2]
+    bases = _bases(shapes, count, place, guard)
     expected: dict[str, _Shape] = {
         "means": (count, 3),
         "quats": (count, 4),
@@ -76,6 +69,21 @@ def check(
     sound = _fitting({name: known[name] for name in expected if name in known}, expected, place, guard)
     words = _number(guard, lambda: len(vocabulary))
     return sound | check_meanings(shapes, _number(guard, lambda: len(objects)), words, table, place, guard)
+
+
+def _bases(
+    shapes: Mapping[str, tuple[int, ...]], count: int | None, place: str, guard: findings.Guard
+) -> dict[str, int]:
+    """Number of bases of each array of harmonics whose shape is sound."""
+    bases: dict[str, int] = {}
+    for name, rank in (("sh", 3), ("background_sh", 2)):
+        with guard():
+            shape = shapes[name]
+            if shape is not findings.UNREAD and (len(shape) != rank or shape[-2] not in SH_BASES):
+                wanted = f"({count}, K, 3)" if name == "sh" else "(K, 3)"
+                fail(place, name, f"{wanted} with K one of {SH_BASES}", shape)
+            bases[name] = shape[-2]
+    return bases
 
 
 def check_meanings(
