@@ -273,12 +273,13 @@ def _check_objects(scene: Scene, place: str, guard: findings.Guard) -> None:
 
 
 def _check_ranges(scene: Scene, place: str, guard: findings.Guard) -> None:
+    count = len(scene.gaussians.object_ids)
     position = findings.UNREAD if scene.objects is findings.UNREAD else 0
     for item in _listed(scene.objects):
         start, position = position, findings.UNREAD
         with guard():
             position = item.start + item.count
-            if item.start != start or item.count < 0 or position > len(scene.gaussians.object_ids):
+            if item.start != start or item.count < 0 or position > count:
                 _fail(place, f"object {item.name!r}", f"a range that starts at {start}", f"{item.start} + {item.count}")
         with guard():
             rows = scene.gaussians.object_ids[item.start : item.start + item.count]
@@ -286,13 +287,8 @@ def _check_ranges(scene: Scene, place: str, guard: findings.Guard) -> None:
                 found = sorted(set(rows.tolist()))[:5]
                 _fail(place, f"object {item.name!r}", f"object_ids {item.id} in its range", found)
     with guard():
-        if position != len(scene.gaussians.object_ids):
-            _fail(
-                place,
-                "objects",
-                f"ranges that cover {len(scene.gaussians.object_ids)} Gaussians",
-                f"{position} covered",
-            )
+        if position != count:
+            _fail(place, "objects", f"ranges that cover {count} Gaussians", f"{position} covered")
 
 
 def _check_group(
