@@ -273,7 +273,7 @@ def _check_objects(scene: Scene, place: str, guard: findings.Guard) -> None:
 
 
 def _check_ranges(scene: Scene, place: str, guard: findings.Guard) -> None:
-    count = len(scene.gaussians.object_ids)
+    count = findings.attempt(guard, lambda: len(scene.gaussians.object_ids))
     position = findings.UNREAD if scene.objects is findings.UNREAD else 0
     for item in _listed(scene.objects):
         start, position = position, findings.UNREAD

@@ -16,7 +16,7 @@ from r5dgs_core.check import codes, data
 from r5dgs_core.cli import main
 from r5dgs_core.data import images
 from r5dgs_core.motion import models
-from r5dgs_core.scene import scene_file
+from r5dgs_core.scene import scene_file, validation
 from tests.core.data.test_dataset import HEIGHT, WIDTH, camera_matrix, write_flat
 from tests.support import colmap_files, scenes
 
@@ -664,3 +664,12 @@ def test_all_faults_of_a_scene_are_listed(tmp_path, monkeypatch):
         assert any(finding.problem.startswith(part) for finding in found), part
     with pytest.raises(errors.SceneFileError, match="means"):
         scene_file.read(path)
+
+
+def test_a_scene_with_unread_object_ids_is_checked_to_its_end():
+    scene = scenes.make_scene()
+    unread = dataclasses.replace(scene.gaussians, object_ids=findings.UNREAD)
+    collect = findings.Collector(check.CODES, "S01")
+    collect.add("S01", "x.r5dgs: object_ids: damaged")
+    validation.check(dataclasses.replace(scene, gaussians=unread, frames_per_unit=0.0), "x.r5dgs", collect)
+    assert [found.problem.split()[0] for found in collect.findings] == ["object_ids:", "frames_per_unit:"]
