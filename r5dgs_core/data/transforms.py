@@ -33,6 +33,7 @@ class Entry:
         camera: Name of the camera, "" if the file gives none.
         lens: Keys about intrinsics that apply to this frame.
         frame: Frame number, or None.
+        lens_place: File or frame that ``lens`` comes from, for errors; ``place`` if empty.
     """
 
     place: str
@@ -42,6 +43,7 @@ class Entry:
     camera: str
     lens: dict[str, float]
     frame: float | None
+    lens_place: str = ""
 
     def moved(self, shift: np.ndarray) -> Entry:
         """Translate the frame's camera by a vector [3]."""
@@ -95,7 +97,7 @@ def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
     Returns:
         Camera matrix in pixels. [3, 3]
     """
-    lens = entry.lens
+    lens, place = entry.lens, entry.lens_place or entry.place
     declared = lens.get("w", width), lens.get("h", height)
     scale = np.array([width / declared[0], height / declared[1]])
     if abs(scale[0] - scale[1]) * max(declared) > 1.5:
@@ -105,7 +107,7 @@ def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
     distorted = [key for key in _DISTORTION if abs(lens.get(key, 0.0)) > 1e-9]
     if distorted:
         raise errors.DatasetError(
-            f"{entry.place}: lens distortion ({', '.join(distorted)}) is not supported; undistort the images first",
+            f"{place}: lens distortion ({', '.join(distorted)}) is not supported; undistort the images first",
             code="D08",
         )
     if "fl_x" in lens or "fl_y" in lens:
@@ -114,17 +116,15 @@ def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
     elif "camera_angle_x" in lens or "camera_angle_y" in lens:
         for key in ("camera_angle_x", "camera_angle_y"):
             if key in lens and not 0.0 < lens[key] < math.pi:
-                raise errors.DatasetError(
-                    f"{entry.place}: '{key}' is {lens[key]:g}, expected radians in (0, pi)", code="D08"
-                )
+                raise errors.DatasetError(f"{place}: '{key}' is {lens[key]:g}, expected radians in (0, pi)", code="D08")
         focal_x = 0.5 * width / math.tan(0.5 * lens["camera_angle_x"]) if "camera_angle_x" in lens else 0.0
         focal_y = 0.5 * height / math.tan(0.5 * lens["camera_angle_y"]) if "camera_angle_y" in lens else focal_x
         focal_x = focal_x or focal_y
     else:
-        raise errors.DatasetError(f"{entry.place}: expected 'camera_angle_x' or 'fl_x', found neither", code="D08")
+        raise errors.DatasetError(f"{place}: expected 'camera_angle_x' or 'fl_x', found neither", code="D08")
     if not (focal_x > 0 and focal_y > 0):
         raise errors.DatasetError(
-            f"{entry.place}: the focal length must be positive, found {focal_x:g}, {focal_y:g}", code="D08"
+            f"{place}: the focal length must be positive, found {focal_x:g}, {focal_y:g}", code="D08"
         )
     cx = lens["cx"] * scale[0] if "cx" in lens else 0.5 * width
     cy = lens["cy"] * scale[1] if "cy" in lens else 0.5 * height
@@ -152,24 +152,26 @@ def _read_frames(
     for i, frame in enumerate(frames):
         with guard():
             t = i / max(len(frames) - 1, 1)
-            entries.append(_read_frame(f"{place}: frame {i}", frame, common, shared_matrix, camera, t))
+            entries.append(_read_frame(place, i, frame, common, shared_matrix, camera, t))
     return entries
 
 
-def _read_frame(at: str, frame: Any, common: dict, shared_matrix: Any, camera: str, t: float) -> Entry:
-    """Read one frame; ``t`` is its time if it gives none."""
+def _read_frame(place: str, i: int, frame: Any, common: dict, shared_matrix: Any, camera: str, t: float) -> Entry:
+    """Read frame ``i``; ``t`` is its time if it gives none."""
+    at = f"{place}: frame {i}"
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
         raise errors.DatasetError(f"{at}: expected an object with a 'file_path'", code="D03")
     at = f"{at} ({frame['file_path']})"
     lens = {
-        key: finite(at, key, value)
-        for source in (common, frame)
+        key: finite(where, key, value)
+        for where, source in ((place, common), (at, frame))
         for key, value in _lens_keys(source).items()
         if value is not None
     }
+    lens_place = at if _lens_keys(frame) else place
     for key in ("w", "h"):
         if key in lens and lens[key] <= 0:
-            raise errors.DatasetError(f"{at}: '{key}' must be positive, found {lens[key]:g}", code="D08")
+            raise errors.DatasetError(f"{lens_place}: '{key}' must be positive, found {lens[key]:g}", code="D08")
     number = frame.get("frame")
     numbered = isinstance(number, (int, float)) and not isinstance(number, bool)
     return Entry(
@@ -179,6 +181,7 @@ def _read_frame(at: str, frame: Any, common: dict, shared_matrix: Any, camera: s
         matrix=rigid_matrix(at, frame.get("transform_matrix", shared_matrix)),
         camera=str(frame.get("view", frame.get("camera", camera))),
         lens=lens,
+        lens_place=lens_place,
         frame=finite(at, "frame", number) if numbered else None,
     )
 

@@ -673,3 +673,15 @@ def test_a_scene_with_unread_object_ids_is_checked_to_its_end():
     collect.add("S01", "x.r5dgs: object_ids: damaged")
     validation.check(dataclasses.replace(scene, gaussians=unread, frames_per_unit=0.0), "x.r5dgs", collect)
     assert [found.problem.split()[0] for found in collect.findings] == ["object_ids:", "frames_per_unit:"]
+
+
+@pytest.mark.parametrize(
+    "fault", [{"fl_x": -3}, {"camera_angle_x": 5}, {"w": "wide"}, {"h": 0}, {"k1": 0.1}], ids=lambda fault: [*fault][0]
+)
+def test_a_fault_of_a_whole_camera_file_is_listed_once(tiny, tmp_path, fault):
+    root = tmp_path / "data"
+    shutil.copytree(tiny.root, root)
+    path = root / "transforms_train.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **fault}))
+    (found,) = [finding for finding in check.check(root) if finding.severity == findings.ERROR]
+    assert found.place == str(path) and "frame " not in found.problem
