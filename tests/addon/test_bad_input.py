@@ -149,7 +149,7 @@ def test_bad_input_says_what_to_do_and_changes_nothing(saved, bad, kind):
 
 WITHOUT_A_SCENE = {
     "Load an R5DGS scene first": (
-        "add_alias", "allow_scene_file", "exact_mode", "export_masks", "export_ply", "export_scene",
+        "add_alias", "allow_scene_file", "exact_mode", "export_format", "export_masks", "export_ply", "export_scene",
         "extrapolate_until", "fit_timeline", "isolate", "preview", "remove_alias",
         "rename_object", "select_by_prompt", "select_object", "set_display",
         "show_confidence",
