@@ -56,14 +56,7 @@ def measure(
         absent.append(f"images with true poses: {why}")
     else:
         moves[ORACLE] = oracle
-    plans = {}
-    for split in splits:
-        past = any(view.t > scene.t_max for view in dataset.views(split))
-        plans[split] = moves if past else {k: m for k, m in moves.items() if k in ("rigid", ORACLE)}
-        if not dataset.views(split):
-            absent.append(f"images of {split}: the data set has none")
-        elif not past and len(moves) > len(plans[split]):
-            absent.append(f"images of {split} in other modes than rigid: up to t_max all are the same")
+    plans = _plans(scene, dataset, splits, moves, absent)
     total = sum(len(dataset.views(split)) * len(plan) for split, plan in plans.items())
     done = 0
 
@@ -88,11 +81,9 @@ def measure(
             else:
                 times = {"ms_motion": motion[mode].ms(clock), "ms_raster": raster[mode].ms(clock)}
                 times |= (motion[mode] + raster[mode]).columns(clock)
-            for kind in KINDS:
-                if found[kind] is None:
-                    missing[kind] = None
-                    continue
-                row = Row(
+            missing |= dict.fromkeys(kind for kind in KINDS if found[kind] is None)
+            rows += [
+                Row(
                     task="images",
                     setting=split,
                     error_kind=kind if number == 0 else f"{kind}@{split}",
@@ -101,10 +92,27 @@ def measure(
                     **label,
                     **times,
                 )
-                rows.append(row)
+                for kind in KINDS
+                if found[kind] is not None
+            ]
     if missing:
         absent.append(f"images: not computed: {', '.join(missing)} (docs/reference/evaluation.md says what each needs)")
     return rows, absent
+
+
+def _plans(
+    scene: Scene, dataset: Dataset, splits: Sequence[str], moves: dict[str, Move], absent: list[str]
+) -> dict[str, dict[str, Move]]:
+    """Return the moves to measure in each split, and append the reasons for missing ones to ``absent``."""
+    plans = {}
+    for split in splits:
+        past = any(view.t > scene.t_max for view in dataset.views(split))
+        plans[split] = moves if past else {k: m for k, m in moves.items() if k in ("rigid", ORACLE)}
+        if not dataset.views(split):
+            absent.append(f"images of {split}: the data set has none")
+        elif not past and len(moves) > len(plans[split]):
+            absent.append(f"images of {split} in other modes than rigid: up to t_max all are the same")
+    return plans
 
 
 def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[Move | None, str]:

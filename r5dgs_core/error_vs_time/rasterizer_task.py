@@ -51,17 +51,14 @@ def measure(
     """
     absent, player = [], scene_player.Player(scene)
     shots: list[tuple[Camera, float]] = [(view.camera, view.t) for view in views]
-    if not shots:
-        shots = [(camera, scene.t_max) for camera in scene.cameras]
+    shots = shots or [(camera, scene.t_max) for camera in scene.cameras]
     if not shots:
         return [], ["raster: neither the scene nor a data set gives a camera"]
     kept = np.unique(np.linspace(0, len(shots) - 1, min(VIEWS, len(shots))).round().astype(int)).tolist()
     shots = [shots[i] for i in kept]
     frames = [player.frame(t) for _, t in shots]
-    if views:
-        truths = [datasets.load_image(views[i], evaluate.truth_background(scene)) for i in kept]
-    else:
-        truths = []
+    truths = [datasets.load_image(views[i], evaluate.truth_background(scene)) for i in kept] if views else []
+    if not views:
         absent.append("raster: PSNR against true images needs a data set")
     used = backends.choose(backend, scene.gaussians.means).name
     base = RasterSettings(near_plane=scene.near_plane)

@@ -100,16 +100,8 @@ def draw(
     height = top + len(rows) * panel * aspect + bottom
     figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(
-        len(rows),
-        len(views),
-        left=left / width,
-        right=1 - 0.1 / width,
-        top=1 - top / height,
-        bottom=bottom / height,
-        wspace=0.03,
-        hspace=0.03,
-    )
+    edges = {"left": left / width, "right": 1 - 0.1 / width, "top": 1 - top / height, "bottom": bottom / height}
+    grid = figure.add_gridspec(len(rows), len(views), **edges, wspace=0.03, hspace=0.03)
     figure.suptitle(f"{scene.name}: observed until t_max = {scene.t_max:.3f}", fontsize=12, y=1 - 0.2 / height)
     for column, (view, shown, truth, mask) in enumerate(zip(views, renderings, truths, masks, strict=True)):
         difference = np.clip(GAIN * np.abs(shown.color - truth), 0, 1)
@@ -125,20 +117,29 @@ def draw(
             if column == 0:
                 axes.set_ylabel(rows[row], fontsize=11)
             if row == 0:
-                future = is_later(scene, view.t)
-                when = f"t = {view.t:.3f}, past t_max" if future else f"t = {view.t:.3f}, observed"
-                score = metrics.psnr(shown.color, truth)
-                title = f"{when}\n{view.name} ({view.camera.name}), {score:.1f} dB"
-                axes.set_title(title, fontsize=9, color="#a03000" if future else "black")
-    handles = [Patch(facecolor=item.color, edgecolor="0.3", label=item.name) for item in scene.objects if item.id > 0]
-    handles.append(Patch(facecolor=BACKGROUND_COLOR, edgecolor="0.3", label="background"))
-    handles.append(Patch(facecolor="white", edgecolor="0.3", label="true outline"))
+                title, color = _title(scene, view, metrics.psnr(shown.color, truth))
+                axes.set_title(title, fontsize=9, color=color)
+    handles = _legend_handles(scene)
     per_row = max(2, int(width / 1.25))
     figure.legend(handles=handles, loc="lower center", ncols=min(per_row, len(handles)), fontsize=9, frameon=False)
     buffer = io.BytesIO()
     canvas.print_rgba(buffer)
     w, h = canvas.get_width_height()
     return np.frombuffer(buffer.getvalue(), np.uint8).reshape(h, w, 4)[..., :3].copy()
+
+
+def _title(scene: Scene, view: datasets.View, psnr: float) -> tuple[str, str]:
+    """Return the title of a column, and its color."""
+    future = is_later(scene, view.t)
+    when = f"t = {view.t:.3f}, past t_max" if future else f"t = {view.t:.3f}, observed"
+    return f"{when}\n{view.name} ({view.camera.name}), {psnr:.1f} dB", "#a03000" if future else "black"
+
+
+def _legend_handles(scene: Scene) -> list[Patch]:
+    handles = [Patch(facecolor=item.color, edgecolor="0.3", label=item.name) for item in scene.objects if item.id > 0]
+    handles.append(Patch(facecolor=BACKGROUND_COLOR, edgecolor="0.3", label="background"))
+    handles.append(Patch(facecolor="white", edgecolor="0.3", label="true outline"))
+    return handles
 
 
 def color_ids(scene: Scene, ids: np.ndarray) -> np.ndarray:

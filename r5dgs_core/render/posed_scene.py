@@ -165,12 +165,8 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
         scene_player.move_points(given.means[part], linear, offset, means[to])
         affine_transform.map_shapes(linear, given.quats[part], given.log_scales[part], quats[to], log_scales[to])
         light = given.lights[instance.scene]
-        world = None if instance.world is None else affine(instance.world, index)[0]
-        rotation = np.eye(3) if light is None else affine_transform.nearest_rotation(linear)
-        if light is not None and world is not None:
-            rotation = affine_transform.nearest_rotation(world).T @ rotation
-        shading[to] = _shading(given, part, rotation, light)
-        pose_ids[to] = poses
+        rotation = _rotation(instance, index, linear, light)
+        shading[to], pose_ids[to] = _shading(given, part, rotation, light), poses
         maps = np.linalg.inv(linear)[None]
         bent = _bent(given, instance, part)
         if bent is not None:
@@ -199,6 +195,15 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
         shading_factor=shading if given.shading is not None else None,
         tints=None if all(one.tint is None for one in instances) else np.concatenate(tints).astype(np.float32),
     )
+
+
+def _rotation(instance: Instance, index: int, linear: np.ndarray, light: np.ndarray | None) -> np.ndarray:
+    """Rotation of an instance relative to its scene's world, for shading; the identity without a light. [3, 3]"""
+    world = None if instance.world is None else affine(instance.world, index)[0]
+    if light is None:
+        return np.eye(3)
+    rotation = affine_transform.nearest_rotation(linear)
+    return rotation if world is None else affine_transform.nearest_rotation(world).T @ rotation
 
 
 @dataclass(frozen=True)
