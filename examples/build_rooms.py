@@ -78,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Build, and do what the arguments ask for."""
+    """Build a scene, and save or capture it."""
     chosen = _parser().parse_args(arguments)
     rooms.SCENES[chosen.scene]()
     if chosen.threads > 0:

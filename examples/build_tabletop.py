@@ -72,7 +72,7 @@ def tabletop_settings(capture: ModuleType, directory: Path):
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Build, and do what the arguments ask for."""
+    """Build the scene, and save or capture it."""
     chosen = stage.parser("build_tabletop.py", __doc__.split("\n", 1)[0]).parse_args(arguments)
     build_tabletop()
     if chosen.blend is not None:

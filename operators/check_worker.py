@@ -13,7 +13,7 @@ KEY = "check"
 
 
 class R5DGS_OT_check_worker(worker_operator.Waiting, bpy.types.Operator):
-    """Restart the worker and report its versions, device and speed; the first test compiles the rasterizer (10 s)"""
+    """Restart the worker and report versions, device and speed; the first test compiles the rasterizer (10 to 30 s)"""
 
     bl_idname = "r5dgs.check_worker"
     bl_label = "Test Worker"

@@ -35,7 +35,7 @@ class R5DGS_OT_exact_mode(polls.NeedsScene, bpy.types.Operator):
         collection = loaded_scenes.active_collection(context)
         if self.action == "OFF" or (self.action == "TOGGLE" and collection.r5dgs_exact.enabled):
             exact_mode.switch_off(context, collection)
-            self.report({"INFO"}, f"{collection.name}: objects move as wholes")
+            self.report({"INFO"}, f"{collection.name}: objects move rigidly")
             return {"FINISHED"}
         try:
             count = exact_mode.switch_on(context, collection)

@@ -115,14 +115,17 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             {"INFO"}, f"{path.name}: {plural.of(len(scene.gaussians.means), 'Gaussian')}, {plural.of(named, 'object')}"
         )
         if named == 0:
-            self.report({"WARNING"}, f"{path.name} holds no objects, only a background; to get some, train with masks")
+            self.report(
+                {"WARNING"}, f"{path.name} contains only a background, no objects; train with masks to get objects"
+            )
         too_fast = physics.too_fast(loaded_scenes.members(collection, "ANCHOR"))
         if too_fast:
             self.report({"WARNING"}, too_fast)
         if scene.residuals is not None:  # anchors only hold one transform per group
             count = len(scene.residuals.rows)
             self.report(
-                {"WARNING"}, f"{plural.of(count, 'Gaussian', 'bend')} while observed; here groups move as wholes"
+                {"WARNING"},
+                f"{plural.of(count, 'Gaussian', 'deform')} in the observed time; shown rigid, unless Exact Mode is on",
             )
         return {"FINISHED"}
 

@@ -34,8 +34,8 @@ def poses(scene: Scene, t: float, mode: str = "rigid") -> dict[str, np.ndarray]:
         mode: Playback mode past t_max.
 
     Returns:
-        By name of the object, a matrix that maps positions at t_max to positions at ``t``, world; that of its first
-        rigid body, the identity for objects at rest. [4, 4] float64
+        Matrix of each object by its name, which maps world positions at t_max to those at ``t``: the pose of the
+        object's first rigid body, or the identity for objects at rest. [4, 4] float64
     """
     quats, displacements = Player(scene, mode).group_poses(t)
     bodies = {group.object_id: group for group in reversed(scene.groups) if group.role == "body"}

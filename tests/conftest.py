@@ -53,7 +53,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_report_header(config: pytest.Config) -> str:
-    """Say beside the platform whether Blender's tests can run, and if not, why."""
+    """Report if Blender tests can run."""
     if importlib.util.find_spec("bpy") is not None:
         try:
             return f"blender: bpy {importlib.metadata.version('bpy')}"

@@ -23,9 +23,9 @@ from tests.support import scenes
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Which rooms of the core a room may import, itself and `GROUND` aside, lower rooms first.
-# All rooms may import `GROUND`.
+# Modules without dependencies in the core; every room may import them.
 GROUND = {"atomic_files", "errors", "extras", "findings", "folder_lock", "input_paths", "strict_json", "time_left"}
+# Rooms of the core that a room may import besides itself and `GROUND`, lower rooms first.
 ALLOWED = {
     "atomic_files": set(),
     "errors": set(),
@@ -536,7 +536,7 @@ def test_a_scene_is_drawn_without_torch_to_the_same_bits(tmp_path, degree):
     assert np.array_equal(np.load(tmp_path / "picture.npy"), expected)
 
 
-def test_the_block_is_a_block(tmp_path):
+def test_blocked_modules_cannot_be_imported(tmp_path):
     with pytest.raises(AssertionError, match="torch is blocked"):
         run_blocked("import torch", HEAVY, tmp_path)
 

@@ -1,1 +1,1 @@
-"""What the scene builders of this folder share: materials, shapes, toys, motion by laws, and the capture of a scene."""
+"""Shared modules of the scene builders: materials, shapes, toys, laws of motion, and the capture of a scene."""

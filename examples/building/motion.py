@@ -1,4 +1,4 @@
-"""Motion by laws that can be written down, keyed at every frame.
+"""Motion by closed-form laws, keyed at every frame.
 
 Scenes last from t = 0 to t = 1. Laws are smooth over all of it, so that what happens after the last observed time
 follows from what was seen before. Lengths are scene units, speeds units per unit of time, angles degrees.
@@ -42,7 +42,7 @@ def perform(actors: Sequence[Actor]) -> None:
 
 
 def animate(ob: bpy.types.Object, law: Law) -> None:
-    """Key the law's pose at every frame of t in [0, 1]; of q and -q the one that is nearer to the frame before."""
+    """Key the law's pose at every frame of t in [0, 1]; of q and -q, the one nearer to the previous frame."""
     ob.rotation_mode = "QUATERNION"
     before = law(0.0)[1]
     for step in range(FRAMES_PER_UNIT + 1):

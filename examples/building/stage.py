@@ -1,4 +1,4 @@
-"""The stage of a scene: an empty file with its light, the capture of what was built, and the scripts' command line."""
+"""Setup of a scene: an empty file with lights, its capture, and the scripts' command line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from . import motion
 
 
 def new(sky: Sequence[float], sky_strength: float) -> None:
-    """Empty the file; a constant sky, the timeline, and Cycles set for matte surfaces."""
+    """Empty the file, and set up a constant sky, the timeline, and Cycles for matte surfaces."""
     bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = motion.FIRST_FRAME, motion.FIRST_FRAME + motion.FRAMES_PER_UNIT
@@ -102,7 +102,7 @@ def capture(service: ModuleType, settings) -> None:
 
 
 def parser(prog: str, description: str) -> argparse.ArgumentParser:
-    """A parser with the arguments that all builders have."""
+    """Return a parser with the arguments of all builders."""
     built = argparse.ArgumentParser(prog=prog, description=description)
     built.add_argument("--blend", type=Path, help="save the scene here")
     built.add_argument("--dataset", type=Path, help="capture the scene into this new folder")
@@ -110,7 +110,7 @@ def parser(prog: str, description: str) -> argparse.ArgumentParser:
 
 
 def arguments() -> list[str]:
-    """What a script was given, be it run by the bpy module or by Blender, where its own follow ``--``."""
+    """Return the arguments of the script, which follow ``--`` if Blender runs it."""
     if "--" in sys.argv:
         return sys.argv[sys.argv.index("--") + 1 :]
     return sys.argv[1:] if bpy.app.binary_path == "" else []

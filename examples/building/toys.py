@@ -1,4 +1,4 @@
-"""Toys: things that move, each with its own colours. The foot of a toy is on z = 0 unless it says otherwise."""
+"""Toys: movable objects of different colours, with their foot at z = 0 unless stated otherwise."""
 
 from __future__ import annotations
 

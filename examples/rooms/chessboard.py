@@ -15,7 +15,7 @@ from . import room
 SQUARE = 0.32
 BOARD_TOP = 0.6
 GAP = 0.004
-"""What stands on the board is this much above it, so that no two surfaces coincide."""
+"""Gap between a piece and the board, so that no two surfaces coincide."""
 
 
 def build() -> list[Actor]:
@@ -78,7 +78,7 @@ def _wood() -> tuple[list[bpy.types.Material], list[bpy.types.Material]]:
 
 
 def _turned(name: str, profile: Sequence[tuple[float, float]], skins: list[bpy.types.Material], rows: Sequence[int]):
-    """A turned piece on a common foot, with the given rows of faces inlaid over three eighths of the way around."""
+    """A turned piece on a common foot; the given rows of faces are inlaid over three eighths of the circumference."""
     foot = [(0.0, 0.0), (0.15, 0.0), (0.16, 0.03), (0.15, 0.07), (0.12, 0.09)]
     return shapes.lathe(name, [*foot, *profile], skins, lambda row, k: int(row in (2, *rows) and k % 24 < 9))
 
@@ -186,7 +186,7 @@ def _pawn(name: str, skins: list[bpy.types.Material]) -> bpy.types.Object:
 
 
 def _toppling(name: str, skins: list[bpy.types.Material]) -> bpy.types.Object:
-    """A pawn hung from the edge of its foot that is towards +x, so that it can tip over that edge."""
+    """A pawn with its origin at the edge of its foot towards +x, so that it can tip over that edge."""
     root = shapes.empty(name)
     pawn = _pawn(f"{name} body", skins)
     pawn.parent, pawn.location = root, (-0.15, 0, 0)

@@ -13,7 +13,7 @@ from . import room
 
 BENCH_TOP = 0.72
 GAP = 0.004
-"""What rests on something is this much above it, so that no two surfaces coincide."""
+"""Gap between an object and its support, so that no two surfaces coincide."""
 
 
 def build() -> list[Actor]:

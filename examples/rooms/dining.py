@@ -12,7 +12,7 @@ from . import room
 
 TABLE_TOP = 0.74
 GAP = 0.004
-"""What rests on something is this much above it, so that no two surfaces coincide."""
+"""Gap between an object and its support, so that no two surfaces coincide."""
 
 
 def build() -> list[Actor]:

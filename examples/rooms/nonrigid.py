@@ -84,7 +84,7 @@ def _flag(name: str, width: float = 1.25, height: float = 0.8) -> bpy.types.Obje
 
 
 def _balloon(name: str, radius: float) -> bpy.types.Object:
-    """A ball about its origin that breathes: across by a fifth, and less in height, a quarter of a breath later."""
+    """A ball about its origin that breathes: by a fifth in width, and less in height, a quarter of a period later."""
     patches = materials.speckled("balloon", (0.62, 0.10, 0.30), (0.80, 0.62, 0.20), 3.0, sharp=0.9)
     cap = materials.plain("balloon cap", (0.08, 0.10, 0.30))
     ob = shapes.ball(name, radius, [patches, cap], lambda row, k: int(row < 3 or row > 21))

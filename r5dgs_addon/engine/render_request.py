@@ -124,7 +124,7 @@ def scene_path(collection: bpy.types.Collection) -> Path:
         return found.path
     if found.asked is not None:
         raise errors.SceneFileError(
-            f"{found.asked}: not read, as it lies neither beside nor below the .blend that names it; "
+            f"{found.asked}: not read, because it is outside the folder of the .blend that uses it; "
             "press Allow in the panel Scene of the R5DGS tab, or add its folder to 'Trusted Folders' in the add-on's "
             f"preferences or to the environment variable {trust.ENVIRONMENT}"
         )

@@ -120,7 +120,7 @@ def edited_steps(
         for number, t in enumerate(when):
             yield Step(number, total, f"frame {times.frame(t):.4g}")
             _look(context, collection, members, times.frame(float(t)), bind=number == len(source.tracks.times) - 1)
-    yield Step(len(when), total, "fitting motion to what was edited", slow=True)
+    yield Step(len(when), total, "fitting the edited motion", slow=True)
     changed = [member for member in members if member.points.edit is not None]
     extended, places = point_edits.extend(source, [member.points.edit.points for member in changed])
     placed = {id(member): place for member, place in zip(changed, places, strict=True)}
@@ -130,8 +130,8 @@ def edited_steps(
     lost = _moving_before(members, before, TOLERANCE * source.extent, source.extent)
     if lost:
         notes.append(
-            f"{', '.join(lost)}: what moves before frame {times.frame(times.t_start):.4g}, the first observed time, is "
-            "not in the file; move those keys behind it"
+            f"{', '.join(lost)}: motion before frame {times.frame(times.t_start):.4g}, the first observed time, is not "
+            "exported; move those keys after it"
         )
     if not _rests(collection):
         notes.append("The root was moved; positions in the file are relative to the root")

@@ -237,7 +237,7 @@ def source(anchors: list[bpy.types.Object], path: Path) -> Scene:
     """
     for anchor in anchors:
         if curve_place.find(anchor).strip is not None:
-            raise errors.ConfigError(f"{anchor.name}: its action lies in the NLA; make it active again first")
+            raise errors.ConfigError(f"{anchor.name}: its action is in the NLA; make it active again first")
     scene = scene_file.read(path)
     for anchor in anchors:
         motion_id = anchor.r5dgs.motion_id

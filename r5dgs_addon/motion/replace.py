@@ -73,10 +73,11 @@ def prepare(target: bpy.types.Object, source: bpy.types.Object, frame: float, ti
     here, there = curve_place.find(target), curve_place.find(source)
     for obj, where in ((target, here), (source, there)):
         if where.strip is not None:
-            raise errors.ConfigError(f"{obj.name}: its motion lies in the NLA; make its action active again first")
+            raise errors.ConfigError(f"{obj.name}: its motion is in the NLA; make its action active again first")
     if source.r5dgs_motion.leader is not None:
         raise errors.ConfigError(
-            f"{source.name}: follows '{source.r5dgs_motion.leader.name}'; choose that one, or one that follows nobody"
+            f"{source.name}: follows '{source.r5dgs_motion.leader.name}'; choose the leader or an object without a "
+            "leader"
         )
     location, quat = fcurves.pose_at(target, here, frame)
     from_location, from_quat = fcurves.pose_at(source, there, frame)

@@ -52,7 +52,7 @@ def _plan(anchor: bpy.types.Object, allowed: float) -> tuple[timeline.Times, flo
     """Times, allowed error and new keys over frames of an anchor; no keys if nothing can be removed."""
     times, place = extrapolate.times_of(anchor), curve_place.find(anchor)
     if place.strip is not None:
-        raise errors.ConfigError(f"{anchor.name}: its action lies in the NLA; make it active again first")
+        raise errors.ConfigError(f"{anchor.name}: its action is in the NLA; make it active again first")
     curves = {name: curve for name, curve in place.curves().items() if len(curve.keyframe_points)}
     parts = {name: _segments(anchor.name, curve) for name, curve in curves.items()}
     if all(len(curve.keyframe_points) == 1 for curve in curves.values()):

@@ -45,7 +45,7 @@ def _physics(layout, anchor) -> None:
         status_bar.wrapped(layout, bpy.context, refused, "ERROR")
     layout.prop(state, "leader")
     if physics.follow_matrix(state) is not None:
-        layout.label(text="Moves with what it follows", icon="LINKED")
+        layout.label(text="Follows another object", icon="LINKED")
         return
     layout.prop(state, "kind")
     if not refused:

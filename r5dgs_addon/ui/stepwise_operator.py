@@ -111,7 +111,7 @@ class Running:
         manager.modal_handler_add(self)
         self._timer = manager.event_timer_add(0.01, window=context.window)
         begin(self)
-        status_bar.say(context, f"{self.work}: begins; Esc stops")
+        status_bar.say(context, f"{self.work}: starting; press Esc to stop")
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
@@ -166,7 +166,7 @@ class Running:
         elif getattr(self, "_timer", None) is not None:
             context.window_manager.progress_update(step.done / max(step.total, 1))
             rest = f", {left:.0f} s left" if step.done else ""
-            stands = "" if step.slow else f", {step.done} of {step.total}{rest}; Esc stops"
+            stands = "" if step.slow else f", {step.done} of {step.total}{rest}; press Esc to stop"
             status_bar.say(context, f"{self.work}: {step.what}{stands}")
 
     def _end(self, context):

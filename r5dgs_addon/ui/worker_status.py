@@ -56,5 +56,5 @@ def draw(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     layout.operator("r5dgs.check_worker", icon="PLAY")
     text, icon = _result
     if _job is not None and not _job.done:
-        text, icon = f"Testing: {_job.doing}, {_job.seconds:.0f} s; Esc stops", "SORTTIME"
+        text, icon = f"Testing: {_job.doing}, {_job.seconds:.0f} s; press Esc to stop", "SORTTIME"
     status_bar.wrapped(layout, context, text, icon)

@@ -38,7 +38,7 @@ ENVIRONMENT = preferences.ENVIRONMENT
 STDERR_LINES = 12
 LAST_WORDS_S = 0.5  # time to read the rest of the pipes after a worker's death
 REMEDY = f"set 'Worker Python' in the add-on's preferences, or {ENVIRONMENT}, to a Python with torch and numba"
-COMPILING = "preparing the rasterizer (first use, about 10 s)"
+COMPILING = "preparing the rasterizer (first use, 10 to 30 s)"
 
 log = logging.getLogger(__name__)
 

@@ -40,7 +40,9 @@ class Waiting:
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         if not self._job.done:
-            status_bar.say(context, f"{self.waits_for}: {self._job.doing}, {self._job.seconds:.0f} s; Esc stops")
+            status_bar.say(
+                context, f"{self.waits_for}: {self._job.doing}, {self._job.seconds:.0f} s; press Esc to stop"
+            )
             return {"PASS_THROUGH"}
         self._leave(context)
         return self._answered(context)

@@ -150,7 +150,7 @@ class Need:
             return self
         on = wanted == "on" and self.learned
         missing = wanted == "on" and not self.learned
-        reason = f"set {wanted} by you{', but this run has none' if missing else ''}; {self.reason}"
+        reason = f"set {wanted} by the user{', but not trained' if missing else ''}; {self.reason}"
         return replace(self, on=on, reason=reason)
 
     def row(self) -> dict[str, Any]:

@@ -305,7 +305,7 @@ def _row(part: _Part, dropped: bool, loss: float | None, said: str, travel: floa
         why += f"; without it the training views lose {loss:.3f} dB"
         why += "" if dropped else f", more than is left of {LOSS:g}; it ends at t_max"
     if part.kept:
-        why = f"set on by you; {why}"
+        why = f"set on by the user; {why}"
     text = f"{_SPREADS[part.name]}: {why}"
     if part.name == "motion":
         text += f"; goes {travel:.3g} diameters; past t_max: {said}"

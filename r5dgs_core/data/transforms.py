@@ -102,7 +102,8 @@ def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
     scale = np.array([width / declared[0], height / declared[1]])
     if abs(scale[0] - scale[1]) * max(declared) > 1.5:
         raise errors.DatasetError(
-            f"{entry.place}: the image is {width}x{height}, 'w' and 'h' say {declared[0]:g}x{declared[1]:g}", code="D09"
+            f"{entry.place}: the image is {width}x{height}, but 'w' and 'h' are {declared[0]:g}x{declared[1]:g}",
+            code="D09",
         )
     distorted = [key for key in _DISTORTION if abs(lens.get(key, 0.0)) > 1e-9]
     if distorted:

@@ -88,7 +88,7 @@ def write_colmap(folder: str | Path, views: Sequence[View]) -> Path:
     """Write COLMAP's text model into ``sparse/0`` of a folder, each file atomically, without points.
 
     Images are named by their paths without the leading folder ``images``, as in COLMAP. If views have times, they are
-    stored in ``times.json`` beside ``sparse`` (docs/dataset.md), an extension that COLMAP ignores.
+    stored in ``times.json`` beside ``sparse`` (docs/reference/dataset.md), an extension that COLMAP ignores.
 
     Args:
         folder: An existing folder.

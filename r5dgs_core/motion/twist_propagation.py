@@ -2,9 +2,9 @@
 
 Notation: x = (w, v) the twist of a point about its own centre at time 0, b = (e, a) its rate, T the duration. For a
 twist that is linear in time the bracket C = [x, b] is constant, so a Magnus step of length h with midpoint m is
-exp(h x + h m b - h^3/12 C): three products. Arrays are stored by column, [6, n] (`quaternion_columns`). With
-s = sin(|u|/2), the ratios B = 2 s^2/|u|^2, C and D of `se3` lose precision towards u = 0 only as fast as their factors
-vanish, so no series is needed.
+exp(h x + h m b - h^3/12 C), which takes three products. Arrays are stored by column, [6, n] (`quaternion_columns`).
+The ratios B = 2 sin(|u|/2)^2/|u|^2, C and D of `se3` lose precision near u = 0, but the factors that multiply them
+vanish equally fast, so no series is needed.
 """
 
 from __future__ import annotations

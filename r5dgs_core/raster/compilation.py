@@ -240,7 +240,7 @@ def _danger(folder: Path) -> str | None:
         return "it is a link or belongs to another user"
     if status.st_mode & 0o022:
         return "others can write there"
-    for parent in folder.resolve().parents:  # who can rename a folder can replace it
+    for parent in folder.resolve().parents:  # a user who can rename a parent folder can replace this one
         status = parent.stat()
         if status.st_uid not in (os.getuid(), *_SYSTEM_USERS):
             return f"{parent} belongs to another user"

@@ -138,9 +138,7 @@ def check_exclusions(labels: Sequence[Label], text: str, missing: Sequence[str])
         ConfigError: ``missing`` is not empty.
     """
     if missing:
-        raise errors.ConfigError(
-            f"{text.strip()!r} leaves out what is not there: {explain_nothing(labels, missing[0])}"
-        )
+        raise errors.ConfigError(f"{text.strip()!r} excludes an unknown object: {explain_nothing(labels, missing[0])}")
 
 
 def is_nothing(labels: Sequence[Label], text: str) -> bool:

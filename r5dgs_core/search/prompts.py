@@ -63,9 +63,9 @@ def parse(text: str, names: Iterable[str] = ()) -> Prompt:
         return _list(text, known)
     left, word, right = text[: found[0]].strip(" ,;"), text[slice(*found)].strip(" ,;"), text[found[1] :].strip()
     if not right:
-        raise errors.UsageError(f"{text.strip()!r}: expected what to leave out after {word!r}")
+        raise errors.UsageError(f"{text.strip()!r}: nothing to exclude after {word!r}; name an object after it")
     if _spelled(right) not in known:
-        right = _EXCEPT.sub(" and ", right)  # "not the vase and not the ball" leaves out both
+        right = _EXCEPT.sub(" and ", right)  # "not the vase and not the ball" excludes both
     excluded = _list(right, known)
     if _NOTHING.fullmatch(left):  # "nothing but the mug" is the mug
         return excluded

@@ -63,7 +63,7 @@ def draw(rows: Sequence[dict[str, Any]]) -> bytes:
     """Plot loss, PSNR of held-out views (if there are any) and number of Gaussians; returns a PNG.
 
     Args:
-        rows: Lines of the log (docs/training.md).
+        rows: Lines of the log (docs/reference/run_folder.md).
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -53,8 +53,8 @@ def train(
         overwrite: Start again if the folder contains a run. Its files are kept until training is ready for the first
             step.
         go_on: Command that resumes this run, for messages; by default a call of ``r5dgs train``.
-        progress: Called with a dictionary per event (docs/training.md). If it is a `Timed`, its estimate of the time
-            left also counts phases that the caller has added.
+        progress: Called with a dictionary per event (docs/reference/run_folder.md#progress). If it is a
+            `Timed`, its estimate of the time left also counts phases that the caller has added.
 
     Returns:
         The run.

@@ -36,7 +36,7 @@ from .representations.representation import Representation
 
 log = logging.getLogger(__name__)
 
-TARGET_BYTES = 1 << 30
+TARGET_BYTES = 1 << 30  # largest cache of training images as floats
 EYES = 256  # largest number of cameras in tests of visibility
 HOLD_EVERY = 100  # steps between updates of the held Gaussians
 HELD = "held"  # name of a tensor of the state: mask of the Gaussians whose centres are frozen
@@ -120,7 +120,7 @@ class Trainer:
         return backgrounds.learned(found if found is not None else self._mean_color(), degree)
 
     def _conditions(self) -> densifier.Conditions:
-        """Return what the densification needs to know about the run."""
+        """Return the properties of the run that densification depends on."""
         sizes = [v.camera.width * v.camera.height for v in self.views]
         most = self.config.densify.max_gaussians
         focal = float(np.median([v.camera.intrinsics[0, 0] for v in self.views]))

@@ -191,7 +191,7 @@ def test_a_scene_of_background_alone_loads_and_says_so(blender, tmp_path, capfd)
     collection = motions.load(blender, path)
     said = capfd.readouterr().out
     print(said)
-    assert "Warning: still.r5dgs holds no objects, only a background; to get some, train with masks" in said
+    assert "Warning: still.r5dgs contains only a background, no objects; train with masks to get objects" in said
     motions.assert_plays_like_the_core(blender, collection, scene_file.read(path), (0.0, 0.5, 0.9))
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "still.blend"))
     blender.ops.wm.open_mainfile(filepath=str(tmp_path / "still.blend"))

@@ -59,7 +59,7 @@ def test_the_sidebar_says_when_the_worker_is_still_compiling(blender, sidebar, s
     process = importlib.import_module("r5dgs.r5dgs_addon.worker.process")
     monkeypatch.setattr(worker, "notice", lambda: process.COMPILING)
     new = [text for text in sidebar() if text not in before]
-    assert " ".join(new) == "Preparing the rasterizer (first use, about 10 s)"
+    assert " ".join(new) == "Preparing the rasterizer (first use, 10 to 30 s)"
 
 
 def test_no_text_is_longer_than_a_sidebar_of_normal_width_shows(blender, sidebar, scene_path, monkeypatch):

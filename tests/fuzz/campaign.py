@@ -1,6 +1,6 @@
-"""Runs of readers over mutated inputs: what was accepted, refused or went wrong, and what it took.
+"""Fuzzing of readers with mutated inputs: counts of accepted, rejected and failed inputs, with time and memory.
 
-Each input follows from seed, reader and index alone, so that any can be made again.
+Seed, reader and index determine an input, so that each one is reproducible.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ Files = dict[str, bytes]
 
 @dataclass(frozen=True)
 class Reader:
-    """Something that reads files.
+    """Reader of files under test.
 
     Attributes:
         name: Its name.
         make: Files of an input, by their paths in a folder.
-        read: Reads them and uses what was accepted; a fault is an `R5dgsError`, all else is a defect.
+        read: Reads them and uses what was accepted; a rejection is an `R5dgsError`; any other exception is a defect.
     """
 
     name: str
@@ -79,7 +79,7 @@ HEAD = (
 
 
 class Hang(BaseException):
-    """An input took too long; no `Exception`, so that no reader catches it."""
+    """Raised if an input takes too long; not an `Exception`, so that no reader catches it."""
 
 
 def run(reader: Reader, indices: range, seed: int, save: Path | None = None) -> Tally:
@@ -174,7 +174,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _summary(fault: str) -> str:
-    """The error and the last line of our code that it went through."""
+    """Return the error and the last line of our code in its traceback."""
     lines = [line.strip() for line in fault.strip().splitlines()]
     ours = [line for line in lines if line.startswith("File ") and "r5dgs_core" in line]
     where = ours[-1].split("r5dgs_core")[-1].replace('", line ', ":") if ours else ""

@@ -26,7 +26,7 @@ class DensifySection:
         prune_width: Standard deviation, as a share of the image width, above which a Gaussian is removed.
         prune_near: Distance from a camera below which background Gaussians in the view of fewer than two cameras are
             removed, normalised units (the cameras' focus is at about 4). 0 keeps them.
-        opacity: Weight of the mean opacity in the loss, by which Gaussians fade that no image needs. 0 turns it off.
+        opacity: Weight of the mean opacity in the loss, which fades Gaussians that no image needs. 0 turns it off.
     """
 
     strategy: str = "share"

@@ -31,15 +31,15 @@ class FieldSection:
         gate: Share of the field's run after which ``measured`` freezes Gaussians at rest, but not before all times take
             part.
         still: Displacement over the observed times below which a Gaussian is at rest, normalised units.
-        calm: Weight of the mean distance from the canonical state, which brings Gaussians to rest that no image moves.
-            Used with ``measured``, until ``gate``.
+        calm: Weight of the mean distance from the canonical state, which keeps Gaussians still if no image requires
+            motion. Used with ``measured``, until ``gate``.
         place_steps: Steps that fit the field to the triangulated positions of the objects, before the first image.
         tracks_share: Share of the run that trains ``tracks`` first; the field then starts from them. 0 starts with the
             field.
         distill_steps: Steps that fit field and TRD to the motion of these tracks.
         trd_steps: Steps of each fit of the TRD to the motion of the field, without images. 0 turns these fits off.
         trd_every: Interval between these fits, as a share of the run. 0 fits only at the start.
-        twist: Weight of the cross-Gaussian twist loss in these fits, by which the twist of each Gaussian must also move
+        twist: Weight of the cross-Gaussian twist loss in these fits, which applies the twist of each Gaussian to
             another Gaussian of its group.
         stiffness: Weight of the mean squared distance of moved Gaussians from the best rigid motion of their group.
         chunk: Gaussians per forward pass of the networks; bounds memory.

@@ -96,7 +96,7 @@ class RatesSection:
         sh_rest: View-dependent colour (harmonics of degree 1 and higher).
         opacity_logits: Opacities, before the sigmoid.
         quats: Orientations.
-        shading: Shading vectors, by which colours change as objects turn.
+        shading: Shading vectors, which change colours as objects turn.
         light: Direction of the light that the shading assumes.
         translations: Translations of the object tracks.
         rotvecs: Rotations of the object tracks, rad.

@@ -148,8 +148,8 @@ def check_words(folder: Path, tokenizer: Any) -> None:
     one, other = tokenizer(["lemon", "apple"])["input_ids"]  # of equal length, as each letter may be unknown
     if list(one) == list(other):
         raise errors.BackendError(
-            f"{folder}: the tokenizer knows no words, its vocabulary is missing; copy the model again, tokenizer.json "
-            "and all other files"
+            f"{folder}: the tokenizer's vocabulary is missing; copy the model again with all files, "
+            "including tokenizer.json"
         )
 
 

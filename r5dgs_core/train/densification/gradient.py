@@ -51,7 +51,7 @@ class _Gradients:
 class Share(_Gradients):
     """Default strategy: the Gaussians with the largest gradients grow, up to a share of all per round; no resets.
 
-    A small weight on the mean opacity lets Gaussians fade that no image needs. Otherwise those that no camera sees, or
+    A small weight on the mean opacity fades Gaussians that no image needs. Otherwise Gaussians that no camera sees, or
     that repeat the sky in front of it, would keep their random initial state and be visible in other views.
 
     Args:

@@ -202,12 +202,17 @@ def companions(
 def _pull(
     labels: np.ndarray, going: np.ndarray | None, moving: np.ndarray | None, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the class that motion votes for and its weight; 0 if that class (for 0: the own one) is at rest."""
+    """Return the class that motion votes for and its weight.
+
+    The weight is 0 if the class is at rest; for class 0 (background), if the Gaussian's own class is at rest.
+    """
     if going is None or moving is None:
         return np.zeros(len(labels), np.int64), np.zeros(len(labels), np.float32)
-    told = np.append(moving, np.zeros(count - len(moving), bool))
-    told[0] = False
-    return going.astype(np.int64), (MOTION * np.where(going > 0, told[going], told[labels])).astype(np.float32)
+    known_moving = np.append(moving, np.zeros(count - len(moving), bool))
+    known_moving[0] = False
+    return going.astype(np.int64), (MOTION * np.where(going > 0, known_moving[going], known_moving[labels])).astype(
+        np.float32
+    )
 
 
 def _decide(

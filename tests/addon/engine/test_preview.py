@@ -265,7 +265,7 @@ def test_in_a_window_the_picture_comes_while_the_window_stays_free(blender, load
     window = windowed()
     assert worker.busy() and not blender.ops.r5dgs.preview.poll() and not blender.ops.r5dgs.check_worker.poll()
     assert window.send("MOUSEMOVE") == {"PASS_THROUGH"} and window.said == []
-    assert window.send("TIMER") == {"PASS_THROUGH"} and "Esc stops" in window.said[-1]
+    assert window.send("TIMER") == {"PASS_THROUGH"} and "press Esc to stop" in window.said[-1]
     os.kill(worker._worker.pid, signal.SIGCONT)
     window.operator._job.join()
     assert window.send("TIMER") == {"FINISHED"}
@@ -400,7 +400,7 @@ def test_progress_and_result_of_the_worker_test_are_drawn_under_its_button(blend
     job = worker.start([("testing", "check", {})])
     check.begin(job)
     patience.wait_until(lambda: job.doing in ("testing", worker.notice()))
-    assert re.search(rf"Testing: {re.escape(job.doing)}, \d+ s; Esc stops", " ".join(drawn_check(blender)))
+    assert re.search(rf"Testing: {re.escape(job.doing)}, \d+ s; press Esc to stop", " ".join(drawn_check(blender)))
     window = Window(module.R5DGS_OT_check_worker, job)
     assert window.send("ESC") == {"CANCELLED"} and "Stopped" in drawn_check(blender)
     check.begin(job)

@@ -259,7 +259,7 @@ def test_what_moves_before_the_first_observed_time_is_said_to_be_lost(blender, s
     anchor.keyframe_insert("location", frame=first)
     save(blender, tmp_path / "b.r5dgs")
     said = capfd.readouterr().out
-    assert f"mug: what moves before frame {1 + 60 * late.tracks.times[0]:.4g}, the first observed time" in said
+    assert f"mug: motion before frame {1 + 60 * late.tracks.times[0]:.4g}, the first observed time" in said
     assert "red apple" not in said
 
 

@@ -516,7 +516,7 @@ def test_the_panel_shows_what_a_motion_has_and_whether_it_was_edited(blender, lo
     mug.rotation_mode = "XYZ"
     assert any("expected the rotation mode" in text for text in layouts.draw(blender, panel))
     motions.choose(blender, blender.data.objects["mug shadow anchor"])
-    assert "Moves with what it follows" in layouts.draw(blender, panel)
+    assert "Follows another object" in layouts.draw(blender, panel)
     motions.choose(blender, loaded.r5dgs.root)
     assert "Select an object to see its motion" in layouts.draw(blender, panel)
 

@@ -54,7 +54,7 @@ def test_loading_says_what_bends_and_is_not_played(blender, tmp_path, capfd):
     bending = datasets.breathing(scene, 0.3)
     for name, wanted in (("rigid", scene), ("bending", bending)):
         motions.load(blender, scene_file.write(wanted, tmp_path / f"{name}.r5dgs"))
-        warned = f"{len(bending.residuals.rows)} Gaussians bend" in capfd.readouterr().out
+        warned = f"{len(bending.residuals.rows)} Gaussians deform" in capfd.readouterr().out
         assert warned == (name == "bending")
 
 

@@ -12,7 +12,7 @@ from r5dgs_core import errors
 from r5dgs_core.scene import scene_file
 from tests.support import layouts, motions, tiny_datasets
 
-ASKS = "not read, as it lies neither beside nor below"
+ASKS = "not read, because it is outside the folder of the .blend"
 
 
 @pytest.fixture

@@ -135,7 +135,7 @@ def test_every_row_of_the_table_can_be_overridden():
 def test_your_word_wins_over_the_number_and_is_marked(name):
     measured, decided = table(**EVERYTHING)[name], table(**EVERYTHING, wanted={name: "off"})[name]
     assert (measured["decision"], decided["decision"]) == ("on", "off")
-    assert decided["value"] == measured["value"] and decided["reason"].startswith("set off by you")
+    assert decided["value"] == measured["value"] and decided["reason"].startswith("set off by the user")
     others = [table(**EVERYTHING, wanted={name: "off"})[other] == table(**EVERYTHING)[other] for other in NAMES]
     assert others == [other != name for other in NAMES]
 
@@ -143,7 +143,7 @@ def test_your_word_wins_over_the_number_and_is_marked(name):
 @pytest.mark.parametrize("name", ["tracks", "rotation"])
 def test_an_object_at_rest_may_be_said_to_move(name):
     row = table(wanted={name: "on"})[name]
-    assert row["decision"] == "on" and row["reason"].startswith("set on by you;")
+    assert row["decision"] == "on" and row["reason"].startswith("set on by the user;")
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_an_object_at_rest_may_be_said_to_move(name):
 )
 def test_what_was_not_learned_cannot_be_switched_on_and_the_table_says_so(name):
     row = table(classified=False, wanted={name: "on"})[name]
-    assert row["decision"] == "off" and "set on by you, but this run has none" in row["reason"]
+    assert row["decision"] == "off" and "set on by the user, but not trained" in row["reason"]
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def test_training_leaves_out_what_you_say_is_not_needed(tiny, tmp_path):
     assert done.config == settings  # the folder says what was asked for
     scene = bake.bake(done, datasets.read(tiny.root))
     assert {row["decision"] for row in scene.needs} == {"off"}
-    assert all(row["reason"].startswith("set off by you") for row in scene.needs)
+    assert all(row["reason"].startswith("set off by the user") for row in scene.needs)
 
 
 def test_colour_that_depends_on_the_view_is_learned_where_you_say_that_it_is_needed(tiny):

@@ -368,7 +368,7 @@ def sheared(frame):
         (mirrored, "frame 2 .*mirrors"),
         (lambda frame: frame.update(camera_angle_x=4.0), "frame 2 .*radians"),
         (lambda frame: frame.update(k1=0.1), "frame 2 .*distortion"),
-        (lambda frame: frame.update(w=100, h=20, fl_x=50), "frame 2 .*the image is 12x8, 'w' and 'h' say 100x20"),
+        (lambda frame: frame.update(w=100, h=20, fl_x=50), "frame 2 .*the image is 12x8, but 'w' and 'h' are 100x20"),
         (lambda frame: frame.update(fl_x=-3.0), "frame 2 .*positive"),
     ],
 )

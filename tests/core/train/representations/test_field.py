@@ -368,5 +368,5 @@ def test_gaussians_of_a_field_go_with_the_group_that_explains_them_and_the_scene
     assert counts["unexplained"] == len(residuals.unexplained(scene)) and counts["moving"] > 100
     ungrouped = dataclasses.replace(made, config=made.config.override(("needs.regrouping=off",)))
     kept = bake.bake(tiny_datasets.as_trained(ungrouped), data)
-    assert "set off by you" in next(row["reason"] for row in kept.needs if row["name"] == "regrouping")
+    assert "set off by the user" in next(row["reason"] for row in kept.needs if row["name"] == "regrouping")
     assert "regrouping" not in kept.provenance

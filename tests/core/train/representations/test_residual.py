@@ -339,7 +339,7 @@ def test_a_scene_may_be_baked_without_residuals(breathing, tmp_path):
     assert plain.residuals is None and plain.groups[BALL].rigid_max == 0
     assert np.array_equal(plain.gaussians.means, scene.gaussians.means)
     row = next(row for row in plain.needs if row["name"] == "residuals")
-    assert row["decision"] == "off" and row["reason"].startswith("set off by you")
+    assert row["decision"] == "off" and row["reason"].startswith("set off by the user")
 
 
 FORCED = ("needs.residuals=on", "train.iterations=100", "residual.trial_steps=20")  # tried after 40 steps, and kept
