@@ -52,7 +52,7 @@ def test_the_extension_and_the_package_have_one_version_and_licence():
     assert "END OF TERMS AND CONDITIONS" in text
 
 
-def test_what_was_tested_lies_in_the_ranges_and_everything_needed_is_pinned():
+def test_requirements_are_pinned_to_versions_in_their_ranges():
     tested = pins()
     for requirement in requirements():
         assert normal(requirement.name) in tested, f"{requirement.name} is not in constraints.txt"

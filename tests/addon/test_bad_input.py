@@ -141,7 +141,7 @@ REMEDIES = {
 
 
 @pytest.mark.parametrize("kind", REMEDIES)
-def test_bad_input_says_what_to_do_and_changes_nothing(saved, bad, kind):
+def test_bad_input_raises_with_a_remedy_and_changes_nothing(saved, bad, kind):
     path = bad(kind)
     with refused(saved, f"{path.name}.*{REMEDIES[kind]}"):
         saved.ops.r5dgs.load_scene(filepath=str(path))
@@ -171,7 +171,7 @@ NEEDING_NONE = {
 @pytest.mark.parametrize(
     ("asked", "name"), [(asked, name) for asked, names in WITHOUT_A_SCENE.items() for name in names]
 )
-def test_without_a_scene_an_action_says_what_it_needs(blender, asked, name):
+def test_actions_without_a_scene_raise(blender, asked, name):
     with pytest.raises(RuntimeError, match=asked):
         getattr(blender.ops.r5dgs, name)()
 
@@ -186,7 +186,7 @@ def test_no_file_at_all_is_asked_for(blender):
         blender.ops.r5dgs.load_scene()
 
 
-def test_a_scene_of_background_alone_loads_and_says_so(blender, tmp_path, capfd):
+def test_a_scene_with_only_a_background_loads_with_a_warning(blender, tmp_path, capfd):
     path = scene_file.write(scenes.make_scene(n=50, objects=0, unassigned=0), tmp_path / "still.r5dgs")
     collection = motions.load(blender, path)
     said = capfd.readouterr().out
@@ -200,7 +200,7 @@ def test_a_scene_of_background_alone_loads_and_says_so(blender, tmp_path, capfd)
 
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="rights to read are those of POSIX here")
 @pytest.mark.parametrize("what", ["file", "folder"])
-def test_without_the_right_to_read_it_says_so(blender, scene_path, what):
+def test_an_unreadable_scene_file_raises(blender, scene_path, what):
     locked: Path = scene_path if what == "file" else scene_path.parent
     locked.chmod(0)
     is_root, before = os.geteuid() == 0, contents(blender)
@@ -302,7 +302,7 @@ def dying(loaded):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="signals are those of POSIX")
-def test_a_worker_that_is_killed_in_mid_render_is_told_and_the_next_picture_comes(loaded, dying):
+def test_a_worker_killed_during_a_render_raises_and_the_next_render_works(loaded, dying):
     pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
     assert f12(loaded)
     for act in (lambda: f12(loaded), loaded.ops.r5dgs.preview):

@@ -83,7 +83,7 @@ def test_a_blend_and_its_scene_can_move_together(blender, scene_path, tmp_path):
     assert plays(blender, loaded(blender), moved / "synthetic.r5dgs")
 
 
-def test_a_lost_scene_is_asked_for_by_name_and_found_where_the_user_says(blender, scene_path, tmp_path):
+def test_a_lost_scene_file_raises_by_name_until_the_user_sets_its_path(blender, scene_path, tmp_path):
     collection = motions.load(blender, scene_path)
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
     hidden = tmp_path / "hidden" / "renamed.r5dgs"
@@ -246,12 +246,12 @@ def test_two_scenes_at_once_have_names_of_their_own_and_both_play(blender, scene
 
 
 @pytest.mark.parametrize("fps", [24, 60, 120])
-def test_frames_say_the_time_whatever_the_frame_rate(blender, scene_path, fps):
+def test_frames_map_to_times_at_any_frame_rate(blender, scene_path, fps):
     blender.context.scene.render.fps = fps
     assert plays(blender, motions.load(blender, scene_path), scene_path)
 
 
-def test_in_edit_mode_loading_asks_for_object_mode_and_changes_nothing(blender, scene_path):
+def test_loading_in_edit_mode_raises_and_changes_nothing(blender, scene_path):
     blender.context.view_layer.objects.active = blender.data.objects["Cube"]
     blender.ops.object.mode_set(mode="EDIT")
     before = contents(blender)
@@ -330,7 +330,7 @@ def test_a_script_that_uses_the_module_ends_as_it_should(blender, scene_path):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_what_was_loaded_lives_on_without_the_extension_and_is_known_again_after_it(blender, extension, scene_path):
+def test_loaded_scenes_survive_disabling_and_enabling_the_extension(blender, extension, scene_path):
     motions.load(blender, scene_path)
     before = {obj.name for obj in blender.data.objects}
     extension.unregister()

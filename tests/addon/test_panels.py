@@ -34,7 +34,7 @@ def test_without_a_scene_the_sidebar_offers_to_load_one(sidebar):
     assert "r5dgs.preview" not in said
 
 
-def test_with_a_scene_the_sidebar_says_what_is_loaded_and_whether_now_is_the_future(blender, sidebar, scene_path):
+def test_the_sidebar_shows_the_loaded_scene_and_if_the_time_is_extrapolated(blender, sidebar, scene_path):
     blender.ops.r5dgs.load_scene(filepath=str(scene_path))
     blender.context.scene.frame_set(31)
     said = sidebar()
@@ -44,7 +44,7 @@ def test_with_a_scene_the_sidebar_says_what_is_loaded_and_whether_now_is_the_fut
     assert "t = 0.900: extrapolated by 0.150" in sidebar()
 
 
-def test_the_sidebar_shows_answers_and_says_when_there_are_none(blender, sidebar, scene_path):
+def test_the_sidebar_shows_matches_or_their_absence(blender, sidebar, scene_path):
     blender.ops.r5dgs.load_scene(filepath=str(scene_path))
     blender.ops.r5dgs.select_by_prompt(text="cup")
     assert {"mug", "0.97  alias 'cup'"} <= set(sidebar())
@@ -52,7 +52,7 @@ def test_the_sidebar_shows_answers_and_says_when_there_are_none(blender, sidebar
     assert "Nothing matches 'submarine'" in sidebar()
 
 
-def test_the_sidebar_says_when_the_worker_is_still_compiling(blender, sidebar, scene_path, monkeypatch):
+def test_the_sidebar_shows_kernel_compilation(blender, sidebar, scene_path, monkeypatch):
     worker = importlib.import_module("r5dgs.r5dgs_addon.worker.jobs")
     blender.ops.r5dgs.load_scene(filepath=str(scene_path))
     before = sidebar()

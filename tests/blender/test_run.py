@@ -20,7 +20,7 @@ def run(*arguments):
     return subprocess.run(command, capture_output=True, text=True, timeout=600)
 
 
-def test_tests_that_pass_fail_or_want_torch_are_told_apart(tmp_path):
+def test_passed_failed_and_torch_dependent_tests_are_distinguished(tmp_path):
     passing, failing, wanting = (tmp_path / f"test_{name}.py" for name in ("passing", "failing", "wanting"))
     passing.write_text(PASSING)
     failing.write_text("def test_it():\n    assert False\n")

@@ -179,7 +179,7 @@ def test_a_run_file_of_another_program_makes_no_run_folder_and_a_damaged_one_doe
         assert (tmp_path / folder_lock.LOCK_FILE).exists() == ours
 
 
-def test_what_is_written_elsewhere_and_what_is_read_needs_no_lock(tmp_path, trained):
+def test_reading_a_run_and_writing_elsewhere_need_no_lock(tmp_path, trained):
     with folder_lock.hold(trained.folder):
         assert checkpoint.open_run(trained.folder).digest == trained.digest
         assert checkpoint.load(trained.folder).finished

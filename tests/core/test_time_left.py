@@ -119,7 +119,7 @@ def test_nothing_is_shown_before_anything_is_measured():
     assert TimeLeft(Phase("step", 100)).at("step", 0) is None
 
 
-def test_the_number_of_units_that_an_event_tells_replaces_the_planned_one():
+def test_the_number_of_units_in_an_event_replaces_the_planned_one():
     now, shown = [0.0], []
     report = Timed(shown.append, clock=lambda: now[0])
     report.estimate.add(Phase("evaluate", 1000, 2.0))

@@ -32,7 +32,7 @@ def test_without_a_file_nothing_is_set(place, capsys):
 
 
 @pytest.mark.parametrize("name", ["plain", 'quo"ted \\ back', "süß 日本 😀", "line\nbreak", "delete\x7f"])
-def test_what_is_set_is_read_again(place, tmp_path, capsys, name):
+def test_settings_can_be_read_back(place, tmp_path, capsys, name):
     folder = tmp_path / name
     folder.mkdir()
     assert main.main(["config", "--user", "set", "encoder", str(folder)]) == 0

@@ -129,7 +129,7 @@ def test_the_splits_divide_time_at_t_max(extension, start, length, step, t_max, 
     assert plan.time(start) == 0.0 and all(0.0 <= plan.time(frame) <= 1.0 for frame in plan.frames)
 
 
-def test_val_also_asks_for_times_between_the_observed_ones(service):
+def test_val_includes_times_between_the_observed_ones(service):
     settings = service.settings.CaptureSettings(directory="x", frame_step=4, t_max=0.75, val_every=4)
     plan = service.capture.plan_times(settings, 1, 61)
     assert len(plan.observed) == 12
@@ -314,7 +314,7 @@ def parent_to_empty(bpy, name, children):
     return empty
 
 
-def test_what_hangs_from_one_empty_is_one_object_with_its_pose(service, blender, scene):
+def test_children_of_one_empty_are_one_object_with_its_pose(service, blender, scene):
     parts = [add_ball(blender, f"part {k}", (k, 2.0, 0.0), (0.5, 0.5, 0.5)) for k in range(2)]
     root = parent_to_empty(blender, "truck", parts)
     for frame, z in ((1, 0.0), (9, 2.0)):
@@ -331,7 +331,7 @@ def test_an_empty_that_carries_the_whole_scene_is_no_object(service, blender, sc
     assert [o.name for o in choose(service, blender, "ANIMATED")] == ["moving ball"]
 
 
-def test_what_moves_under_an_empty_that_stands_is_an_object_of_its_own(service, blender, scene):
+def test_moving_children_of_a_static_empty_are_separate_objects(service, blender, scene):
     other = add_ball(blender, "other ball", (0.0, 2.0, 0.5), (0.5, 0.5, 0.5))
     other.keyframe_insert("location", frame=1)
     other.location.y = 3.0
@@ -364,7 +364,7 @@ def test_a_selection_counts_where_nothing_moves(service, blender, scene):
     assert [o.name for o in choose(service, blender, "AUTO")] == ["still ball"]
 
 
-def test_what_does_not_render_is_no_object(service, blender, scene):
+def test_objects_hidden_in_renders_are_not_captured(service, blender, scene):
     blender.data.objects["still ball"].pass_index = 1
     moving = blender.data.objects["moving ball"]
     moving.pass_index = 2
@@ -502,7 +502,7 @@ def test_without_openimageio_the_remedy_is_named(service, blender, scene, tmp_pa
         capture(service, blender, tmp_path / "set")
 
 
-def test_a_blender_that_cannot_denoise_says_what_to_switch_off(service, blender, scene, tmp_path, monkeypatch):
+def test_missing_denoiser_raises_an_error_with_the_remedy(service, blender, scene, tmp_path, monkeypatch):
     def render(**keywords):
         raise RuntimeError("Error: Failed to denoise, build has no OpenImageDenoise support\n")
 

@@ -173,7 +173,7 @@ def test_cryptomatte_shares_pixels_among_objects_by_name(blender, loaded, scene,
     assert json.loads(header[f"{start}/manifest"])["mug"] == f"{cryptomatte.hash_of('mug'):08x}"
 
 
-def test_passes_that_nobody_asked_for_are_not_there(blender, loaded, tmp_path):
+def test_disabled_passes_are_not_written(blender, loaded, tmp_path):
     assert render_passes(blender, tmp_path).names == {"Combined"}
 
 
@@ -306,7 +306,7 @@ def test_other_view_transforms_are_inverted(blender, loaded, scene, tmp_path, vi
     assert np.abs(render_png(blender, tmp_path, "changed") - expected).mean() > 5 * np.abs(saved - expected).mean()
 
 
-def test_using_the_engine_leaves_the_view_alone_and_says_what_it_loses(blender, loaded, scene, tmp_path, capfd):
+def test_using_the_engine_keeps_the_view_transform_and_reports_its_loss(blender, loaded, scene, tmp_path, capfd):
     loss = importlib.import_module("r5dgs.r5dgs_addon.color.inverse_loss")
     view, found = blender.context.scene.view_settings, {}
     for name in ("AgX", "Filmic", "Standard"):
@@ -430,7 +430,7 @@ def test_a_view_that_cannot_be_sampled_is_named_and_rendered_all_the_same(blende
     assert color.objections(blender.context.scene) == ["view transform Filmic"]
 
 
-def test_what_a_viewport_wants_is_made_by_the_timer_when_it_rests(blender, loaded, monkeypatch):
+def test_the_timer_computes_requested_view_inverses_once_edits_pause(blender, loaded, monkeypatch):
     view_module = importlib.import_module("r5dgs.r5dgs_addon.color.view_transform")
     settings = blender.context.scene.view_settings
     made, now = [], [100.0]
@@ -458,7 +458,7 @@ def test_other_working_spaces_show_the_same_bytes(blender, loaded, scene, tmp_pa
     assert psnr(render_png(blender, tmp_path), np.clip(core(scene, 0.0).color, 0, 1)) > 45
 
 
-def test_a_render_that_cannot_be_says_why_and_writes_nothing(blender, loaded, tmp_path):
+def test_a_failed_render_raises_an_error_and_writes_no_file(blender, loaded, tmp_path):
     (tmp_path / "scene.r5dgs").rename(tmp_path / "gone.r5dgs")
     with pytest.raises(RuntimeError, match="scene.r5dgs.*Scene File"):
         render_png(blender, tmp_path, "nothing")
@@ -471,7 +471,7 @@ def test_a_render_that_cannot_be_says_why_and_writes_nothing(blender, loaded, tm
     assert not (tmp_path / "nothing.png").exists()
 
 
-def test_what_no_camera_of_ours_can_see_is_refused(blender, loaded, tmp_path):
+def test_rendering_with_a_panoramic_camera_raises(blender, loaded, tmp_path):
     blender.context.scene.camera.data.type = "PANO"
     with pytest.raises(RuntimeError, match="Perspective"):
         render_png(blender, tmp_path, "nothing")

@@ -81,7 +81,7 @@ def test_collections_hold_out_and_hide_as_their_objects_do(blender, loaded, pass
     np.testing.assert_allclose(found.combined, expected.combined, atol=1e-5)
 
 
-def test_what_cameras_do_not_see_is_not_drawn(blender, loaded, passes):
+def test_objects_invisible_to_cameras_are_not_drawn(blender, loaded, passes):
     mug = cloud(loaded, "mug")
     before = passes()
     mug.visible_camera = False

@@ -90,7 +90,7 @@ def test_the_preview_is_the_cores_picture(blender, loaded, scene_path, t):
     assert psnr(preview(blender), core_picture(scene, scene_player.frame(scene, t))) > 45
 
 
-def test_the_error_is_told_beside_the_milliseconds(blender, loaded, scene_path):
+def test_preview_statistics_show_the_error_and_the_render_time(blender, loaded, scene_path):
     figures = importlib.import_module("r5dgs.r5dgs_addon.engine.render_stats")
     preview(blender)
     size = " x ".join(map(str, blender.data.images["R5DGS Preview"].size))
@@ -216,7 +216,7 @@ def test_pixel_aspect_is_part_of_the_camera(blender, loaded):
     assert wide[0, 0] / wide[1, 1] == pytest.approx(0.5 * square[0, 0] / square[1, 1], rel=1e-5)
 
 
-def test_what_cannot_be_rendered_is_refused_with_the_remedy(blender, loaded):
+def test_preview_with_a_panoramic_camera_raises(blender, loaded):
     blender.context.scene.camera.data.type = "PANO"
     with pytest.raises(RuntimeError, match="Perspective"):
         blender.ops.r5dgs.preview()
@@ -372,7 +372,7 @@ def test_a_wrong_python_is_named(blender, loaded, monkeypatch, tmp_path, kind):
         blender.ops.r5dgs.preview()
 
 
-def test_the_worker_test_says_that_it_is_ready_and_unregistering_stops_it(blender, worker, capfd):
+def test_worker_test_reports_readiness_and_unregistering_stops_the_worker(blender, worker, capfd):
     assert blender.ops.r5dgs.check_worker() == {"FINISHED"}
     told = capfd.readouterr().out
     versions = r"\(Python 3\.\S+, R5DGS \S+, torch \S+, numba \S+\)"
@@ -438,7 +438,9 @@ for line in sys.stdin:
 """
 
 
-def test_who_waits_for_the_compiler_is_told_so(blender, loaded, worker, windowed, monkeypatch, tmp_path, caplog):
+def test_waiting_for_kernel_compilation_shows_a_notice(
+    blender, loaded, worker, windowed, monkeypatch, tmp_path, caplog
+):
     os.mkfifo(tmp_path / "gate")
     monkeypatch.setenv("GATE", str(tmp_path / "gate"))
     monkeypatch.setenv("R5DGS_PYTHON", fake_python(tmp_path / "python", COMPILES))

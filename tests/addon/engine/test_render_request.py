@@ -103,7 +103,7 @@ def test_a_scene_that_is_loaded_twice_is_seen_twice(blender, picture, kitchen):
     assert psnr(arrays["color"], core_color(scene, both, seen.camera, incremental_renderer.Sky(0, affine(W)))) > 45
 
 
-def test_what_bends_is_seen_bent_in_exact_mode(blender, picture, load, tmp_path):
+def test_exact_mode_renders_deformed_gaussians(blender, picture, load, tmp_path):
     made = tiny_datasets.breathing(tiny_datasets.make_truth(), 0.4)
     path = scene_file.write(made, tmp_path / "balloon.r5dgs")
     assert blender.ops.r5dgs.load_scene(filepath=str(path)) == {"FINISHED"}
@@ -157,7 +157,7 @@ def test_an_instanced_collection_is_seen_where_it_is_instanced(blender, picture,
     assert psnr(arrays["color"], core_color(scene, both[1:], seen.camera, incremental_renderer.Sky(0, affine(W)))) > 45
 
 
-def test_what_a_collection_hides_is_not_seen(blender, picture, kitchen):
+def test_objects_of_hidden_collections_are_not_rendered(blender, picture, kitchen):
     collection, _ = kitchen
     layer = blender.context.view_layer.layer_collection.children[collection.name]
     layer.children["mug"].exclude = True
@@ -228,7 +228,7 @@ def test_points_that_were_deleted_are_not_drawn(blender, picture, kitchen):
     assert psnr(arrays["color"], core_color(scene, parts, seen.camera)) > 45
 
 
-def test_points_that_do_not_say_what_they_are_are_refused(blender, picture, kitchen):
+def test_points_without_required_attributes_are_refused(blender, picture, kitchen):
     mug = kitchen[0].all_objects["mug"]
     mug.data = without(blender, mug.data, np.arange(5), named=False)
     with pytest.raises(RuntimeError, match="mug: expected its .* points, found 5.*load the scene again"):

@@ -73,7 +73,7 @@ def test_the_latest_wish_wins(blender, seen, viewport):
     np.testing.assert_array_equal(port._pixels, color.scene_linear(picture.render(last)[1]["color"])[::-1])
 
 
-def test_a_viewport_that_gets_no_picture_says_why_and_asks_again_after_a_change(blender, seen, viewport, tmp_path):
+def test_a_viewport_shows_render_errors_and_retries_after_a_change(blender, seen, viewport, tmp_path):
     port = viewport.Port()
     wish = viewport.Wish(seen(20), sky=True, transparent=False, moving=1)
     (tmp_path / "scene.r5dgs").rename(tmp_path / "gone.r5dgs")

@@ -114,7 +114,7 @@ def test_cameras_whose_names_differ_in_signs_alone_have_views_of_their_own(blend
     assert len({name.casefold() for name in names}) == len(names) == 5
 
 
-def test_what_is_no_pinhole_camera_is_refused_and_nothing_written(blender, view, tmp_path):
+def test_exporting_a_non_pinhole_camera_raises_and_writes_nothing(blender, view, tmp_path):
     view.data.type = "PANO"
     with pytest.raises(RuntimeError, match="perspective"):
         blender.ops.r5dgs.export_cameras(directory=str(tmp_path / "out"))

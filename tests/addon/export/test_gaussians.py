@@ -104,7 +104,7 @@ def select(splats, rows):
     return Splats(**{name: None if values is None else values[rows] for name, values in parts.items()})
 
 
-def test_what_was_moved_turned_scaled_and_mirrored_looks_as_in_blender(blender, scene, loaded, tmp_path):
+def test_exported_gaussians_keep_translation_rotation_scale_and_mirroring(blender, scene, loaded, tmp_path):
     blender.context.scene.frame_set(43)
     edit(blender, loaded)
     camera = in_blender(scene.cameras[0])
@@ -149,7 +149,7 @@ def test_a_moved_turned_scaled_and_tinted_object_looks_as_in_the_preview(blender
     assert psnr(render(export(blender, tmp_path / "b.ply"), scene, camera), shown_there) < 40
 
 
-def test_what_third_parties_read_looks_as_in_the_preview(blender, scene, previewed, tmp_path):
+def test_exported_ply_read_by_trimesh_matches_the_preview(blender, scene, previewed, tmp_path):
     trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed; it comes with the extra 'test'")
     camera, shown_there = previewed[1]()
     assert blender.ops.r5dgs.export_ply(filepath=str(tmp_path / "a.ply")) == {"FINISHED"}
@@ -180,7 +180,7 @@ def test_an_unedited_scene_is_that_of_playback(blender, scene, loaded, tmp_path)
     assert psnr(render(splats, scene, scene.cameras[0]), wanted) > 50
 
 
-def test_what_bends_is_exported_bent_in_exact_mode(blender, scene, tmp_path):
+def test_exact_mode_exports_deformed_gaussians(blender, scene, tmp_path):
     rows, knots = np.array([120, 260], np.int32), len(scene.tracks.times)
     offsets = np.full((2, knots, 3), 0.5, np.float32) * np.linspace(1, 0, knots)[None, :, None].astype(np.float32)
     bent = scene.with_arrays(
@@ -298,7 +298,7 @@ def test_third_parties_read_the_columns(blender, loaded, tmp_path):
     np.testing.assert_allclose(rest, ours.quats, atol=1e-6)
 
 
-def test_what_cannot_be_exact_is_said(blender, loaded, tmp_path, capsys):
+def test_inexact_transforms_of_the_export_are_reported(blender, loaded, tmp_path, capsys):
     cloud(loaded, "mug").scale = (1, 2, 1)
     cloud(loaded, "red apple").scale = (0, 0, 0)  # nothing to see, so nothing to export
     blender.context.view_layer.update()
@@ -314,7 +314,7 @@ def test_a_folder_that_is_not_there_is_an_error_and_no_file(blender, loaded, tmp
     assert not (tmp_path / "none").exists()
 
 
-def test_without_a_scene_the_operator_says_what_to_do(blender):
+def test_ply_export_is_disabled_without_a_scene(blender):
     assert not blender.ops.r5dgs.export_ply.poll()
 
 

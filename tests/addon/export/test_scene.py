@@ -85,7 +85,7 @@ def test_an_unedited_scene_is_the_same_file(blender, tmp_path, key_tolerance):
     assert (blender.context.scene.frame_current, blender.context.scene.frame_subframe) == (17, 0.25)
 
 
-def test_what_was_moved_in_its_anchor_or_by_a_parent_is_there_again(blender, scene, loaded, tmp_path):
+def test_exported_scene_keeps_transforms_of_clouds_anchors_and_parents(blender, scene, loaded, tmp_path):
     cloud(loaded, "mug").matrix_local = MATRIX @ Matrix.Scale(1.6, 4)
     handle = blender.data.objects.new("handle", None)
     handle.matrix_world = MATRIX.inverted() @ Matrix.Scale(0.5, 4)
@@ -184,7 +184,7 @@ def test_the_file_that_a_scene_plays_from_is_not_replaced(blender, loaded, tmp_p
     assert (tmp_path / "scene.r5dgs").read_bytes() == before
 
 
-def test_without_its_file_a_scene_says_what_to_do(blender, loaded, tmp_path):
+def test_export_without_the_scene_file_raises(blender, loaded, tmp_path):
     (tmp_path / "scene.r5dgs").rename(tmp_path / "elsewhere.r5dgs")
     with pytest.raises(RuntimeError, match="Scene File"):
         blender.ops.r5dgs.export_scene(filepath=str(tmp_path / "b.r5dgs"))
@@ -202,7 +202,7 @@ def test_stopping_leaves_no_file_and_the_frame_where_it_was(blender, loaded, tmp
     assert [path.name for path in tmp_path.iterdir()] == ["scene.r5dgs"]
 
 
-def test_a_root_that_was_moved_is_said(blender, loaded, tmp_path, capsys):
+def test_export_reports_a_moved_root(blender, loaded, tmp_path, capsys):
     loaded.r5dgs.root.location = (1, 0, 0)
     blender.context.view_layer.update()
     save(blender, tmp_path / "b.r5dgs")
@@ -238,7 +238,7 @@ def test_a_motion_taken_from_another_object_is_there_again(blender, scene, loade
 
 
 @pytest.mark.parametrize("observed", [1, 4], ids=["still scene", "scene that begins late"])
-def test_what_moves_before_the_first_observed_time_is_said_to_be_lost(blender, scene, tmp_path, capfd, observed):
+def test_export_reports_motion_before_the_first_observed_time(blender, scene, tmp_path, capfd, observed):
     late = scene.with_arrays(track_times=scene.tracks.times[-observed:], track_poses=scene.tracks.poses[:, -observed:])
     if observed == 1:
         still = [dataclasses.replace(group, model=models.STATIC) for group in late.groups]
@@ -264,7 +264,7 @@ def test_what_moves_before_the_first_observed_time_is_said_to_be_lost(blender, s
 
 
 @pytest.mark.parametrize("scale", [(0.0, 0.0, 0.0), (1e-8, 1.0, 1.0)])
-def test_what_is_too_flat_to_be_seen_is_not_in_the_file(blender, loaded, scale, tmp_path):
+def test_objects_flattened_to_invisibility_are_not_exported(blender, loaded, scale, tmp_path):
     cloud(loaded, "mug").scale = scale
     visible = importlib.import_module("r5dgs.r5dgs_addon.engine.visible_clouds")
     _, seen = visible.instances(blender.context.evaluated_depsgraph_get())

@@ -51,13 +51,13 @@ def notes(bpy):
     return [note.name for note in bpy.context.window_manager.r5dgs_words.notes]
 
 
-def test_the_encoder_of_the_preferences_knows_other_words(loaded):
+def test_the_encoder_of_the_preferences_matches_words_not_stored_in_the_scene(loaded):
     assert ask(loaded, "zorb") == {"FINISHED"}
     (match,) = [m for m in loaded.context.window_manager.r5dgs_words.matches if m.object_id == 2]
     assert "meaning of 'zorb'" in match.why and match.score >= 0.5 and notes(loaded) == []
 
 
-def test_a_phrase_is_embedded_once_and_names_need_nobody(loaded, monkeypatch):
+def test_a_phrase_is_embedded_once_and_names_need_no_encoder(loaded, monkeypatch):
     worker = motions.addon("worker.jobs")
     asked, run = [], worker.run
     monkeypatch.setattr(worker, "run", lambda steps: asked.append(steps[0][2]["texts"]) or run(steps))
@@ -81,7 +81,7 @@ def test_another_encoder_is_named_with_the_remedy(loaded, folders, monkeypatch):
     assert "made by the encoder 'own'; the preferences' 'other' cannot be asked" in notes(loaded)[0]
 
 
-def test_a_damaged_encoder_is_said_and_names_are_searched_all_the_same(loaded, tmp_path, monkeypatch):
+def test_a_damaged_encoder_is_reported_and_names_are_still_searched(loaded, tmp_path, monkeypatch):
     monkeypatch.setenv("R5DGS_TEXT_ENCODER", str(tmp_path))
     assert ask(loaded, "mug and zorb") == {"FINISHED"}
     assert f"Text encoder: {tmp_path}/config.json: expected in the folder of an encoder" in notes(loaded)[0]
@@ -124,7 +124,7 @@ def test_an_answer_that_comes_later_is_not_shown_where_another_prompt_stands(win
     assert session.asked == "mug" and [match.object_id for match in session.matches] == [1]
 
 
-def test_what_goes_wrong_later_is_said_beside_what_is_known(windowed, monkeypatch):
+def test_late_encoder_errors_are_shown_beside_the_known_matches(windowed, monkeypatch):
     monkeypatch.setenv("R5DGS_TEXT_ENCODER", "/nowhere")
     ask(windowed, "mug and zorb")
     wait_for_the_answer()
@@ -132,7 +132,7 @@ def test_what_goes_wrong_later_is_said_beside_what_is_known(windowed, monkeypatc
     assert "Text encoder: /nowhere: expected the folder of an encoder" in notes(windowed)[-1]
 
 
-def test_what_was_asked_in_another_file_is_not_answered_in_this_one(loaded):
+def test_opening_another_file_drops_pending_phrase_embeddings(loaded):
     phrases, told = motions.addon("language.phrase_embeddings"), []
     phrases.begin(["zorb"], told.append)
     loaded.ops.wm.read_homefile(app_template="")

@@ -39,7 +39,7 @@ def test_aliases_plurals_and_typos_find_it(blender, loaded, text, object_id):
     assert selected_ids(blender) == {object_id}
 
 
-def test_what_an_object_answers_to_is_kept_word_for_word(blender, tmp_path):
+def test_aliases_are_kept_verbatim(blender, tmp_path):
     made = scenes.make_scene(n=100, objects=1)
     words = ("cup, blue", "", " mug ", "tasse")
     table = tuple(dataclasses.replace(item, aliases=words) if item.id == 1 else item for item in made.objects)
@@ -78,7 +78,7 @@ def test_modes_set_add_and_subtract(blender, loaded):
     assert selected_ids(blender) == {4}
 
 
-def test_nothing_matching_is_said_and_leaves_the_selection(blender, loaded):
+def test_a_prompt_without_matches_keeps_the_selection(blender, loaded):
     ask(blender, "mug")
     assert ask(blender, "submarine") == {"CANCELLED"}
     session = blender.context.window_manager.r5dgs_words
@@ -137,7 +137,7 @@ def test_the_threshold_decides_what_matches(blender, loaded):
     assert blender.context.scene.r5dgs_words.threshold == pytest.approx(0.3)
 
 
-def test_what_was_meant_is_said_and_offered(blender, loaded, capfd):
+def test_similar_names_are_reported_and_suggested(blender, loaded, capfd):
     assert ask(blender, "bug") == {"CANCELLED"}
     assert "did you mean 'mug'" in capfd.readouterr().out
     assert [item.name for item in session(blender).meant][0] == "mug"
@@ -204,7 +204,7 @@ def test_duplicates_are_selected_with_their_object(blender, loaded):
     assert {obj.name for obj in blender.context.selected_objects} == {"mug", "mug.001", "mug anchor", "mug anchor.001"}
 
 
-def test_what_was_deleted_is_no_match_but_said(blender, loaded, capfd):
+def test_deleted_objects_are_reported_but_do_not_match(blender, loaded, capfd):
     ask(blender, "lemon")
     blender.ops.object.delete()
     assert ask(blender, "fruit") == {"FINISHED"}
@@ -218,7 +218,7 @@ def test_what_was_deleted_is_no_match_but_said(blender, loaded, capfd):
     assert "lemon was deleted" in capfd.readouterr().out
 
 
-def test_of_two_scenes_the_active_one_is_searched_or_both(blender, loaded, tmp_path):
+def test_a_prompt_searches_the_active_scene_or_all_scenes(blender, loaded, tmp_path):
     path = scene_file.write(scenes.make_scene(n=200, objects=2), tmp_path / "other.r5dgs")
     blender.ops.r5dgs.load_scene(filepath=str(path))
     other = next(c for c in blender.data.collections if c.r5dgs.is_scene and c != loaded)
@@ -271,7 +271,7 @@ def meaningful(blender, tmp_path):
     return path, rich
 
 
-def test_stored_meanings_find_what_no_name_says(blender, meaningful):
+def test_stored_embeddings_match_phrases_that_no_name_contains(blender, meaningful):
     assert ask(blender, "sour things") == {"FINISHED"}
     assert selected_ids(blender) == {4} and "meaning of 'sour thing'" in session(blender).matches[0].why
 
@@ -285,7 +285,7 @@ def test_meanings_are_read_again_when_the_file_changes(blender, meaningful):
 
 
 @pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"PK")])
-def test_when_the_scene_file_is_gone_names_are_searched_and_that_is_said(blender, meaningful, damage):
+def test_without_the_scene_file_only_names_are_searched_with_a_note(blender, meaningful, damage):
     damage(meaningful[0])
     assert ask(blender, "sour things") == {"CANCELLED"}
     assert ask(blender, "lemon") == {"FINISHED"}
@@ -306,7 +306,7 @@ def test_without_a_scene_the_operators_cannot_be_called(blender):
         ("fruit but not the lemon", {2}),
     ],
 )
-def test_everything_and_what_is_left_out_mean_what_they_say(blender, loaded, text, ids):
+def test_everything_and_exclusions_select_the_expected_objects(blender, loaded, text, ids):
     assert ask(blender, text) == {"FINISHED"} and selected_ids(blender) == ids
 
 
@@ -317,7 +317,7 @@ def test_nothing_selects_nothing(blender, loaded):
 
 
 @pytest.mark.parametrize("text", ["not the vaze", "everything but", "mug but not the vaze"])
-def test_leaving_out_what_is_unknown_is_an_error_that_selects_nothing(blender, loaded, text):
+def test_excluding_an_unknown_object_raises_and_selects_nothing(blender, loaded, text):
     ask(blender, "globe")
     with pytest.raises(RuntimeError, match="excludes an unknown object|nothing to exclude after"):
         ask(blender, text)
@@ -328,7 +328,7 @@ def test_leaving_out_what_is_unknown_is_an_error_that_selects_nothing(blender, l
         blender.ops.r5dgs.isolate(text=text)
 
 
-def test_of_two_scenes_one_knows_what_is_left_out(blender, loaded, tmp_path):
+def test_excluding_an_object_of_one_scene_selects_all_objects_of_the_other(blender, loaded, tmp_path):
     path = scene_file.write(scenes.make_scene(n=200, objects=2), tmp_path / "other.r5dgs")
     blender.ops.r5dgs.load_scene(filepath=str(path))
     blender.context.scene.r5dgs_words.all_scenes = True

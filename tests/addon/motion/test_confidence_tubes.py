@@ -72,7 +72,7 @@ def test_all_that_move_get_one_where_nothing_is_chosen_and_a_second_press_remove
     assert {kind: {d.name for d in getattr(blender.data, kind)} for kind in before} == before
 
 
-def test_where_one_path_cannot_be_read_no_tube_is_made(blender, loaded):
+def test_an_unreadable_path_prevents_all_tubes(blender, loaded):
     anchors = [obj for obj in loaded.all_objects if obj.r5dgs.role == "ANCHOR" and obj.r5dgs_motion.leader is None]
     blender.ops.r5dgs.show_confidence(action="SHOW")
     shown = [anchor for anchor in anchors if anchor.r5dgs_motion.tube is not None]
@@ -136,7 +136,7 @@ def test_tubes_survive_saving(blender, loaded, tmp_path):
     assert mug.r5dgs_motion.tube is None and not blender.data.meshes.get("mug confidence")
 
 
-def test_nothing_that_moves_is_said(blender, loaded, capfd):
+def test_showing_confidence_without_motion_reports_that_nothing_moves(blender, loaded, capfd):
     motions.choose(blender, blender.data.objects["wooden block anchor"])
     assert blender.ops.r5dgs.show_confidence() == {"CANCELLED"}
     assert "Nothing moves" in capfd.readouterr().out

@@ -158,7 +158,7 @@ def test_deleting_takes_what_belongs_to_the_object_and_nothing_else(blender, sce
 
 
 @pytest.mark.parametrize("name", ["background", "mug"])
-def test_what_a_prompt_selects_is_one_object_though_some_of_it_moves_with_others(blender, tmp_path, name):
+def test_clouds_that_move_with_another_object_are_selected_with_their_own_object(blender, tmp_path, name):
     """Clouds that move with another object are selected, and do not stand for that one."""
     scene = scenes.make_scene(n=400, objects=5, seed=1)
     motion_ids = scene.gaussians.motion_ids.copy()

@@ -124,7 +124,7 @@ def test_undo_and_redo_keep_points_and_listener_in_step(blender, scene, loaded):
     assert_bends_like_the_core(blender, blender.data.collections[name], scene, (0.2, 0.3333))
 
 
-def test_a_scene_whose_objects_are_rigid_says_that_there_is_nothing_to_play(blender, tmp_path):
+def test_exact_mode_raises_for_a_rigid_scene(blender, tmp_path):
     motions.load(blender, scene_file.write(tiny_datasets.make_truth(), tmp_path / "rigid.r5dgs"))
     with pytest.raises(RuntimeError, match="moves as a whole"):
         blender.ops.r5dgs.exact_mode()

@@ -218,7 +218,7 @@ def test_a_curve_whose_handles_overlap_keeps_its_shape_when_it_is_cut(blender, l
         np.testing.assert_allclose([curve.evaluate(f) for f in frames], before[name], atol=5e-6)
 
 
-def test_what_cannot_be_cut_is_refused_and_nothing_changes(blender, mug):
+def test_curves_that_cannot_be_cut_raise_and_stay_unchanged(blender, mug):
     for curve in motions.curves(mug).values():
         remove_key_at_t_max(curve)
         for point in curve.keyframe_points:
@@ -362,7 +362,7 @@ def test_reset_reads_observed_keys_from_the_file_when_asked_to(blender, scene_pa
     motions.assert_plays_like_the_core(blender, loaded, scene_file.read(scene_path), TIMES)
 
 
-def test_reset_from_a_file_that_is_gone_says_so_and_changes_nothing(blender, scene_path, loaded, mug):
+def test_reset_with_a_missing_file_raises_and_changes_nothing(blender, scene_path, loaded, mug):
     scene_path.unlink()
     before = motions.keys(mug)
     with pytest.raises(RuntimeError, match="synthetic.r5dgs"):
@@ -540,7 +540,7 @@ def test_numbers_are_written_at_once_when_that_is_wanted(blender, loaded, mug):
     assert not motions.addon("motion.physics").is_written(mug)
 
 
-def test_what_lies_in_another_blend_file_is_refused(blender, loaded, tmp_path):
+def test_linked_objects_are_refused(blender, loaded, tmp_path):
     blend = tmp_path / "library.blend"
     blender.ops.wm.save_as_mainfile(filepath=str(blend))
     blender.ops.wm.read_homefile(app_template="")
@@ -584,7 +584,7 @@ def test_speeds_beyond_all_measure_do_no_harm(blender, loaded, mug, speed):
     assert not motions.addon("motion.physics").edited(mug.r5dgs_motion)
 
 
-def test_what_is_no_number_is_refused_by_name(blender, mug):
+def test_a_velocity_that_is_not_finite_raises_an_error_that_names_it(blender, mug):
     before = motions.keys(mug)
     mug.r5dgs_motion.velocity = (math.nan, 0.0, 0.0)
     with pytest.raises(RuntimeError, match="mug anchor: velocity: expected three finite numbers"):
@@ -609,7 +609,7 @@ def test_a_curve_that_has_lost_all_keys_holds_and_the_others_get_fewer(blender, 
     assert motions.curves(mug)["location", 2].evaluate(20.0) == pytest.approx(0.3)
 
 
-def test_what_a_curve_without_keys_leaves_alone_is_where_the_new_motion_begins(blender, loaded, mug):
+def test_a_channel_without_keys_starts_the_new_motion_at_its_current_value(blender, loaded, mug):
     curve = motions.curves(mug)["location", 2]
     for point in list(curve.keyframe_points)[::-1]:
         curve.keyframe_points.remove(point)

@@ -81,7 +81,7 @@ def test_the_point_that_the_pivot_was_moved_to_stays_and_others_turn(blender, lo
 
 
 @pytest.mark.parametrize("name", ["pendulum", "turn"])
-def test_what_lies_on_the_axis_that_was_set_stays(blender, loaded, mug, name):
+def test_points_on_a_set_axis_stay_fixed(blender, loaded, mug, name):
     kind, fields = KINDS[name]
     set_up(mug.r5dgs_motion, kind, **fields)
     mug.r5dgs_pivot.point = PIVOT
@@ -204,7 +204,7 @@ def test_export_writes_the_moved_pivot(blender, scene_path, tmp_path):
     assert np.abs(scene_player.frame(scene, 1.0).means - scene_player.frame(scene, T_MAX).means).max() > 0.1
 
 
-def test_what_has_no_pivot_shows_none_and_says_so(blender, loaded, mug):
+def test_motions_without_a_pivot_show_none(blender, loaded, mug):
     (panel,) = importlib.import_module("r5dgs.r5dgs_addon.panels.motion").CLASSES
     state = mug.r5dgs_motion
     has = {"static": 0, "translation": 0, "ballistic_spin": 2, "constant_twist": 2, "world_twist": 2, "free_top": 0}

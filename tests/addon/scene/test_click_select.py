@@ -52,7 +52,7 @@ def test_shift_adds_anchors_makes_them_active_and_takes_the_active_one_out(blend
 
 
 @pytest.mark.parametrize("name", ["Cube", "mug anchor"])
-def test_what_is_no_cloud_stays_selected(blender, click, name):
+def test_objects_that_are_not_clouds_stay_selected(blender, click, name):
     choose(blender, name)
     assert click.follow(blender.context, extend=False) is None and selected(blender) == {name}
 

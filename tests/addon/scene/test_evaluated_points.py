@@ -302,7 +302,7 @@ def test_edits_survive_saving_and_loading(blender, mug, rendered, tmp_path):
     np.testing.assert_array_equal(rendered()[0], before)
 
 
-def test_what_cannot_be_drawn_is_named(blender, loaded, mug, cloud_points, visible, tmp_path, capfd):
+def test_points_that_cannot_be_drawn_are_reported(blender, loaded, mug, cloud_points, visible, tmp_path, capfd):
     nodes(blender, mug, doubled)
     visible.instances(blender.context.evaluated_depsgraph_get())
     said = " | ".join(cloud_points.notes(loaded))
@@ -311,7 +311,7 @@ def test_what_cannot_be_drawn_is_named(blender, loaded, mug, cloud_points, visib
     assert "mesh made by its modifiers" in capfd.readouterr().out
 
 
-def test_what_cannot_be_drawn_of_a_linked_scene_is_named_where_it_is_instanced(blender, mug, visible, tmp_path):
+def test_undrawable_points_of_a_linked_scene_are_reported_at_its_instance(blender, mug, visible, tmp_path):
     nodes(blender, mug, doubled)
     library = str(tmp_path / "library.blend")
     blender.ops.wm.save_as_mainfile(filepath=library)
@@ -341,7 +341,7 @@ def test_unrealized_instances_and_radii_are_named(blender, loaded, mug, cloud_po
     assert any("radius" in note for note in cloud_points.notes(loaded))
 
 
-def test_what_did_not_change_is_compared_once(blender, mug, visible, cloud_points, monkeypatch):
+def test_unchanged_points_are_compared_once(blender, mug, visible, cloud_points, monkeypatch):
     clouds, counted = importlib.import_module("r5dgs.r5dgs_addon.scene.point_clouds"), []
     plain = clouds.fingerprint
     monkeypatch.setattr(clouds, "fingerprint", lambda values: counted.append(1) or plain(values))
@@ -390,7 +390,7 @@ def test_apply_transform_leaves_the_numbers_of_the_edited_scene(blender, scene, 
         np.testing.assert_allclose(after.arrays()[name], before.arrays()[name], atol=2e-4, err_msg=name)
 
 
-def test_points_that_nodes_animate_are_said_to_be_written_as_they_end(blender, mug, tmp_path, capfd):
+def test_animated_node_points_are_reported_as_exported_at_their_last_frame(blender, mug, tmp_path, capfd):
     nodes(blender, mug, swaying)
     blender.ops.r5dgs.export_scene(filepath=str(tmp_path / "a.r5dgs"))
     assert "mug: points that modifiers animate" in capfd.readouterr().out

@@ -36,7 +36,7 @@ def test_only_the_named_objects_stay_and_the_rest_of_the_file_too(blender, load)
     assert shown(blender) == before
 
 
-def test_what_was_hidden_before_is_hidden_again(blender, load):
+def test_unisolating_restores_hidden_objects(blender, load):
     blender.data.objects["mug"].hide_set(True)
     blender.data.objects["red apple"].hide_render = True
     blender.data.objects["toy car anchor"].hide_set(True)
@@ -76,7 +76,7 @@ def test_it_survives_saving_renaming_and_deleting(blender, load, tmp_path):
     assert shown(blender) == before
 
 
-def test_nothing_to_isolate_is_said_and_changes_nothing(blender, load):
+def test_isolating_no_object_is_cancelled_and_changes_nothing(blender, load):
     before = shown(blender)
     assert blender.ops.r5dgs.isolate(text="submarine") == {"CANCELLED"}
     for obj in blender.context.selected_objects:

@@ -48,7 +48,7 @@ def test_points_stand_where_playback_has_them_at_any_time(blender, tmp_path, con
     motions.assert_plays_like_the_core(blender, motions.load(blender, path), scene_file.read(path), TIMES)
 
 
-def test_loading_says_what_bends_and_is_not_played(blender, tmp_path, capfd):
+def test_loading_warns_of_deformation_that_anchors_do_not_play(blender, tmp_path, capfd):
     datasets = drawn_scenes()
     scene = datasets.make_truth()
     bending = datasets.breathing(scene, 0.3)
@@ -123,7 +123,7 @@ def test_points_carry_the_files_gaussians_under_the_native_names(blender, scene_
         np.testing.assert_array_equal(ids, np.arange(rows.start, rows.stop))
 
 
-def test_what_points_are_made_with_is_gone_afterwards(blender, scene_path):
+def test_loading_leaves_no_temporary_data(blender, scene_path):
     before = len(blender.data.objects), len(blender.data.pointclouds)
     collection = motions.load(blender, scene_path)
     assert len(blender.data.scenes) == 1 and not blender.data.node_groups
@@ -172,7 +172,7 @@ def test_only_what_moves_has_curves(blender, scene_path):
     assert {path for path, _ in curves_of(anchor_of(collection, "mug"))} == {"location", "rotation_quaternion"}
 
 
-def test_what_only_slides_has_two_keys(blender, tmp_path):
+def test_a_uniform_translation_has_two_keys(blender, tmp_path):
     truth = drawn_scenes().make_truth()
     slide = models.MotionModel("translation", velocity=[0.9, 0.35, 0.0], radius=0.5)
     poses = truth.tracks.poses.copy()

@@ -36,7 +36,7 @@ def drawn(bpy, collection, name):
     return said
 
 
-def test_a_row_says_how_many_gaussians_and_how_they_move(blender, loaded):
+def test_a_row_shows_the_number_of_gaussians_and_the_kind_of_motion(blender, loaded):
     said = drawn(blender, loaded, "mug")
     entry = row_of(loaded, "mug")
     assert {"color", "label", "hidden", "hidden_in_renders", f"{entry.count:,}"} <= set(said)
@@ -45,7 +45,7 @@ def test_a_row_says_how_many_gaussians_and_how_they_move(blender, loaded):
     assert kinds[anchor.r5dgs_motion.kind].name in said
 
 
-def test_a_deleted_object_is_said_to_be(blender, loaded):
+def test_a_deleted_object_is_shown_as_deleted(blender, loaded):
     blender.data.objects.remove(blender.data.objects["mug"])
     said = drawn(blender, loaded, "mug")
     assert "deleted" in said and "hidden" not in said
@@ -128,7 +128,7 @@ def test_recolouring_can_be_undone_and_redone(blender, loaded):
     assert state() == states[1]
 
 
-def test_of_a_linked_scene_only_what_is_kept_here_changes(blender, loaded, tmp_path):
+def test_in_a_linked_scene_only_local_properties_change(blender, loaded, tmp_path):
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
     blender.ops.wm.read_homefile(app_template="", use_empty=True)
     with blender.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (source, target):
@@ -153,7 +153,7 @@ def test_of_a_linked_scene_only_what_is_kept_here_changes(blender, loaded, tmp_p
     assert all(obj.visible_get() for obj in clouds)
 
 
-def test_a_tint_that_is_linked_stays_and_that_is_said(blender, loaded, tmp_path, capfd):
+def test_resetting_a_linked_tint_is_refused_with_a_report(blender, loaded, tmp_path, capfd):
     loaded.all_objects["mug"].r5dgs_look.tint = TINT
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
     blender.ops.wm.read_homefile(app_template="", use_empty=True)

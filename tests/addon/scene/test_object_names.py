@@ -55,7 +55,7 @@ def test_a_name_that_another_file_data_has_counts_without_blenders_number(blende
     assert table.names(loaded)[MUG] == "teapot"
 
 
-def test_two_objects_of_one_name_are_told_apart(blender, loaded, table):
+def test_objects_with_equal_names_are_distinguished(blender, loaded, table):
     blender.data.objects["mug anchor"].name = "red apple"
     assert table.names(loaded)[MUG] == "red apple 2" and table.names(loaded)[APPLE] == "red apple"
 

@@ -69,7 +69,7 @@ def test_a_broken_property_counts_as_none(loaded, loaded_scenes, value):
     assert loaded_scenes.origin(loaded).tolist() == [0, 0, 0]
 
 
-def test_the_panel_tells_the_origin_in_one_line(blender, loaded, loaded_scenes):
+def test_the_panel_shows_the_origin_in_one_line(blender, loaded, loaded_scenes):
     panel = importlib.import_module("r5dgs.r5dgs_addon.panels.scene").R5DGS_PT_scene
     assert f"Relative to {TEXT}" in layouts.draw(blender, panel)
     del loaded.r5dgs.root[loaded_scenes.ORIGIN]
@@ -94,7 +94,7 @@ def test_exported_cameras_of_the_file_are_those_of_the_data_sets_world(blender, 
     np.testing.assert_allclose(-T_cam_world[:3, :3].T @ T_cam_world[:3, 3] - ORIGIN, own.center, atol=1e-5)
 
 
-def test_exported_cameras_in_other_axes_are_relative_and_say_so(blender, view, tmp_path, capfd):
+def test_exported_cameras_in_other_axes_are_relative_to_the_origin_with_a_report(blender, view, tmp_path, capfd):
     options = {"directory": str(tmp_path), "frames": "CURRENT", "axes": "BLENDER"}
     assert blender.ops.r5dgs.export_cameras(**options) == {"FINISHED"}
     entry = transforms.read(tmp_path / "transforms.json")[0][0]
@@ -102,7 +102,7 @@ def test_exported_cameras_in_other_axes_are_relative_and_say_so(blender, view, t
     assert f"relative to {TEXT}" in "".join(capfd.readouterr())
 
 
-def test_an_exported_ply_is_relative_to_the_origin_and_says_so(blender, loaded, scene_path, tmp_path, capfd):
+def test_an_exported_ply_is_relative_to_the_origin_and_stores_it(blender, loaded, scene_path, tmp_path, capfd):
     scene, path = scene_file.read(scene_path), tmp_path / "out.ply"
     go_to(blender, scene.t_max)
     assert blender.ops.r5dgs.export_ply(filepath=str(path), axes="FILE") == {"FINISHED"}

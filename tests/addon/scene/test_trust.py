@@ -85,7 +85,7 @@ def test_opening_a_blend_reads_no_file_from_elsewhere_until_the_user_allows_it(b
     assert collection.r5dgs_exact.problem == ""
 
 
-def test_what_a_blend_can_store_allows_nothing(blender, blend, scene_path, trust, reads):
+def test_data_stored_in_a_blend_file_grants_no_trust(blender, blend, scene_path, trust, reads):
     collection = opened(blender, blend)
     blender.ops.wm.save_mainfile()
     blender.ops.wm.save_as_mainfile(filepath=str(blend.with_name("copy.blend")), copy=True)

@@ -16,12 +16,12 @@ from tests.support import scenes
         (40_000, "40,000 Gaussians", "40,000 Gaussians bend"),
     ],
 )
-def test_one_is_said_as_one_and_several_as_several(blender, count, things, done):
+def test_plural_follows_the_count(blender, count, things, done):
     amounts = importlib.import_module("r5dgs.r5dgs_addon.ui.plural")
     assert amounts.of(count, "Gaussian") == things and amounts.of(count, "Gaussian", "bend") == done
 
 
-def test_a_scene_of_one_object_is_told_as_such(blender, tmp_path, capfd):
+def test_loading_one_object_reports_the_singular(blender, tmp_path, capfd):
     path = scene_file.write(scenes.make_scene(n=40, objects=1, seed=1), tmp_path / "one.r5dgs")
     blender.ops.r5dgs.load_scene(filepath=str(path))
     assert "one.r5dgs: 40 Gaussians, 1 object\n" in capfd.readouterr().out

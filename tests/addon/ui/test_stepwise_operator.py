@@ -88,7 +88,7 @@ def test_the_end_is_reported_with_what_was_not_as_expected(running):
 
 
 @pytest.mark.parametrize("why", ["a script asks", "there is no window", "Blender runs in the background"])
-def test_where_nobody_looks_all_is_done_at_once(running, monkeypatch, why):
+def test_scripts_and_background_run_all_steps_immediately(running, monkeypatch, why):
     def steps():
         yield running.Step(0, 1, "frame")
         return running.Outcome("1 file")
@@ -101,7 +101,7 @@ def test_where_nobody_looks_all_is_done_at_once(running, monkeypatch, why):
     assert window.timers == 0 and window.done == window.said == []
 
 
-def test_the_time_that_is_left_is_told_by_the_pace_so_far(running, monkeypatch):
+def test_the_remaining_time_follows_from_the_pace_so_far(running, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: now[0]))
 
@@ -119,7 +119,7 @@ def test_the_time_that_is_left_is_told_by_the_pace_so_far(running, monkeypatch):
     assert blink(operator, window) == {"FINISHED"}
 
 
-def test_the_window_shows_what_takes_long_before_that_is_done(running):
+def test_the_window_announces_a_slow_step_before_it_runs(running):
     packed = []
 
     def steps():
@@ -157,7 +157,7 @@ def test_esc_leaves_the_window_as_it_was_even_where_undoing_the_steps_fails(runn
     assert tidy(window)
 
 
-def test_what_runs_beside_the_window_is_stopped_before_the_extension_goes(running, extension, monkeypatch):
+def test_unregistering_stops_running_steps_first(running, extension, monkeypatch):
     closed, stop, window = [], running.stop_all, None
     monkeypatch.setattr(running, "stop_all", lambda context: stop(window))  # the module bpy has no window
     operator, window, _ = begin(running, endless(running, closed))

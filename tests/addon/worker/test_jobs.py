@@ -86,7 +86,7 @@ def test_the_latest_request_of_a_key_wins_and_other_keys_keep_their_turn(worker,
     assert not worker.busy()
 
 
-def test_what_runs_already_is_not_dropped_for_what_comes_later(worker):
+def test_a_running_request_is_not_dropped_for_a_later_one(worker):
     running = worker.current()
     os.kill(running.pid, signal.SIGSTOP)
     first = worker.submit("view", HELLO)
@@ -102,7 +102,7 @@ def test_a_request_in_place_waits_for_its_turn(worker, held):
     assert worker.request("hello")[0]["pid"] == running.pid and first.done
 
 
-def test_giving_up_what_waits_leaves_the_worker_alone_and_what_runs_ends_it(worker, held):
+def test_cancelling_a_waiting_job_keeps_the_worker_and_a_running_job_ends_it(worker, held):
     running, first = held
     waiting = worker.submit("view", HELLO)
     waiting.cancel()
@@ -183,7 +183,7 @@ def test_the_first_python_that_has_what_is_needed_is_taken(pythons, elsewhere):
     assert pythons.find([own], home) == able
 
 
-def test_this_python_can_run_the_worker_and_others_say_why_not(pythons, tmp_path):
+def test_unsuitable_pythons_are_rejected_with_the_reason(pythons, tmp_path):
     assert pythons.lacking(sys.executable) is None
     assert pythons.lacking(str(tmp_path / "none")) is not None
     dull = tmp_path / "dull"
@@ -192,7 +192,7 @@ def test_this_python_can_run_the_worker_and_others_say_why_not(pythons, tmp_path
     assert pythons.lacking(str(dull)) is not None
 
 
-def test_what_was_found_is_remembered_until_it_is_forgotten_or_gone(preferences, pythons, elsewhere, monkeypatch):
+def test_a_found_python_is_cached_until_it_is_forgotten_or_removed(preferences, pythons, elsewhere, monkeypatch):
     looked = []
     places = [fake_python(elsewhere / "one"), fake_python(elsewhere / "two")]
     monkeypatch.setattr(
@@ -229,7 +229,7 @@ def test_the_users_settings_name_the_python_after_the_preferences_and_before_the
     assert preferences.worker_python() == sys.executable
 
 
-def test_where_none_will_do_blenders_own_python_says_what_it_lacks(preferences, pythons, monkeypatch):
+def test_blenders_own_python_is_used_if_no_python_is_suitable(preferences, pythons, monkeypatch):
     monkeypatch.setattr(pythons, "find", lambda *_, **__: None)
     assert preferences.worker_python() == sys.executable
 
@@ -243,7 +243,7 @@ def elsewhere_called(function):
     return results[0]
 
 
-def test_another_thread_leaves_the_preferences_alone_and_knows_what_they_said_last(preferences, pythons, monkeypatch):
+def test_other_threads_use_cached_preferences_without_reading_them(preferences, pythons, monkeypatch):
     kept = types.SimpleNamespace(worker_python="", found_python="", trusted_folders="", worker_timeout=7)
     asked = []
     monkeypatch.setattr(preferences, "get", lambda: asked.append(threading.current_thread()) or kept)
@@ -273,7 +273,7 @@ def only_python(preferences, elsewhere, monkeypatch):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="the script is one of a POSIX shell")
-def test_who_asks_does_not_wait_for_the_search_and_can_give_it_up(worker, only_python, tmp_path):
+def test_the_search_for_a_python_does_not_block_and_can_be_cancelled(worker, only_python, tmp_path):
     told = tmp_path / "pid"
     only_python(f"echo $$ > {told}.new; /bin/mv {told}.new {told}; exec /bin/sleep 600\n")
     job = worker.submit("view", HELLO)
@@ -288,7 +288,7 @@ def test_who_asks_does_not_wait_for_the_search_and_can_give_it_up(worker, only_p
 
 
 @pytest.mark.skipif(os.name == "nt", reason="the script is one of a POSIX shell")
-def test_what_a_search_beside_the_window_finds_runs_the_worker_and_is_kept(
+def test_a_python_found_in_the_background_runs_the_worker_and_is_stored(
     worker, preferences, only_python, tmp_path, monkeypatch
 ):
     gate = tmp_path / "gate"

@@ -124,7 +124,7 @@ def test_a_switch_is_found_and_listed():
     assert rows[changed[0], a].new_id == rows[changed[0], b].usual_id
 
 
-def test_a_fragment_and_a_missing_object_do_not_part_it():
+def test_a_fragment_or_a_missed_object_does_not_split_an_object():
     seen = look(5, 2, 8)
     masks = [truth.copy() for truth in seen.truths]
     for k, (view, t) in enumerate(seen.moments):

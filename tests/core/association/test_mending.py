@@ -47,13 +47,13 @@ def test_right_masks_stay_as_they_are():
         np.testing.assert_array_equal(mask, truth())
 
 
-def test_what_was_missed_is_filled():
+def test_missed_objects_are_filled_in():
     masks = [truth() for _ in range(TIMES)]
     masks[3][masks[3] == 3] = 0
     np.testing.assert_array_equal(mended(masks)[3], truth())
 
 
-def test_what_was_run_together_is_parted():
+def test_merged_objects_are_separated():
     masks = [truth() for _ in range(TIMES)]
     masks[2][masks[2] == 2] = 1
     np.testing.assert_array_equal(mended(masks)[2], truth())
@@ -74,7 +74,7 @@ def test_an_object_that_nothing_shows_takes_no_pixel():
     np.testing.assert_array_equal(out[truth() != 3], truth()[truth() != 3])
 
 
-def test_what_is_unknown_stays_so_even_where_votes_show_an_object():
+def test_unknown_pixels_stay_unknown_despite_votes():
     masks = [truth() for _ in range(TIMES)]
     masks[0][masks[0] == 3] = UNKNOWN
     given, found = associated(masks)
@@ -82,7 +82,7 @@ def test_what_is_unknown_stays_so_even_where_votes_show_an_object():
     np.testing.assert_array_equal(mending.mend(masks[0], given[0].ids, drawn, found, 0), masks[0])
 
 
-def test_what_lies_in_several_segments_alike_takes_pixels_of_none():
+def test_an_object_spread_evenly_over_several_segments_takes_no_pixels():
     masks = [truth() for _ in range(TIMES)]
     masks[3][14:20, 4:6], masks[3][14:20, 6:8], masks[3][14:20, 8:10] = 0, 1, 2
     np.testing.assert_array_equal(mended(masks)[3], masks[3])
@@ -95,7 +95,7 @@ def test_votes_that_are_not_trusted_move_no_outline(doubt):
     np.testing.assert_array_equal(mended(masks, **doubt)[3], masks[3])
 
 
-def test_relabelling_follows_the_ids_and_knows_no_others():
+def test_relabelling_maps_ids_and_keeps_unknown_pixels():
     mask = np.array([[0, 5], [9, UNKNOWN]])
     new = mending.relabel(mask, np.array([0, 5, 9]), np.array([0, 2, 7]))
     assert new.tolist() == [[0, 2], [7, UNKNOWN]]

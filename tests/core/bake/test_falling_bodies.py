@@ -24,7 +24,7 @@ def fits_of(accelerations):
 
 
 @pytest.mark.parametrize(("convention", "up"), [("blender", 2), ("opengl", 1)])
-def test_what_falls_shares_gravity_and_what_brakes_does_not(convention, up):
+def test_falling_bodies_share_gravity_and_braking_ones_do_not(convention, up):
     down = np.zeros(3)
     down[up] = -6.0
     fits = fits_of([down, down, np.array([-4.0, 0, 0])])
@@ -35,7 +35,7 @@ def test_what_falls_shares_gravity_and_what_brakes_does_not(convention, up):
     assert shared[2] is fits[2][1].model
 
 
-def test_where_nobody_says_what_is_up_nothing_is_shared():
+def test_conventions_without_an_up_axis_share_no_gravity():
     fits = fits_of([np.array([0, 0, -6.0])] * 2)
     assert falling_bodies.share_gravity(fits, "colmap") == {k: fit.model for k, (_, fit) in fits.items()}
     assert falling_bodies.share_gravity({}, "blender") == {}

@@ -109,7 +109,7 @@ def test_a_classifier_is_on_where_one_was_trained():
     assert decisions(classified=False)["classifier"] == "off"
 
 
-def test_what_is_off_is_not_in_the_scene(baked):
+def test_disabled_parts_are_not_in_the_scene(baked):
     found = {row["name"]: row["decision"] for row in baked.needs if "object" not in row}
     assert (found["shading"] == "on") == (baked.shading is not None)
     assert (found["classifier"] == "on") == (baked.gaussians.identities is not None)
@@ -149,7 +149,7 @@ def test_an_object_at_rest_may_be_said_to_move(name):
 @pytest.mark.parametrize(
     "name", ["shading", "shadows", "view_dependent_colour", "sky_gradient", "classifier", "residuals"]
 )
-def test_what_was_not_learned_cannot_be_switched_on_and_the_table_says_so(name):
+def test_parts_that_were_not_trained_cannot_be_switched_on(name):
     row = table(classified=False, wanted={name: "on"})[name]
     assert row["decision"] == "off" and "set on by the user, but not trained" in row["reason"]
 
@@ -175,7 +175,7 @@ def test_contradictions_are_refused(need, key):
         config.load(None, [f"needs.{need}=on", key])
 
 
-def test_training_leaves_out_what_you_say_is_not_needed(tiny, tmp_path):
+def test_training_omits_parts_that_the_user_disables(tiny, tmp_path):
     off = [f"needs.{name}=off" for name in NAMES]
     settings = tiny_datasets.settings("train.iterations=60", *off)
     done = run.train(tiny.root, tmp_path / "run", settings)
@@ -189,7 +189,7 @@ def test_training_leaves_out_what_you_say_is_not_needed(tiny, tmp_path):
     assert all(row["reason"].startswith("set off by the user") for row in scene.needs)
 
 
-def test_colour_that_depends_on_the_view_is_learned_where_you_say_that_it_is_needed(tiny):
+def test_view_dependent_colour_is_learned_if_the_user_enables_it(tiny):
     trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings("needs.view_dependent_colour=on"))
     assert trainer.gaussians.params["sh_rest"].shape[1] == 3
     kept = training_needs.resolve(config.load(None, ["needs.view_dependent_colour=on", "train.sh_degree=2"]))
@@ -214,7 +214,7 @@ def test_bake_takes_no_other_override_than_needs(trained, tmp_path):
         bake.run_bake(trained.folder, tmp_path / "x.r5dgs", None, ["train.seed=1"])
 
 
-def test_the_table_says_what_was_regrouped():
+def test_the_table_lists_regrouped_gaussians():
     row = table(moves=observed_motion.Moves(3, 2, 1, 1, 60))["regrouping"]
     assert (row["value"], row["decision"]) == (6, "on")
     for part in ("of 60", "3 went to another body", "2 to a shadow", "1 to rest", "1 shadows rest"):

@@ -71,7 +71,7 @@ def with_noise(scene, turn=0.0, shift=0.0):
     return scene.with_arrays(track_poses=poses)
 
 
-def test_what_rests_rests_and_what_turns_or_slides_slowly_goes_on_so(given):
+def test_noise_is_simplified_to_rest_and_slow_motion_is_kept(given):
     name, truth, data = given
     scene, rows = simplified(with_noise(truth, 3e-4, 3e-5), data)
     decisions = {key: row["decision"] for key, row in rows.items()}
@@ -154,7 +154,7 @@ def test_a_baked_scene_keeps_what_the_checkpoint_shows_in_the_training_views(tra
     assert compared["checkpoint_psnr"] == stored
 
 
-def test_a_missing_image_is_said_and_the_poses_decide(trained, tiny, copied, caplog):
+def test_without_training_images_a_warning_is_logged_and_poses_decide(trained, tiny, copied, caplog):
     data = datasets.read(copied)
     for view in data.train:
         view.image_path.unlink()

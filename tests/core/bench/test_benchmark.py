@@ -90,7 +90,7 @@ def test_a_record_holds_what_evaluate_and_playing_find(made, tiny):
     assert json.loads((plan.out / benchmark.RESULT_FILE).read_text()) == result
 
 
-def test_what_is_finished_is_neither_trained_nor_measured_again(made, monkeypatch):
+def test_finished_runs_are_neither_trained_nor_measured_again(made, monkeypatch):
     plan, case, _, result = made
     before = contents(case.run)
     monkeypatch.setattr(process, "train", None)
@@ -169,7 +169,7 @@ def test_a_fault_in_one_case_does_not_cost_the_others(tiny, tmp_path, monkeypatc
     assert len(json.loads((tmp_path / benchmark.RESULT_FILE).read_text())["results"]) == 1
 
 
-def test_a_record_says_what_it_was_trained_and_measured_on(made):
+def test_a_record_stores_the_machines_of_training_and_measurement(made):
     _, case, _, result = made
     (found,) = result["results"]
     assert found["machine"] == benchmark.machine() and found["machine"]["cores"] >= 1
@@ -178,7 +178,7 @@ def test_a_record_says_what_it_was_trained_and_measured_on(made):
     assert cases.read_record(case)["measured"]["modes"]["rigid"]["machine"] == found["machine"]
 
 
-def test_what_was_measured_elsewhere_keeps_its_machine(made, monkeypatch):
+def test_results_measured_elsewhere_keep_their_machine(made, monkeypatch):
     plan, _, _, result = made
     monkeypatch.setattr(checkpoint, "machine", lambda: {"processor": "another"})
     (found,) = benchmark.run_bench(plan, progress_kind="none")["results"]
@@ -259,7 +259,7 @@ def test_every_preset_can_be_benchmarked_and_the_method_is_the_same_in_all(tiny,
     assert plain.train.iterations == configs.load(None, (), preset).train.iterations
 
 
-def test_what_does_not_suit_tracks_in_a_preset_is_still_the_users_to_set(tiny, tmp_path):
+def test_user_overrides_win_over_the_exceptions_of_a_preset_for_tracks(tiny, tmp_path):
     overrides = ("train.shading=false", "identity.training=off", "identity.weight=0.3")
     made = cases.make(cases.Plan((tiny.root,), tmp_path, preset="paper", overrides=overrides))
     found = {case.variant: configs.load(None, case.overrides, "paper") for case in made}
@@ -288,7 +288,7 @@ def test_a_sitting_of_which_nothing_is_known_makes_the_sum_unknown():
     assert set(cases.cost([]).values()) == {None}
 
 
-def test_a_damaged_record_says_what_to_remove(tiny, tmp_path):
+def test_a_damaged_record_raises_with_the_file_to_remove(tiny, tmp_path):
     (case,) = cases.make(plan_for(tiny, tmp_path))
     case.run.parent.mkdir()
     for text in ("{", "[]", '{"sittings": 3}'):
@@ -297,7 +297,7 @@ def test_a_damaged_record_says_what_to_remove(tiny, tmp_path):
             cases.read_record(case)
 
 
-def test_a_process_tells_its_own_memory_and_its_complaint(tmp_path):
+def test_a_process_reports_its_own_memory_and_error(tmp_path):
     ballast = np.ones(2**26)  # half a GiB here, which must not be counted there
     log_path, ended = tmp_path / "log", []
     log_path.write_text("an earlier complaint\n")

@@ -64,7 +64,7 @@ def test_seeds_become_their_mean_and_half_their_range():
     assert lines_of(played)[0]["FPS"] == "200.0 ± 0.0" and "seeds 0, 1" in played.caption
 
 
-def test_the_tables_say_which_records_were_measured_on_what():
+def test_the_tables_mark_the_machine_of_each_record():
     records = [record(seed=0), record(seed=1), record(variant="r5dgs", mode="standard")]
     found = result(records)
     assert "alike" not in tables.markdown(found)
@@ -77,7 +77,7 @@ def test_the_tables_say_which_records_were_measured_on_what():
     assert line.startswith("- measured:") and line.endswith("(room tracks rigid seed 1)")
 
 
-def test_the_tables_say_which_runs_were_trained_elsewhere_or_nobody_knows_where():
+def test_the_tables_mark_runs_trained_on_other_or_unknown_machines():
     records = [record(seed=0), record(seed=1), record(variant="r5dgs", mode="standard")]
     records[0]["trained_on"] = {**MACHINE, "versions": {"r5dgs": "0.1"}}
     records[2]["trained_on"] = None
@@ -136,7 +136,7 @@ def test_the_mean_over_scenes_is_given_where_all_scenes_have_a_figure():
     assert last["FLIP"] == "-" and last["PSNR"] == "25.00"
 
 
-def test_what_failed_is_in_the_tables_and_below_them():
+def test_failed_runs_are_listed_in_and_below_the_tables():
     names = {"scene": "b", "representation": "field", "variant": "r5dgs", "seed": 0}
     found = result([record("a")], [{**names, "error": "loss: nan | at step 3"}])
     (line,) = [line for line in lines_of(tables.sheets(found)[0]) if line["scene"] == "b"]

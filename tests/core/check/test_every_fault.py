@@ -126,7 +126,7 @@ def test_arrays_are_checked_although_scene_json_is_damaged(sound, tmp_path):
     assert "scene.json" in found[0] and "quats" in found[1] and "means" in found[2]
 
 
-def test_nothing_else_is_said_about_a_file_of_a_later_version(sound, tmp_path):
+def test_a_later_format_version_is_the_only_fault_reported(sound, tmp_path):
     def change(tree):
         tree.update(format_version=99, t_max="late")
 

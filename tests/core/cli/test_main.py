@@ -78,12 +78,12 @@ def test_evaluate_measures_a_run_and_a_scene(made, tiny, capsys, target):
     assert str(path) in capsys.readouterr().out.replace("\n", "")
 
 
-def test_evaluate_writes_where_it_is_told(made, tmp_path, capsys):
+def test_evaluate_writes_to_the_given_path(made, tmp_path, capsys):
     assert main.main(["evaluate", str(made[0]), "--json", str(tmp_path / "e.json")]) == 0
     assert set(json.loads((tmp_path / "e.json").read_text())) == {"scene", "splits", "objects", "train"}
 
 
-def test_info_tells_the_same_to_people_and_programs(made, capsys):
+def test_info_prints_the_same_values_as_text_and_json(made, capsys):
     assert main.main(["info", str(made[1]), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [o["name"] for o in found["objects"]] == ["background", "brick", "ball"]
@@ -230,7 +230,7 @@ def test_the_bundled_data_is_found_and_small():
     assert sum(p.stat().st_size for p in found.rglob("*") if p.is_file()) < 4e6
 
 
-def test_missing_bundled_data_is_said(monkeypatch, capsys, tmp_path):
+def test_missing_bundled_data_raises(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(demo, "DATASET", "nothing")
     assert "install r5dgs again" in complaint(capsys, "demo", "--out", tmp_path / "demo")
 
@@ -276,7 +276,7 @@ def test_the_table_is_shown_even_where_the_file_cannot_be_written(made, tmp_path
     assert "PSNR" in shown.out and "No space left" in shown.err and str(made[0] / "evaluation.json") in shown.err
 
 
-def test_only_the_data_of_a_run_bakes_it_and_measuring_on_others_is_said(made, tmp_path, capsys, caplog):
+def test_baking_with_other_data_raises_and_evaluating_on_it_warns(made, tmp_path, capsys, caplog):
     other = tiny_datasets.make_dataset(tmp_path / "other", views=3)
     line = complaint(capsys, "bake", made[0], "--out", tmp_path / "x.r5dgs", "--data", other.root)
     assert f"{other.root}: is not the data that {made[0]} was trained on" in line
@@ -350,7 +350,7 @@ def test_a_scene_goes_into_a_file_that_blender_finds(made, tmp_path, capsys):
     assert ".r5dgs" in complaint(capsys, *wrong, status=ExitStatus.USAGE)
 
 
-def test_a_data_set_that_has_moved_is_asked_for(made, tmp_path, capsys):
+def test_a_moved_data_set_raises_with_the_option_for_its_path(made, tmp_path, capsys):
     shutil.copytree(made[0], tmp_path / "run")
     path = tmp_path / "run" / "run.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "dataset": str(tmp_path / "gone")}))
@@ -380,7 +380,7 @@ def test_the_help_of_train_names_every_preset(capsys):
         (["scene.r5dgs"], "report: expected RUN|SCENE and --out DIR"),
     ],
 )
-def test_a_report_refuses_what_it_would_not_heed(given, said, capsys):
+def test_report_rejects_unused_options(given, said, capsys):
     assert said in complaint(capsys, "report", *given, status=ExitStatus.USAGE)
 
 

@@ -27,7 +27,7 @@ def said(capsys, *arguments):
     return capsys.readouterr().out
 
 
-def test_objects_tell_the_same_to_people_and_programs(path, capsys):
+def test_objects_prints_the_same_values_as_text_and_json(path, capsys):
     found = json.loads(said(capsys, "objects", path, "--json"))
     scene = scene_file.read(path)
     assert [row["name"] for row in found["objects"]] == [item.name for item in scene.objects]
@@ -90,7 +90,7 @@ def test_nothing_found_is_no_picture(path, capsys, tmp_path):
     assert not (tmp_path / "none.png").exists()
 
 
-def test_what_no_picture_can_be_made_of_is_refused_before_the_work(path, capsys, tmp_path, monkeypatch):
+def test_invalid_picture_paths_are_rejected_before_the_work(path, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(scene_file, "read", lambda *_: pytest.fail("work began"))
     for option, command in (("--legend", ["objects", path]), ("--render", ["query", path, "mug"])):
         assert "ends in .png" in complaint(capsys, *command, option, tmp_path / "x.jpg", status=ExitStatus.USAGE)

@@ -52,7 +52,7 @@ def of():
 
 
 @pytest.mark.parametrize("forward", [film, mixed, gamma])
-def test_what_a_view_displays_comes_back(of, forward):
+def test_inverting_a_view_restores_displayed_colours(of, forward):
     wanted = forward(seen())
     off = steps(forward(of(forward).scene_linear(wanted)), wanted)
     assert off.mean() < 0.3 and np.percentile(off, 95) < 1
@@ -66,7 +66,7 @@ def test_views_of_single_channels_reach_every_colour(of, forward):
 
 
 @pytest.mark.parametrize("forward", [film, mixed, gamma, soft])
-def test_white_is_reached_however_bright_a_view_asks_for_it(of, forward):
+def test_white_is_reached_at_any_brightness_of_the_view(of, forward):
     white = np.array([[1.0, 1.0, 1.0], [0.99, 0.99, 0.99]])
     assert steps(forward(of(forward).scene_linear(white)), white).max() < 1
 
@@ -88,7 +88,7 @@ def test_light_below_nothing_reaches_more(of):
     assert np.median(steps(mixed(found), wanted)) < 1 < 5 < np.median(steps(mixed(np.maximum(found, 0)), wanted))
 
 
-def test_what_is_out_of_reach_comes_as_near_as_it_can(of):
+def test_unreachable_colours_are_approximated_as_closely_as_possible(of):
     """Nearer than clamping light at nothing, which is what the start of the search does."""
     wanted = np.array([[0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.1, 0.1, 0.9]])
     greys = 2.0 ** np.linspace(-10, 4, 500)
@@ -105,7 +105,7 @@ def test_an_exposure_is_a_scale(of):
     np.testing.assert_allclose(8 * brighter.scene_linear(wanted), of(mixed).scene_linear(wanted), rtol=1e-3, atol=1e-4)
 
 
-def test_it_knows_how_far_off_colours_are(of):
+def test_the_inverse_reports_its_error(of):
     assert of(film).error < 0.5 and of(mixed).error < 1
     folded = view_inverse.invert(lambda colors: np.abs(2 * gamma(colors) - 1))  # what is dark is displayed bright
     assert folded.error > 50

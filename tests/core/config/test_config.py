@@ -81,7 +81,7 @@ def test_the_last_of_two_overrides_wins_and_whole_numbers_serve_as_decimals():
         ("a.b.c=1", "expected SECTION.KEY=VALUE"),
     ],
 )
-def test_what_cannot_be_used_is_named(override, message):
+def test_invalid_overrides_raise_with_their_key(override, message):
     with pytest.raises(ConfigError, match=message.replace("?", r"\?")):
         config.load(None, [override])
 
@@ -116,7 +116,7 @@ def test_numbers_that_no_key_can_use_are_refused(value):
 
 
 @pytest.mark.parametrize("section", [f.name for f in dataclasses.fields(config.Config)])
-def test_every_key_says_what_it_is(section):
+def test_every_key_is_documented(section):
     kind = type(getattr(config.Config(), section))
     described = re.findall(r"^        (\w+): \S", kind.__doc__, re.MULTILINE)
     assert described == [f.name for f in dataclasses.fields(kind)]
@@ -128,7 +128,7 @@ def test_every_rule_is_about_a_key_and_lets_its_default_pass():
         assert good(getattr(getattr(config.Config(), section), key)), name
 
 
-def test_a_missing_file_is_said(tmp_path):
+def test_a_missing_configuration_file_raises(tmp_path):
     with pytest.raises(ConfigError, match="c.toml: no such configuration file"):
         config.load(tmp_path / "c.toml")
 

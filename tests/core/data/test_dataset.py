@@ -93,7 +93,7 @@ def test_views_of_one_camera_share_its_name_across_splits(flat):
     assert [camera.name for camera in data.cameras] == ["cam0", "cam1", "cam2"]
 
 
-def test_named_cameras_keep_their_name_and_moving_ones_are_told_apart(flat):
+def test_named_cameras_keep_their_name_and_moving_ones_stay_distinct(flat):
     def edit(content):
         for i, frame in enumerate(content["frames"]):
             frame["view"] = "left" if i % 2 == 0 else "walk"
@@ -409,7 +409,7 @@ def test_faulty_object_names_are_one_clear_error(flat, content, message):
         dataset.read(flat)
 
 
-def test_a_folder_that_is_no_data_set_is_told_apart(tmp_path):
+def test_folders_that_are_not_data_sets_raise(tmp_path):
     with pytest.raises(errors.DatasetError, match="found nothing"):
         dataset.read(tmp_path / "nowhere")
     with pytest.raises(errors.DatasetError, match=r"transforms_train\.json: the file is missing"):

@@ -49,7 +49,7 @@ def test_notes_that_cannot_be_used_are_named(tmp_path, change, message):
         mask_notes.read(tmp_path)
 
 
-def test_255_is_an_id_unless_the_folder_says_that_it_is_unknown(copied):
+def test_255_is_an_id_unless_mask_notes_declare_it_unknown(copied):
     view = datasets.read(copied).train[0]
     ids = np.zeros((view.camera.height, view.camera.width), np.uint8)
     ids[:5], ids[5:9] = 255, 7
@@ -89,7 +89,7 @@ def test_masks_of_one_video_are_as_good_as_those_of_a_scene(copied):
     datasets.read(copied).require_one_numbering()
 
 
-def test_masks_that_are_still_being_made_are_told(copied, caplog):
+def test_unfinished_masks_are_reported(copied, caplog):
     mask_notes.write(mask_notes.MaskNotes(finished=False), copied / "object_mask")
     datasets.read(copied)
     assert caplog.text.count("masks are missing") == 1  # though three splits have their masks there

@@ -111,7 +111,7 @@ def test_colours_get_the_same_ids_in_all_masks(tmp_path):
     np.testing.assert_array_equal(masks.read(paths[1], colors), [[2, 2], [0, 3]])
 
 
-def test_what_a_mask_means_is_decided_for_all_masks_at_once(tmp_path):
+def test_the_meaning_of_masks_is_decided_for_all_of_them_at_once(tmp_path):
     """A colour-coded mask that happens to show white and gray objects alone is one of colours all the same."""
     gray, red, white = (90, 90, 90), (200, 0, 0), (255, 255, 255)
     pictures = {

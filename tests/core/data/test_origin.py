@@ -52,7 +52,7 @@ def test_far_scenes_get_an_origin_among_their_cameras_that_is_short_to_write(sca
     assert origin.find(RING[:1] + 1e5, "here").any()  # one camera, too
 
 
-def test_cameras_that_float64_cannot_tell_apart_are_refused(tmp_path):
+def test_cameras_indistinguishable_in_float64_are_refused(tmp_path):
     with pytest.raises(errors.DatasetError, match=r"data: .*too far for 64-bit numbers.*subtract a constant"):
         datasets.read(made(tmp_path / "data", 1.0, (1e12, 0.0, 0.0)).root)
     with pytest.raises(errors.DatasetError, match="within 1e"):

@@ -74,7 +74,7 @@ def test_unknown_pixels_have_no_gradient(seen):
     assert (gradient[:, ~half].abs().sum(-1) > 0).all()
 
 
-def test_a_mask_that_knows_nothing_votes_for_nothing(seen, pose):
+def test_unknown_masks_do_not_vote(seen, pose):
     count = len(pose(seen[0]).means)
     assert not label_votes.votes([unknown(v) for v in seen], pose, CLASSES, count).any()
     several = label_votes.votes([*seen[:6], *(unknown(v) for v in seen[6:])], pose, CLASSES, count)
@@ -132,7 +132,7 @@ def test_a_hull_is_not_cut_where_a_mask_is_unknown(tiny, seen):
     assert spread_of(0) < 0.1
 
 
-def test_what_no_mask_knows_is_background_to_the_background_images(seen):
+def test_background_images_treat_unknown_masks_like_missing_ones(seen):
     for one, other in zip(
         background_images.compute([unknown(v) for v in seen]),
         background_images.compute([unmasked(v) for v in seen]),
@@ -142,7 +142,7 @@ def test_what_no_mask_knows_is_background_to_the_background_images(seen):
         np.testing.assert_array_equal(one.known, other.known)
 
 
-def test_what_some_masks_know_is_taken_from_them_alone(seen):
+def test_pixels_known_in_some_masks_use_only_those_masks(seen):
     (same,) = train_views.by_camera(seen, 1)
     cover = np.zeros(same[0].mask.shape, bool)
     cover[5:15, 5:15] = True

@@ -111,7 +111,7 @@ def rich_scene(**options):
 
 
 @pytest.mark.parametrize("noise", [0.0, 5e-7])
-def test_what_was_not_edited_is_the_same_to_the_bit(tmp_path, noise):
+def test_an_unedited_scene_is_saved_byte_for_byte(tmp_path, noise):
     scene = rich_scene()
     result, notes = edit(scene, pieces_of(scene, noise))
     assert notes == []
@@ -150,7 +150,7 @@ def test_without_its_leader_a_shadow_goes_on_by_itself():
 
 
 @pytest.mark.parametrize("matrix", [matrix_of(1.5 * TURN, (0.2, -1.0, 0.3)), matrix_of(np.diag([1.0, 1, -1]))])
-def test_what_was_put_elsewhere_within_its_motion_moves_on_with_it(matrix):
+def test_a_moved_object_keeps_the_motion_of_its_group(matrix):
     scene = rich_scene()
     result, notes = edit(scene, pieces_of(scene, after={1: matrix}))
     rows = scene.gaussians.object_ids == 1
@@ -231,7 +231,7 @@ def test_new_curves_become_a_track_and_the_nearest_model():
     )
 
 
-def test_a_future_that_no_model_gives_is_said_and_met_nearly():
+def test_a_future_without_matching_model_is_approximated_with_a_note():
     scene, t = rich_scene(), times_of(rich_scene())
     maps = np.tile(np.eye(4), (len(t), 1, 1))
     maps[:, 0, 3] = 0.2 * np.sin(40 * np.maximum(t - 0.75, 0))
@@ -242,7 +242,7 @@ def test_a_future_that_no_model_gives_is_said_and_met_nearly():
     assert any(note.startswith("object 2: no motion model") for note in notes)
 
 
-def test_scale_that_changes_with_time_is_said():
+def test_scale_that_changes_with_time_is_reported():
     scene = rich_scene()
     pieces = pieces_of(scene)
     pieces[-1].matrices[:5, :3, :3] *= 1.2

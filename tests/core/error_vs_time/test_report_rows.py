@@ -47,7 +47,7 @@ def test_the_front_is_what_nothing_better_beats(some):
             assert beaten != one.pareto
 
 
-def test_of_methods_that_take_the_same_time_only_the_best_is_on_the_front():
+def test_only_the_best_of_equally_fast_methods_is_on_the_pareto_front():
     marked = report_rows.mark_front([row(2.0, 1.0, spread=0.2), row(1.0, 1.1, spread=0.2), row(0.5, 9.0)])
     assert [r.pareto for r in marked] == [False, True, True]
 
@@ -117,6 +117,6 @@ def test_names_never_overlap_nor_hide_a_point_nor_leave_the_frame(seed, count):
             np.testing.assert_allclose(box[2:] - box[:2], size)
 
 
-def test_a_name_that_no_place_is_left_for_is_none():
+def test_a_label_that_does_not_fit_is_omitted():
     point, size = np.array([[10.0, 10.0]]), np.array([[50.0, 10.0]])
     assert label_placement.place(point, size, np.array([0, 0, 20, 20.0]), np.zeros((0, 4))) == [None]

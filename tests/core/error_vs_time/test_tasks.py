@@ -108,7 +108,7 @@ def static(groups):
     return [dataclasses.replace(g, model=models.STATIC) for g in groups]
 
 
-def test_what_is_exact_is_exact(scene):
+def test_exact_methods_have_no_error(scene):
     rows, _ = integrator_task.measure(scene, 0.5, 1)
     for kind in ("position", "rotation"):
         closed = only(rows, method="closed form", error_kind=kind)
@@ -299,7 +299,7 @@ def test_the_terminal_shows_the_tables_and_what_is_absent(report, capsys):
     assert "Dynamics" in text and "Poses along the horizon" in text and "not measured" in text
 
 
-def test_without_data_what_needs_it_is_said_to_be_absent(scene, tmp_path):
+def test_tasks_without_their_data_are_listed_as_absent(scene, tmp_path):
     report = error_vs_time_report.measure(scene, rounds=1, backend=BACKEND, tasks=("poses", "images", "raster"))
     text = "\n".join(report["absent"])
     assert "poses: no data set" in text and "images: no data set" in text and "dynamics: not asked for" in text
@@ -338,7 +338,7 @@ def test_a_wrong_call_is_one_line(arguments, words, capsys):
     assert words in complaint(capsys, "report", *arguments, status=ExitStatus.USAGE)
 
 
-def test_a_report_that_cannot_be_written_says_so(scene, tmp_path):
+def test_an_unwritable_report_raises(scene, tmp_path):
     (tmp_path / "file").write_text("mine")
     report = error_vs_time_report.measure(scene, rounds=1, backend=BACKEND, tasks=("poses",))
     with pytest.raises(errors.ConfigError, match="--out"):

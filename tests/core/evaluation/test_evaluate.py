@@ -97,7 +97,7 @@ def test_an_object_that_the_scene_lacks_counts_as_missed(scene, data, tmp_path):
     assert result["splits"]["val"]["rigid"]["miou_matched"] == 1.0
 
 
-def test_what_the_data_set_does_not_have_is_none(scene, data):
+def test_metrics_without_reference_data_are_none(scene, data):
     bare = dataclasses.replace(
         data,
         ground_truth=None,
@@ -203,7 +203,7 @@ def test_the_images_past_t_max_are_counted(scene, result):
     assert scene.t_max == 0.75
 
 
-def test_the_table_says_what_its_overlap_is(scene, data):
+def test_the_table_explains_its_overlap_columns(scene, data):
     swapped = np.array([0, 2, 1, 3])
     ids = np.where(
         scene.gaussians.object_ids > 0, swapped[np.maximum(scene.gaussians.object_ids, 0)], scene.gaussians.object_ids

@@ -91,7 +91,7 @@ def test_the_middle_lies_in_the_largest_part():
     assert ring[int(row), int(column)]
 
 
-def test_a_legend_is_large_enough_to_read_and_says_whether_it_is_past_t_max(scene, monkeypatch):
+def test_a_legend_is_readable_and_marks_times_past_t_max(scene, monkeypatch):
     titles = []
     real = legend.annotate
     monkeypatch.setattr(legend, "annotate", lambda *given: titles.append(given[-1]) or real(*given))

@@ -32,7 +32,7 @@ def test_every_number_is_that_of_its_definition():
 
 
 @given(st.integers(0, 10_000))
-def test_what_is_drawn_where_the_mask_is_unknown_changes_nothing(seed):
+def test_pixels_with_unknown_mask_do_not_change_the_miou(seed):
     rng = np.random.default_rng(seed)
     mask, rendered = rng.choice([0, 1, 5, masks.UNKNOWN], (6, 7)), rng.choice([0, 1, 5], (6, 7))
     other = np.where(mask == masks.UNKNOWN, rng.choice([0, 1, 5], (6, 7)), rendered)

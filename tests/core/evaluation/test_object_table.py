@@ -83,7 +83,7 @@ def test_strays_move_with_another_object_than_they_show(scene):
     assert object_table.strays(still) == {}  # nothing has a group of its own: all rest, as they should
 
 
-def test_motion_is_told_in_the_words_of_the_sidebar(scene):
+def test_motion_is_named_as_in_the_sidebar(scene):
     words = {row.id: row.motion for row in object_table.measure(scene, [])}
     assert words[0] == "pinned" and words[1] == "throw+spin" and words[2] == "slide" and words[3] == "screw"
     group = dataclasses.replace(scene.groups[1], model=dataclasses.replace(scene.groups[1].model, kind="static"))

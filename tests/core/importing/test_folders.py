@@ -158,7 +158,7 @@ def test_the_last_complete_iteration_is_read_unless_another_is_named(deformed):
         run_folder.open_run(deformed, 30000)
 
 
-def test_other_folders_are_told_apart(tmp_path, deformed):
+def test_other_folders_are_distinguished(tmp_path, deformed):
     with pytest.raises(CheckpointError, match="expected a run folder, found nothing"):
         run_folder.open_run(tmp_path / "nowhere")
     with pytest.raises(CheckpointError, match="expected a run folder, found a file"):
@@ -240,7 +240,7 @@ def test_principal_axes_draw_what_any_quaternion_draws():
     np.testing.assert_allclose(found.covariances / size, expected / size, atol=1e-9)
 
 
-def test_what_hardly_moves_is_left_out_and_what_is_kept_is_exact(deformed):
+def test_nearly_static_gaussians_are_dropped_and_kept_ones_are_exact(deformed):
     every = importer.import_run(deformed, importer.Options(knots=5, still=0.0))
     assert len(every.residuals.rows) == foreign.COUNT
     some = importer.import_run(deformed, importer.Options(knots=5, still=0.1))

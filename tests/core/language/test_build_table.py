@@ -135,7 +135,7 @@ def test_the_table_holds_names_extra_words_and_common_nouns_once():
     assert made.lookup.pooling == "max" and made.lookup.canonical == encoder_base.CANONICAL
 
 
-def test_a_caption_answers_for_a_name_that_says_nothing():
+def test_a_caption_replaces_a_generic_name():
     scene = named("object 1", "hammer", "Object_3", captions={1: "a lemon"})
     made = build_table.make(scene, Plain())
     assert [view.source for view in made.scene.lookup.views[_row(scene, 1)]] == ["a lemon"]
@@ -149,7 +149,7 @@ def test_a_caption_answers_for_a_name_that_says_nothing():
 
 
 @pytest.mark.parametrize("kind", ["text", "clip"])
-def test_an_object_without_gaussians_gets_no_embedding_and_that_is_said(kind):
+def test_an_object_without_gaussians_gets_a_warning_and_no_embedding(kind):
     scene = ring(named("lemon", "hammer"))
     keep = scene.gaussians.object_ids != 2
     bare = dataclasses.replace(
@@ -399,7 +399,7 @@ def test_captions_come_from_a_file(file, tmp_path, capsys):
 
 
 @pytest.mark.skipif(not os.environ.get("R5DGS_TEXT_ENCODER"), reason="R5DGS_TEXT_ENCODER names no sentence model")
-def test_a_real_sentence_model_finds_by_meaning_and_says_nothing_matches():
+def test_a_real_sentence_model_finds_by_meaning_or_nothing():
     encoder = registry.open_encoder(os.environ["R5DGS_TEXT_ENCODER"])
     made = build_table.make(named("mug", "lemon", "apple", "donut", "cutting board", "bowl"), encoder).scene
     found = {

@@ -46,7 +46,7 @@ def picture(seed, width=40, height=30):
 
 
 @pytest.mark.parametrize("kind", MAKERS)
-def test_the_folder_says_which_kind_it_is(opened, folders, kind):
+def test_the_kind_of_an_encoder_is_read_from_its_folder(opened, folders, kind):
     card = opened[kind].card
     assert card.kind == kind and card.name == f"tiny-{kind}" and len(card.digest) == 64
     assert card.digest == encoder_base.digest_of([folders[kind] / "model.safetensors"])
@@ -104,7 +104,7 @@ def test_preprocessing_of_older_folders_is_the_same(copied, opened):
     np.testing.assert_allclose(found, opened["clip"].embed_images([picture(4)]), atol=1e-5)
 
 
-def test_a_sentence_is_the_mean_of_its_tokens_or_the_first_one_as_the_folder_says(opened, tmp_path):
+def test_sentence_pooling_follows_the_configuration_of_the_folder(opened, tmp_path):
     first = registry.open_encoder(encoder_folders.sentences(tmp_path / "first", pooling="cls_token"))
     mean = registry.open_encoder(encoder_folders.sentences(tmp_path / "mean", pooling="mean_tokens"))
     assert first.card.digest == mean.card.digest == opened["text"].card.digest
@@ -118,7 +118,7 @@ def test_a_sentence_is_the_mean_of_its_tokens_or_the_first_one_as_the_folder_say
         registry.open_encoder(odd)
 
 
-def test_a_sentence_model_says_that_it_cannot_see(opened):
+def test_embedding_images_with_a_sentence_model_raises(opened):
     with pytest.raises(errors.BackendError, match="cannot look at pixels; give a CLIP"):
         opened["text"].embed_images([picture(0)])
 
@@ -271,7 +271,7 @@ def test_folders_of_open_clip_are_opened_by_their_place(monkeypatch, perception)
 
 
 @pytest.mark.skipif(not os.environ.get("R5DGS_TEXT_ENCODER"), reason="R5DGS_TEXT_ENCODER names no sentence model")
-def test_a_real_sentence_model_knows_what_things_are():
+def test_a_real_sentence_model_ranks_related_words_higher():
     encoder = registry.open_encoder(os.environ["R5DGS_TEXT_ENCODER"])
     lemon, fruit, axe = encoder_base.embed_phrases(encoder, ["lemon", "fruit", "axe"])
     assert lemon @ fruit > lemon @ axe

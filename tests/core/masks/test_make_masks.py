@@ -70,7 +70,7 @@ def test_a_camera_in_motion_is_one_video_as_long_as_it_does_not_leap(views):
     assert [(video.name, len(video.views)) for video in videos.of(named)] == [("phone", 8)]
 
 
-def test_what_is_made_can_be_read_back_and_is_told(views, tmp_path):
+def test_made_masks_can_be_read_back_and_are_reported(views, tmp_path):
     events = []
     made = make_masks.make(views, Numbered(), tmp_path / "m", progress=events.append)
     assert (made.images, made.videos, made.kept, made.objects) == (36, 6, 0, 36)

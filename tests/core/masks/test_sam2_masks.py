@@ -73,7 +73,7 @@ def test_the_segments_of_an_image_are_good_distinct_and_in_order(model, video):
     )
 
 
-def test_what_is_known_is_not_new():
+def test_segments_that_overlap_known_ones_are_not_new():
     def segment(left, right):
         logits = torch.full((8, 8), -1.0)
         logits[:, left:right] = 1.0
@@ -149,7 +149,7 @@ def test_a_pixel_goes_to_the_object_that_is_surest_of_it(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_where_an_object_is_lost_for_some_images_nothing_is_known(tmp_path):
+def test_gaps_of_a_lost_object_are_unknown(tmp_path):
     def painted(rows, gap):
         canvas = sam2_tracking.Canvas(len(rows), 1, 4, tmp_path)
         for index, row in enumerate(rows):
@@ -241,7 +241,7 @@ def test_a_video_of_one_image_gets_its_segments(model, video, tmp_path):
     assert 1 < len(np.unique(ids)) <= 6
 
 
-def test_the_command_makes_goes_on_and_says_what_comes_next(tiny, folder, tmp_path, capsys, monkeypatch):
+def test_the_command_resumes_and_prints_the_next_step(tiny, folder, tmp_path, capsys, monkeypatch):
     options = {"backend": "sam2", "model": folder, "out": tmp_path / "m", "points": 2, "key_frames": 1}
     options |= {"score": 0.0, "stability": 0.0, "max_area": 1.0}
     label = sam2_masks.Sam2Masks.label

@@ -42,7 +42,7 @@ def test_the_plainest_kind_that_holds_the_tolerance_is_taken():
     assert fit_drawn_curve.fit(TAUS, quats, 1e-5 * moves, 0.3, 1e-4)[0].is_static
 
 
-def test_what_no_model_gives_is_met_with_the_error_that_is_said():
+def test_the_fit_to_an_arbitrary_curve_returns_its_true_error():
     moves = np.stack([0.2 * np.sin(25 * TAUS), 0.3 * TAUS, np.abs(TAUS - 0.2)], -1)
     quats = rotations.rotvecs_to_quats(np.stack([0 * TAUS, np.sin(9 * TAUS), TAUS], -1))
     found, error = fit_drawn_curve.fit(TAUS, quats, moves, 0.3, 1e-4)

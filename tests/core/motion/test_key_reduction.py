@@ -144,7 +144,7 @@ def test_joined_curves_keep_the_kink_and_both_sides():
     assert cubic_curves.evaluate(joined.location, np.array([-1.0, 9.0])).tolist() == [[-1, 0, 0], [0, 2, 0]]
 
 
-def test_what_rests_before_it_moves_rests_until_the_join():
+def test_joined_curves_stay_at_rest_until_the_join():
     moving = MotionModel("ballistic_spin", velocity=[1, 0, 0], angular_velocity=[0, 0, 2.0])
     rest = key_reduction.reduce(key_reduction.model_sampler(models.STATIC, 0.0), 0.0, 1.0, TOLERANCE, RADIUS)
     joined = cubic_curves.join(
@@ -258,7 +258,7 @@ def test_the_work_for_keys_is_bounded_whatever_the_pace_of_frames(monkeypatch, f
         assert max(len(curves.location.times), len(curves.rotation.times)) <= 514
 
 
-def test_what_keys_cannot_follow_is_exact_at_every_frame_and_is_marked(monkeypatch):
+def test_motion_too_fast_for_keys_is_exact_at_every_frame_and_marked(monkeypatch):
     for name in ("twist that tilts", "top", "swing"):
         curves, _ = work(monkeypatch, WILD[name], 20.5 * FRAME, FRAME)
         assert not curves.followed

@@ -118,7 +118,7 @@ def test_single_precision_keeps_distances_relative_to_the_pivot(name):
 
 
 @pytest.mark.parametrize("kind", [kind for kind in models.KINDS if kind != "static"])
-def test_overflow_is_finite_or_told(kind, caplog):
+def test_overflow_is_finite_or_logged(kind, caplog):
     inertia = np.diag([1.0, 2.0, 2.5]) if models.KINDS[kind].needs_inertia else None
     sane = CASES["hinge"]
     expected = models.evaluate_all([sane, models.STATIC], 0.8)
@@ -282,7 +282,7 @@ def test_times_before_t_max_are_refused():
         models.evaluate(MotionModel(), -0.1)
 
 
-def test_static_and_turning_are_told_apart():
+def test_static_and_turning_models_are_distinguished():
     assert MotionModel().is_static
     assert not MotionModel(offset_displacement=[0, 0, 1e-9]).is_static
     assert not MotionModel("translation", velocity=[1, 0, 0]).turns

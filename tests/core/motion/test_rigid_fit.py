@@ -122,7 +122,7 @@ def test_covariance_of_planes_and_rods_predicts_the_spread(thickness):
 
 
 @pytest.mark.parametrize(("degrees", "told"), [(20, False), (119, False), (121, True), (160, True), (200, True)])
-def test_steps_that_may_be_turns_the_other_way_are_told(degrees, told):
+def test_ambiguous_rotation_steps_are_reported(degrees, told):
     times = np.array([0.0, 0.1, 0.3, 0.4])
     angles = np.radians([0.0, 5.0, 5.0 + degrees, 9.0 + degrees])
     quats = rotations.rotvecs_to_quats(angles[:, None] * [0.0, 0.6, 0.8]) * [[1], [-1], [1], [1]]

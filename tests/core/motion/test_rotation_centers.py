@@ -58,7 +58,7 @@ def test_every_other_point_moves_as_it_did_about_the_old_one(name, point):
 
 @pytest.mark.parametrize("name", ["hinge", "pendulum", "started from rest", "turn"])
 @given(direction=directions)
-def test_what_lies_on_the_new_axis_stays_and_the_speed_is_the_old_one(name, direction):
+def test_points_on_the_new_axis_stay_fixed_and_the_speed_is_kept(name, direction):
     model = spins()[name]
     if name == "hinge":  # one that turns about one axis throughout
         model = dataclasses.replace(model, angular_acceleration=0.3 * W)
@@ -117,7 +117,7 @@ def test_the_opposite_axis_is_reached_too():
         np.testing.assert_allclose(rotation_centers.with_axis(model, -along).angular_velocity, -along, atol=1e-12)
 
 
-def test_what_has_no_center_or_axis_says_so():
+def test_motions_without_center_or_axis_raise():
     without = (
         MotionModel("static"),
         MotionModel("translation", velocity=W, acceleration=EPS),

@@ -275,7 +275,7 @@ def test_gradients_are_finite_and_right_at_zero_spin():
         assert torch.autograd.gradcheck(lambda *x: se3.integrate(*x, 3), (w, moving, *rates, span))
 
 
-def test_rates_beyond_all_numbers_are_told_by_the_steps():
+def test_overflowing_rates_are_reported_by_the_steps():
     for bad in (math.nan, math.inf, 1e200):
         rates = (
             np.array([[bad, 1, 0], [1.0, 2, 0]]),

@@ -57,7 +57,7 @@ def test_bodies_that_fall_share_gravity_and_are_predicted_better(up):
     assert np.median(together) < 0.75 * np.median(alone)
 
 
-def test_who_disagrees_does_not_share():
+def test_bodies_with_deviating_acceleration_do_not_share_gravity():
     tracks, fits, _ = observed([*FALLING[:2], BRAKING, SLIDING], np.random.default_rng(1), 0.002 * SIZE)
     assert fits[2].chosen == "translation, quadratic"
     shared, who = shared_gravity.share(tracks, fits)
@@ -67,7 +67,7 @@ def test_who_disagrees_does_not_share():
     assert np.linalg.norm(shared[0].model.acceleration - G) < 0.3
 
 
-def test_two_that_disagree_or_one_alone_stay_as_they_are():
+def test_gravity_needs_at_least_two_agreeing_bodies():
     tracks, fits, _ = observed([FALLING[0], BRAKING], np.random.default_rng(2), 0.002 * SIZE)
     for count in (0, 1, 2):
         shared, who = shared_gravity.share(tracks[:count], fits[:count])

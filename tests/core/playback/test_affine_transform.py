@@ -124,7 +124,7 @@ def test_the_light_turns_with_the_world():
 
 @pytest.mark.parametrize("t", [0.02, 0.4, 0.75])
 @pytest.mark.parametrize("turns_harmonics", [True, False])
-def test_what_bends_is_bent_as_the_renderer_bends_it(t, turns_harmonics):
+def test_deformed_gaussians_match_the_renderer(t, turns_harmonics):
     scene, random = make_scene(n=200, sh_degree=3, shading=True), np.random.default_rng(1)
     rows, knots = np.array([70, 71, 120, 190]), len(scene.tracks.times)
     offsets, growths = random.normal(scale=0.1, size=(2, 4, knots, 3)).astype(np.float32)

@@ -58,7 +58,7 @@ def test_the_fitted_source_is_what_the_scene_holds(scene):
 
 
 @pytest.mark.parametrize("source", MEMBERS)
-def test_where_the_world_has_its_origin_does_not_matter(source):
+def test_group_models_do_not_depend_on_the_world_origin(source):
     base = make_scene(300)
     means = np.round(base.gaussians.means * 512) / 512  # float32 holds these far from the origin, too
     near = rigid_dynamics(base.with_arrays(means=means.astype(np.float32)))
@@ -70,7 +70,7 @@ def test_where_the_world_has_its_origin_does_not_matter(source):
     np.testing.assert_allclose(rates(only(far, 1, source)), rates(only(near, 1, source)), rtol=0, atol=1e-9)
 
 
-def test_the_representative_speaks_for_all(scene):
+def test_the_representative_defines_the_motion_of_its_group(scene):
     row = scene.groups[1].anchor_index
     dynamics = scene.dynamics.rates.copy()
     dynamics[row] = 0.0
@@ -93,7 +93,7 @@ def test_faint_members_do_not_vote_and_a_few_bad_ones_do_not_matter(scene, sourc
     np.testing.assert_allclose(rates(only(wrong, 1, source)), TWIST, atol=2e-2)
 
 
-def test_where_all_are_faint_all_vote(scene):
+def test_all_members_vote_if_all_are_faint(scene):
     faint = scene.with_arrays(opacity_logits=np.full(len(scene.gaussians.means), -4.0, np.float32))
     np.testing.assert_allclose(rates(only(faint, 1, "median")), TWIST, atol=1e-6)
 

@@ -74,7 +74,7 @@ def test_the_users_choice_and_the_users_cache_come_first(tmp_path, monkeypatch):
     assert Path(compilation._cache_folder(str(blocked(tmp_path) / "deeper"))).parent == tmp_path / "user"
 
 
-def test_the_first_compilation_of_a_machine_is_told_once_and_loading_never(tmp_path):
+def test_the_first_compilation_is_announced_once_and_loading_never(tmp_path):
     first, second = (run_toy(tmp_path, NUMBA_CACHE_DIR=tmp_path / "cache") for _ in range(2))
     assert first.stderr.splitlines() == [compilation.NOTICE] and second.stderr == ""
 
@@ -119,11 +119,11 @@ assert not gc.isenabled() and compilation.compiled() == 3 and len(told) == 1
 """
 
 
-def test_only_kernels_are_told_of_and_the_collector_is_left_as_it_was(tmp_path):
+def test_only_kernel_compilations_are_announced(tmp_path):
     assert run_toy(tmp_path, TOLD, NUMBA_CACHE_DIR=tmp_path / "cache").stderr == ""
 
 
-def test_without_a_place_the_notice_says_so_in_every_process(tmp_path):
+def test_without_a_cache_folder_every_process_announces_compilation(tmp_path):
     script = TOY.replace(
         "from r5dgs_core",
         "import r5dgs_core.raster.compilation as c\nc._bases = lambda _: iter(())\nfrom r5dgs_core",
@@ -198,7 +198,7 @@ def test_another_state_of_a_source_has_another_folder(tmp_path, monkeypatch):
     assert folders[0] == folders[2] != folders[1]
 
 
-def test_a_new_folder_takes_the_place_of_old_ones_that_nobody_uses(tmp_path):
+def test_a_new_cache_folder_replaces_old_unused_ones(tmp_path):
     week = 7 * 24 * 3600
     ages = {
         **{"r5dgs-0123456789ab": 5, "r5dgs-ffffffffffff": 3, "r5dgs-mine": 5, "r5dgs-0123456789abc": 5},
@@ -279,7 +279,7 @@ def test_a_number_of_threads_that_is_none_is_one_line(tmp_path, value):
     assert done.stderr.startswith("r5dgs: NUMBA_NUM_THREADS=") and done.stderr.count("\n") == 1
 
 
-def test_without_any_place_nothing_is_kept_and_one_line_says_so(tmp_path, monkeypatch, caplog):
+def test_without_a_cache_folder_nothing_is_cached_and_one_warning_is_logged(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(compilation, "_user_cache", lambda: blocked(tmp_path))
     monkeypatch.setattr(compilation, "_own_temporary", lambda: None)
     with caplog.at_level("WARNING"):

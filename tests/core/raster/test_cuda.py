@@ -112,7 +112,7 @@ def test_pixels_finish_where_those_of_the_reference_do(rasterize_cuda, monkeypat
     assert assert_agrees(rasterize_cuda, monkeypatch, scene, camera()).alpha.min() > 0.99
 
 
-def test_of_two_layers_at_the_cap_the_nearer_is_seen_as_in_the_reference(rasterize_cuda, monkeypatch):
+def test_the_nearer_of_two_layers_at_the_alpha_cap_matches_the_reference(rasterize_cuda, monkeypatch):
     scene = [t[:2].clone() for t in splats.splats(2, 2)]
     scene[0][:], scene[2][:], scene[3][:], scene[4] = torch.zeros(3), 1e3, 1.0, torch.eye(2).double()
     found = assert_agrees(rasterize_cuda, monkeypatch, scene, camera())
@@ -153,7 +153,7 @@ def test_equal_votes_go_to_the_smallest_label(rasterize_cuda, labels):
 
 
 @pytest.mark.parametrize("n", [0, 3])
-def test_where_nothing_is_seen_the_background_stands_and_gradients_are_zero(rasterize_cuda, n):
+def test_an_empty_view_shows_the_background_with_zero_gradients(rasterize_cuda, n):
     scene = [t[:n].float().requires_grad_() for t in splats.splats(3, 3)]
     view = camera()
     view.T_cam_world[2, 3] = -30.0
@@ -267,7 +267,7 @@ def test_a_cap_that_nothing_reaches_is_met_exactly(monkeypatch):
         torch.testing.assert_close(found.image, expected.image, atol=TOLERANCE, rtol=0)
 
 
-def test_an_old_gsplat_draws_with_another_cap_and_says_so_once(monkeypatch, caplog):
+def test_an_old_gsplat_uses_another_alpha_cap_and_warns_once(monkeypatch, caplog):
     use(OLD_STAND_IN, monkeypatch)
     cuda._warn_once.cache_clear()
     scene = [t.float() for t in splats.splats(1, 3)]
@@ -320,26 +320,26 @@ def refusal(means=ON_GPU):
     return str(caught.value)
 
 
-def test_a_torch_without_cuda_is_told(monkeypatch):
+def test_torch_without_cuda_raises_backend_error(monkeypatch):
     monkeypatch.setattr(torch.version, "cuda", None)
     with pytest.raises(errors.BackendError, match=r"rasterizer 'cuda': torch .* without CUDA; remedy: install"):
         rasterize_splats(*[t.float() for t in splats.splats(3, 3)], camera(), backend="cuda")
 
 
-def test_a_machine_without_a_device_is_told(monkeypatch):
+def test_a_machine_without_cuda_device_raises_backend_error(monkeypatch):
     monkeypatch.setattr(torch.version, "cuda", "12.8")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     message = refusal()
     assert "no CUDA device" in message and "nvidia-smi" in message and "12.8" in message
 
 
-def test_tensors_that_gsplat_cannot_take_are_told(cuda_machine):
+def test_tensors_that_gsplat_cannot_take_raise_backend_error(cuda_machine):
     assert "got cpu; remedy: move" in refusal(torch.zeros(3))
     double = refusal(SimpleNamespace(device=torch.device("cuda"), dtype=torch.float64))
     assert "float32" in double and "float64" in double and "remedy" in double
 
 
-def test_a_missing_gsplat_is_told(cuda_machine, monkeypatch):
+def test_a_missing_gsplat_raises_backend_error(cuda_machine, monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     assert "gsplat is not installed; remedy: pip install 'r5dgs[cuda]'" in refusal()
 
@@ -353,7 +353,7 @@ def test_a_missing_gsplat_is_told(cuda_machine, monkeypatch):
         ({"init": "import a_package_that_is_not_there"}, r"does not load \(ModuleNotFoundError.*a_package_that"),
     ],
 )
-def test_a_gsplat_that_does_not_load_is_told(cuda_machine, monkeypatch, tmp_path, package, said):
+def test_a_gsplat_that_does_not_load_raises_backend_error(cuda_machine, monkeypatch, tmp_path, package, said):
     install(tmp_path, monkeypatch, **package)
     message = refusal()
     assert message == refusal() and "remedy" in message
@@ -376,7 +376,7 @@ def test_thresholds_are_those_of_the_gsplat_that_is_there(cuda_machine, monkeypa
     assert (kernels.alpha_min, kernels.alpha_max, kernels.transmittance_min) == (1 / 255, alpha_max, 1e-4)
 
 
-def test_auto_takes_the_reference_on_a_gpu_without_gsplat_and_says_so_once(cuda_machine, monkeypatch, caplog):
+def test_auto_uses_the_reference_on_a_gpu_without_gsplat_and_warns_once(cuda_machine, monkeypatch, caplog):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     backends._warn_once.cache_clear()
     with caplog.at_level(logging.WARNING):

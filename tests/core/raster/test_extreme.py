@@ -23,7 +23,7 @@ WHOLE_IMAGES = ("one Gaussian covers a 4K image", "an image of 4096 by 4096 px")
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in WHOLE_IMAGES)) for name in extreme_scenes.CASES]
 )
-def test_both_backends_draw_it_within_the_bars_and_all_is_finite(name):
+def test_backends_agree_within_bounds_and_stay_finite(name):
     case = extreme_scenes.CASES[name]()
     assert_within_bars(case.inputs, case.camera, case.background, settings=case.settings)
 
@@ -87,7 +87,7 @@ def test_the_gradient_of_an_opacity_ends_where_the_cap_begins(steps, backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_of_ten_thousand_opaque_layers_the_nearest_is_seen_as_a_second_would_leave_the_minimum(backend):
+def test_ten_thousand_opaque_layers_show_only_the_nearest(backend):
     case, result, gradients, _ = render("ten thousand opaque layers", backend)
     expected = 0.99 * case.inputs[4][0].double() + 0.01 * case.background.double()
     assert (result.image[0, 0] - expected).abs().max() < FORWARD
@@ -117,7 +117,7 @@ def test_thin_layers_are_seen_until_transmittance_would_fall_below_its_minimum(b
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_of_gaussians_at_one_place_the_lower_row_is_in_front(backend):
+def test_the_lower_row_of_coincident_gaussians_is_in_front(backend):
     inputs, view = extreme_scenes.cloud(50, 50, seed=1), extreme_scenes.view(1, 1)
     inputs[0][:], inputs[4] = torch.tensor([0.0, 0.0, 3.0]), torch.eye(50)
     opacities = inputs[3].double()
@@ -168,7 +168,7 @@ def test_a_wide_image_shows_in_the_middle_what_a_small_one_does(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_what_one_gaussian_covers_falls_off_as_projected_in_every_corner_of_a_4k_image(backend):
+def test_the_falloff_of_a_gaussian_is_correct_in_all_corners_of_a_4k_image(backend):
     view = extreme_scenes.view(3840, 2160, 3000.0)
     inputs = extreme_scenes.cloud(1, 1)
     inputs[0][:], inputs[2][:], inputs[3][:] = torch.tensor([0.0, 0, 3]), 2.0, 0.8

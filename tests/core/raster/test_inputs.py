@@ -54,7 +54,7 @@ def test_a_background_of_another_float_dtype_is_converted_and_gets_its_gradient(
     (torch.zeros(48, 40, 3), ValueError, r"expected shape \(3,\) or \(40, 48, 3\), got \(48, 40, 3\)"),
 ])  # fmt: skip
 @pytest.mark.parametrize("features", [None, torch.zeros(10, 2)])
-def test_what_is_no_background_is_named_with_its_own_shape(background, kind, message, features):
+def test_an_invalid_background_raises_with_its_shape(background, kind, message, features):
     with pytest.raises(kind, match=f"^background: {message}"):
         rasterize_splats(*scene(), camera(), background)
     with pytest.raises(kind, match=f"^background: {message}"):
@@ -81,7 +81,7 @@ def test_labels_may_be_of_any_integer_type(backend, dtype):
     (torch.arange(10) + 2**31 - 5, ValueError, "expected at most 2147483647, found 2147483652 at index 9"),
 ])  # fmt: skip
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_what_are_no_labels_is_named(labels, kind, message, backend):
+def test_invalid_labels_raise(labels, kind, message, backend):
     with pytest.raises(kind, match=f"^labels: {message}"):
         rasterize_splats(*scene(), camera(), labels=labels, backend=backend)
 
@@ -97,7 +97,7 @@ def test_ids_of_the_reference_are_the_labels_as_large_as_int32():
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_where_nothing_is_seen_there_is_no_id_even_if_any_alpha_were_enough(backend):
+def test_pixels_without_alpha_have_no_id_at_threshold_zero(backend):
     labels, settings = torch.arange(10) + 3, RasterSettings(id_alpha_min=0.0)
     result = rasterize_splats(*scene(), camera(), labels=labels, settings=settings, backend=backend)
     seen = result.alpha > 0
@@ -113,7 +113,7 @@ def test_boxes_can_count_the_tiles_of_the_largest_image():
 
 
 @pytest.mark.parametrize("position", range(5))
-def test_what_is_no_tensor_is_named(position):
+def test_inputs_that_are_not_tensors_raise(position):
     inputs = scene()
     inputs[position] = inputs[position].numpy()
     name = ("means", "quats", "scales", "opacities", "channels")[position]
@@ -216,7 +216,7 @@ def test_labels_beyond_signed_numbers_are_refused():
         rasterize_splats(*[t.float() for t in splats(3, 3)], camera(), labels=labels)
 
 
-def test_whole_numbers_and_mixed_kinds_are_told_apart():
+def test_integer_and_mixed_dtypes_raise_different_errors():
     whole = [t.long() for t in splats(3, 3)]
     with pytest.raises(ValueError, match=r"means: expected floating-point values.*means\.float\(\)"):
         rasterize_splats(*whole, camera())
@@ -238,7 +238,7 @@ def test_cameras_of_the_wrong_kinds_are_refused(change, message):
         rasterize_splats(*[t.float() for t in splats(3, 3)], dataclasses.replace(camera(), **change))
 
 
-def test_what_is_no_camera_and_what_are_no_settings_is_said():
+def test_invalid_camera_or_settings_raise():
     scene = [t.float() for t in splats(3, 3)]
     with pytest.raises(TypeError, match="camera: expected a Camera, got NoneType"):
         rasterize_splats(*scene, None)

@@ -79,7 +79,7 @@ def test_nearer_gaussians_cover_farther_ones_whatever_their_order(backend):
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_centres_project_where_the_camera_says(backend):
+def test_centres_are_projected_as_by_the_camera(backend):
     view = camera(skew=3.0, offset=(2.0, -1.5))
     mean = np.array([[0.2, -0.3, 0.4]])
     pixel, depth = cameras.project(view, mean)
@@ -394,7 +394,7 @@ def test_no_gaussians_leave_the_background(backend):
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_what_lies_behind_or_is_transparent_leaves_the_background(backend):
+def test_gaussians_behind_the_camera_or_transparent_show_the_background(backend):
     behind, transparent = one_splat(z=-3.0), one_splat(opacity=0.0)
     stats = RasterStats()
     result = rasterize_splats(
@@ -548,7 +548,7 @@ def test_a_background_of_another_size_is_named():
         rasterize_splats(*[t.float() for t in splats(10, 3)], camera(), torch.zeros(48, 40, 3))
 
 
-def test_backends_that_cannot_draw_say_why():
+def test_unavailable_backends_raise_with_the_reason():
     single, double = [t.float() for t in splats(10, 3)], splats(10, 3)
     with pytest.raises(errors.BackendError, match="cuda"):
         rasterize_splats(*single, camera(), backend="cuda")
@@ -559,7 +559,7 @@ def test_backends_that_cannot_draw_say_why():
     assert rasterize_splats(*double, camera()).image.dtype == torch.float64
 
 
-def test_without_numba_the_reference_draws_and_says_so(monkeypatch, caplog):
+def test_without_numba_the_reference_draws_with_a_warning(monkeypatch, caplog):
     scene = [t.float() for t in splats(10, 3)]
     expected = rasterize_splats(*scene, camera(), backend="reference").image
     backends._warn_once.cache_clear()

@@ -128,7 +128,7 @@ def test_far_from_the_origin_colours_are_those_near_it_to_the_bit():
 
 @pytest.mark.parametrize("backend", ["auto", "reference"])
 @pytest.mark.parametrize("count", [1, *COUNTS])
-def test_what_is_clamped_sends_no_gradient(count, backend):
+def test_clamped_colours_have_no_gradient(count, backend):
     tensors, _ = draw(30, count)
     dark = tensors["sh"].clone()
     dark[:, 0, 1] -= 50
@@ -184,7 +184,7 @@ def test_a_coefficient_that_is_not_a_number_is_an_error_and_not_a_black_dot():
 
 
 @pytest.mark.parametrize("kind", ["array", "tensor"])
-def test_what_the_caller_does_to_its_poses_after_a_call_does_not_reach_the_gradients(kind):
+def test_changing_poses_after_a_call_does_not_change_gradients(kind):
     tensors, where = draw(40, 4)
     where = {name: np.ascontiguousarray(value) for name, value in where.items()}
     expected = differentiate(lambda **t: shade.seen_colors(**t, **where), tensors)[1]

@@ -51,7 +51,7 @@ def test_more_groups_than_one_pass_holds_are_as_exact(posed):
     np.testing.assert_allclose(np.where(found == 17, parts, 0).sum(-1), part[..., 0], atol=1e-6)
 
 
-def test_who_is_of_no_interest_still_covers(posed):
+def test_gaussians_without_group_still_occlude(posed):
     groups = np.where(posed[0].gaussians.object_ids == 1, 0, -1)
     _, parts = shares(posed, groups, 2)
     _, all_parts = shares(posed, np.zeros_like(groups), 2)

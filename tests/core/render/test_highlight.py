@@ -50,7 +50,7 @@ def test_all_objects_together_are_the_whole_picture(scene):
     np.testing.assert_allclose(shown[solid], whole[solid], atol=2e-3)
 
 
-def test_what_is_not_asked_for_is_gray_and_dim(scene):
+def test_objects_without_highlight_are_gray_and_dim(scene):
     whole = np.clip(drawn(scene, 0.4, "scene").color, 0, 1)
     nothing = highlight.highlight(scene, [], CAMERA, 0.4, backend=BACKEND)
     assert np.ptp(nothing, axis=-1).max() < 1e-6

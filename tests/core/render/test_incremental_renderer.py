@@ -65,7 +65,7 @@ def test_another_camera_sky_or_selection_starts_again(scene, made):
     assert len(made) == 2
 
 
-def test_what_begins_to_move_later_is_taken_out_of_what_stands_still(scene, made):
+def test_instances_that_start_to_move_leave_the_static_layer(scene, made):
     theatre, instances = incremental_renderer.Stage(scene), group_instances(scene, 0.4)
     for moving in ((), (1,), (1, 2), (2,), ()):
         shown = []
@@ -77,7 +77,7 @@ def test_what_begins_to_move_later_is_taken_out_of_what_stands_still(scene, made
     assert len(made) == 2
 
 
-def test_where_almost_all_moves_everything_is_drawn(scene, made):
+def test_without_static_instances_no_layer_is_cached(scene, made):
     theatre = incremental_renderer.Stage(scene)
     for shift in (0.0, 0.1, 0.2):
         matrix = np.eye(4)
@@ -251,7 +251,7 @@ def bending(request):
 
 
 @pytest.mark.parametrize("t", [-0.1, 0.13, 0.4, scenes.T_MAX, 0.9])
-def test_what_bends_is_bent_as_in_playback(bending, t):
+def test_deformed_gaussians_match_playback(bending, t):
     found = incremental_renderer.Stage(bending).render(bent_instances(bending, t), CAMERA)
     expected = scene_renderer.render_frame(bending, scene_player.frame(bending, t), CAMERA)
     np.testing.assert_allclose(found.color, expected.color, atol=5e-3)  # a cut-off may fall differently
@@ -260,7 +260,7 @@ def test_what_bends_is_bent_as_in_playback(bending, t):
         assert np.abs(stiff.color - expected.color).max() > 0.05
 
 
-def test_what_bends_in_a_moved_world_is_the_same_picture(bending):
+def test_deformed_gaussians_in_a_moved_world_give_the_same_image(bending):
     world = matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2))
     shown = [
         Instance(one.start, one.count, world @ one.matrix, 0, world, t=0.2) for one in bent_instances(bending, 0.2)
@@ -271,7 +271,7 @@ def test_what_bends_in_a_moved_world_is_the_same_picture(bending):
     np.testing.assert_allclose(found.color, expected.color, atol=5e-3)
 
 
-def test_what_bends_moves_and_the_rest_is_kept(bending, made):
+def test_deforming_gaussians_are_redrawn_and_others_stay_cached(bending, made):
     theatre = incremental_renderer.Stage(bending)
     for t in (0.1, 0.2, 0.3):
         shown = [dataclasses.replace(one, matrix=np.eye(4)) for one in bent_instances(bending, t)]

@@ -125,7 +125,7 @@ def warm_ups(cold, cache):
     return calls
 
 
-def test_a_cold_worker_compiles_beside_its_requests_and_says_so(cold):
+def test_a_cold_worker_compiles_in_the_background_and_announces_it(cold):
     said = [header.get("event", header.get("id")) for header in cold]
     assert sorted(map(str, said)) == ["0", "1", "2", "3", "compiling", "ready"]
     assert said[0] == 0 and said.index(1) < said.index("ready") < said.index(2) < said.index(3)
@@ -134,7 +134,7 @@ def test_a_cold_worker_compiles_beside_its_requests_and_says_so(cold):
     assert cold[said.index("compiling")]["text"] == compilation.NOTICE
 
 
-def test_a_warm_worker_says_nothing_of_it(warm_ups, cache, scene_path):
+def test_a_warm_worker_announces_no_compilation(warm_ups, cache, scene_path):
     assert [header.get("event", header.get("id")) for header in talk(cache, scene_path)] == [0, 1, 2, 3]
 
 

@@ -32,7 +32,7 @@ def write(place, content, later=10.0):
     os.utime(place, (now, now))
 
 
-def test_where_nothing_was_measured_it_is_said_how_to(scene, path):
+def test_unmeasured_quality_names_the_evaluate_command(scene, path):
     found = quality.of(scene, path)
     assert (found.psnr_observed, found.psnr_later, found.rigid_rms, found.bending) == (None, None, None, 0)
     assert "r5dgs evaluate" in found.text()

@@ -151,7 +151,7 @@ def test_equal_scenes_are_equal_files(scene, path, tmp_path):
     assert scene_file.write(scene, tmp_path / "again.r5dgs").read_bytes() == path.read_bytes()
 
 
-def test_what_was_read_is_written_as_the_same_file(tmp_path, monkeypatch):
+def test_a_scene_that_was_read_is_written_byte_for_byte(tmp_path, monkeypatch):
     monkeypatch.setattr(scene_file, "_QUATS_AT_ONCE", 700)
     path = scene_file.write(make_scene(n=3000, sh_degree=1), tmp_path / "a.r5dgs")
     again = scene_file.write(scene_file.read(path), tmp_path / "b.r5dgs")
@@ -388,7 +388,7 @@ def test_inconsistent_scenes_are_not_written(scene, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_info_tells_what_the_file_holds(scene):
+def test_info_summarizes_the_file(scene):
     info = json.loads(json.dumps(scene_info.info(scene)))
     assert info["gaussians"] == 300
     assert info["sh_degree"] == 2
@@ -420,7 +420,7 @@ def test_info_tells_what_the_file_holds(scene):
         (setter("provenance", json.loads("[" * 63 + "]" * 63)), "nested deeper|provenance"),
     ],
 )
-def test_what_could_not_be_played_or_written_is_refused_on_reading(path, tmp_path, change, message):
+def test_unplayable_scenes_are_rejected_on_reading(path, tmp_path, change, message):
     broken = rewrite(path, tmp_path / "broken.r5dgs", change_json=change)
     with pytest.raises(errors.SceneFileError, match=message):
         scene_file.read(broken)
@@ -439,7 +439,7 @@ def test_numbers_that_no_picture_can_show_are_refused(scene, tmp_path, member, v
         scene_file.read(broken)
 
 
-def test_what_json_cannot_hold_is_not_written(scene, tmp_path):
+def test_values_that_json_cannot_hold_are_rejected_on_writing(scene, tmp_path):
     for provenance in ({"a": float("nan")}, {"a": "\ud800"}, {"a": 10**400}, {"a": json.loads("[" * 80 + "]" * 80)}):
         with pytest.raises(errors.SceneFileError, match=r"scene\.json"):
             scene_file.write(dataclasses.replace(scene, provenance=provenance), tmp_path / "a.r5dgs")

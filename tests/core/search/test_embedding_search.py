@@ -87,7 +87,7 @@ def test_several_match_where_several_fit_and_none_far_below_the_best():
     assert sum(one.score >= embedding_search.PASS for one in embedding_search.ask(wide, np.eye(4)[0])) == 3
 
 
-def test_nothing_matches_under_the_thresholds_and_an_object_without_embedding_says_nothing():
+def test_scores_below_thresholds_fail_and_objects_without_embedding_are_skipped():
     known = table_of([around(0.4), np.zeros(4), around(0.45)], [0.5, None, 0.5])
     answers = embedding_search.ask(known, np.eye(4)[0])
     assert [one.object_id for one in answers] == [3, 1] and all(one.score < embedding_search.PASS for one in answers)

@@ -62,7 +62,7 @@ def test_an_exact_name_scores_one_and_better_answers_score_more(scene):
     assert score("coffee mug", MUG) < score("mug", MUG)
 
 
-def test_matches_say_why(scene):
+def test_matches_give_their_reason(scene):
     (match,) = object_search.search(scene, "cups")
     assert match.why == "alias 'cup'"
     (match,) = object_search.search(scene, "aple")
@@ -149,7 +149,7 @@ def test_stored_embeddings_answer_words_that_no_name_has(scene):
     assert object_search.search(scene, "sour things") == []
 
 
-def test_a_sentence_says_what_there_is(scene):
+def test_the_message_without_matches_lists_the_objects(scene):
     labels = [object_search.Label(item.id, item.name) for item in scene.objects if item.id > 0]
     said = object_search.explain_nothing(labels, " giraffe ")
     assert said.startswith("nothing matches 'giraffe'")
@@ -168,7 +168,7 @@ def test_a_sentence_says_what_there_is(scene):
         ("no", []),
     ],
 )
-def test_what_nothing_matches_may_be_close_to_a_name_or_an_alias(scene, text, meant):
+def test_phrases_without_match_suggest_similar_names_and_aliases(scene, text, meant):
     labels = [object_search.Label(item.id, item.name, item.aliases) for item in scene.objects if item.id > 0]
     assert object_search.suggest(labels, text)[: len(meant) or None] == meant
     if meant:
@@ -256,7 +256,7 @@ def test_two_of_a_kind_are_two_matches():
     assert [m.object_id for m in object_search.search_labels(labels, "both of the chairs")] == [1, 3]
 
 
-def test_what_finds_nothing_among_several_wishes_is_named():
+def test_phrases_without_match_are_listed():
     labels = [object_search.Label(1, "mug"), object_search.Label(2, "lemon")]
     assert object_search.unanswered(labels, "two spoons, lemon and elephant") == ["two spoons", "elephant"]
     assert object_search.unanswered(labels, "mugs and lemons") == []

@@ -58,7 +58,7 @@ def test_nothing_is_no_object(scene, text):
         ("not the background", set()),
     ],
 )
-def test_what_is_left_out_is_all_that_is_missing(scene, text, left_out):
+def test_exclusions_remove_only_the_excluded_objects(scene, text, left_out):
     assert found(scene, text) == ALL - left_out
 
 
@@ -88,18 +88,18 @@ def test_exclusions_belong_to_what_stands_before_them(scene, text, ids):
 @pytest.mark.parametrize(
     "text", ["not the vaze", "everything but the vaze", "mug but not the vaze", "not mug and vaze"]
 )
-def test_leaving_out_what_is_unknown_is_an_error_and_no_selection(scene, text):
+def test_excluding_an_unknown_object_raises(scene, text):
     with pytest.raises(errors.ConfigError, match="excludes an unknown object: nothing matches '.*vaze'"):
         query.find(scene, text)
 
 
-def test_the_error_says_what_may_have_been_meant(scene):
+def test_the_error_for_an_unknown_exclusion_suggests_similar_names(scene):
     with pytest.raises(errors.ConfigError, match="did you mean 'mug'"):
         object_search.search(scene, "everything except the bug")
 
 
 @pytest.mark.parametrize("text", ["not", "everything but", "all except for ", "without"])
-def test_a_prompt_that_ends_too_early_says_so(scene, text):
+def test_an_incomplete_prompt_raises(scene, text):
     with pytest.raises(errors.UsageError, match="nothing to exclude after"):
         query.find(scene, text)
 
@@ -136,7 +136,7 @@ def test_unknown_phrases_that_are_left_out_are_asked_of_the_encoder(scene):
     assert object_search.unanswered(labels, "mug and zeppelin but not the car") == ["zeppelin"]
 
 
-def test_the_command_says_that_no_object_is_asked_for(scene, tmp_path, capsys):
+def test_the_command_reports_a_prompt_that_selects_no_object(scene, tmp_path, capsys):
     path = scene_file.write(scene, tmp_path / "scene.r5dgs")
     assert query_command.run_query(path, "none") == []
     assert "'none' asks for no object" in capsys.readouterr().out

@@ -50,7 +50,7 @@ def test_every_case_passes(rows):
     assert [(row.topic, row.name, row.measured, row.message) for row in rows if not row.passed] == []
 
 
-def test_every_case_says_what_it_tries_and_is_told_apart(rows):
+def test_every_case_is_described_and_unique(rows):
     assert len({(row.topic, row.name) for row in rows}) == len(rows) == len(SHORT)
     for row in rows:
         assert row.name and row.method and row.quantity and row.source
@@ -77,7 +77,7 @@ def test_the_table_is_the_same_on_every_run(rows):
         assert row.measured == first[row.topic, row.name]
 
 
-def test_traces_integrator_is_shown_beside_ours_and_fails_where_theory_says(rows):
+def test_traces_integrator_shows_the_errors_that_theory_predicts(rows):
     by_name = {(row.topic, row.name): row for row in rows}
     assert by_name["growth", "one step of 1 rad"].trace_rk2 == pytest.approx(math.sqrt(1.25) - 1)
     assert by_name["direction of time", "forward, then backward, 4 steps"].trace_rk2 > 1
@@ -90,7 +90,7 @@ def magnus_of_order_two(monkeypatch):
     monkeypatch.setattr(se3, "step_twists", lambda w, v, e, a, t, steps, order=4: honest(w, v, e, a, t, steps, 2))
 
 
-def test_an_integrator_of_order_two_fails_where_order_four_is_asked_for_and_nowhere_else(monkeypatch):
+def test_an_integrator_of_order_two_fails_only_the_rows_for_order_four(monkeypatch):
     magnus_of_order_two(monkeypatch)
     assert failed(of("order", "closed forms", "growth", "time grid")) == {
         ("order", "Magnus-4 is of order 4"),
@@ -122,7 +122,7 @@ def test_signs_that_jump_fail_the_rows_on_signs(monkeypatch):
     assert broken == {("signs", "ten turns in steps of 20 degrees")}
 
 
-def test_a_fit_that_mirrors_fails_where_points_lie_in_a_plane_or_less(monkeypatch):
+def test_a_fit_that_mirrors_fails_for_points_in_a_plane(monkeypatch):
     def mirrored(source, target, weights):
         center, moved = weights @ source, weights @ target
         u, _, vt = np.linalg.svd(((target - moved) * weights[:, None]).T @ (source - center))
@@ -160,7 +160,7 @@ def test_a_case_that_raises_fails_with_its_message_and_the_others_still_run():
     assert stability.summary(found).startswith("1 of 3 cases pass")
 
 
-def test_a_case_that_takes_too_long_fails_and_what_prepares_it_does_not_count(monkeypatch):
+def test_a_case_that_takes_too_long_fails_without_counting_preparation(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(stability.time, "process_time", lambda: clock[0])
 
@@ -209,7 +209,7 @@ def test_the_exit_code_follows_the_rows(monkeypatch, tmp_path, capsys):
     assert json.loads(path.read_text())["failed"] == 1
 
 
-def test_a_place_that_cannot_be_written_is_told_before_the_work(monkeypatch, tmp_path, capsys):
+def test_an_unwritable_path_is_rejected_before_the_work(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(stability, "run", lambda *_, **__: pytest.fail("ran"))
     assert main.main(["report", "--stability", "--json", str(tmp_path / "none" / "rows.json")]) == 3
     assert "make it first" in capsys.readouterr().err

@@ -53,7 +53,7 @@ def dataset(root="/data"):
     return SimpleNamespace(root=Path(root), digest="d1")
 
 
-def test_what_is_saved_is_loaded_to_the_bit(tmp_path):
+def test_checkpoints_are_loaded_to_the_bit(tmp_path):
     checkpoint.save(tmp_path, STATE)
     loaded = checkpoint.load(tmp_path)
     assert loaded.tensors.keys() == STATE.tensors.keys()
@@ -180,7 +180,7 @@ def test_a_damaged_run_file_is_named(tmp_path, change, message):
         checkpoint.open_run(tmp_path)
 
 
-def test_a_folder_that_is_no_run_is_said(tmp_path):
+def test_a_folder_that_is_not_a_run_raises(tmp_path):
     with pytest.raises(CheckpointError, match="not a run folder"):
         checkpoint.open_run(tmp_path)
 

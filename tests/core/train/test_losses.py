@@ -142,7 +142,7 @@ def test_threads_do_not_change_the_loss():
         assert torch.equal(loss, results[0][0]) and torch.equal(gradient, results[0][1])
 
 
-def test_a_transposed_input_is_read_by_its_meaning_not_its_memory():
+def test_transposed_images_give_the_same_loss():
     x, y = pair(12, 8)
     turned = x.transpose(0, 1).contiguous().transpose(0, 1)
     assert not turned.is_contiguous()

@@ -45,7 +45,7 @@ def agreement(found, truth):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_bodies_are_told_apart_by_their_motion_and_their_place(seed):
+def test_bodies_are_separated_by_motion_and_position(seed):
     rng = np.random.default_rng(seed)
     paths, truth = scene(rng, 0.01)
     order = rng.permutation(len(paths))

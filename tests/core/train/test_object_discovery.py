@@ -37,7 +37,7 @@ def overlap(found, truth, a, b):
 
 
 @pytest.mark.slow
-def test_what_moves_is_found_and_told_apart(unmasked, tiny):
+def test_moving_objects_are_found_and_separated(unmasked, tiny):
     config = tiny_datasets.settings("discovery.iterations=1000", "densify.stop=0.6")
     events = []
     found = object_discovery.find(datasets.read(unmasked.root), config, events.append)
@@ -60,7 +60,7 @@ def test_a_run_looks_only_where_it_has_to(unmasked, tiny):
     assert training_needs.discovery(datasets.read(unmasked.root), field)
 
 
-def test_where_nothing_moves_no_masks_are_made(unmasked, monkeypatch):
+def test_static_scenes_get_no_masks(unmasked, monkeypatch):
     monkeypatch.setattr(object_discovery, "parts", lambda trainer, config: np.full(len(trainer.gaussians), -1))
     config = tiny_datasets.settings("discovery.iterations=2")
     assert object_discovery.find(datasets.read(unmasked.root), config) is None
@@ -153,7 +153,7 @@ def test_a_field_without_masks_sorts_what_moves_in_the_end(unmasked, tmp_path, m
     assert len(sorted_ones) == 1 and checkpoint.load(again.folder).finished
 
 
-def test_a_field_is_sorted_only_where_nothing_else_says_what_belongs_together(unmasked, tiny):
+def test_a_field_is_sorted_only_without_other_grouping(unmasked, tiny):
     data = datasets.read(unmasked.root)
     field = "train.representation='field'"
     assert training_needs.sorting(data, tiny_datasets.settings(field))

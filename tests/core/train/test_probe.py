@@ -33,7 +33,7 @@ def test_a_run_that_looks_at_held_out_views_ends_with_the_same_bits(tiny, tmp_pa
     assert logged == looking and {10, 20, 30, 40} < {event["iteration"] for event in logged}
 
 
-def test_training_raises_what_held_out_views_say(tiny, tmp_path):
+def test_training_raises_the_psnr_of_held_out_views(tiny, tmp_path):
     found = [e["val_psnr"] for e in events_of(tiny.root, tmp_path / "run", "train.probe_every=5") if "val_psnr" in e]
     assert 5 < found[0] < found[-1] < 60
 

@@ -232,7 +232,7 @@ def test_a_run_stays_where_the_one_that_replaces_it_cannot_begin(tiny, copied, m
     assert contents(copied) == before
 
 
-def test_resuming_where_there_is_no_run_says_that_a_new_one_starts(tiny, tmp_path, caplog):
+def test_resuming_without_a_run_starts_a_new_one_with_a_message(tiny, tmp_path, caplog):
     settings = tiny_datasets.settings("train.iterations=2", "identity.iterations=0")
     run.train(tiny.root, tmp_path / "run", settings, resume=True)
     assert [record.getMessage() for record in caplog.records if record.name == run.__name__] == [
@@ -254,7 +254,7 @@ def test_half_written_files_of_a_kill_are_removed(tiny, tmp_path):
 
 
 @pytest.mark.parametrize("name", [checkpoint.RUN_FILE, checkpoint.LOG_FILE, checkpoint.CHECKPOINT_FILE])
-def test_what_cannot_be_written_is_named(tiny, tmp_path, monkeypatch, name):
+def test_unwritable_files_are_named(tiny, tmp_path, monkeypatch, name):
     real = atomic_files.replacing
 
     def full(path, *previous):

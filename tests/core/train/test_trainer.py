@@ -103,7 +103,7 @@ def test_a_new_trainer_goes_on_to_the_same_bits(tiny, unbroken, broken_at):
     assert broken_at > 18 or trainer.curriculum.entered != entered  # a time entered after the break
 
 
-def test_a_state_stays_what_it_was_while_training_goes_on(tiny, unbroken):
+def test_training_does_not_change_a_saved_state(tiny, unbroken):
     folder, _ = unbroken
     state = checkpoint.load(folder / "9")
     trainer = make(tiny)

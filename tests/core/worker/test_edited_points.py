@@ -66,7 +66,7 @@ def test_edited_points_are_drawn_beside_untouched_rows(path, scene):
     np.testing.assert_allclose(arrays["color"], expected, atol=1e-5)
 
 
-def test_what_is_held_is_not_sent_again_and_what_is_not_kept_is_forgotten(path, scene):
+def test_held_points_are_not_sent_again_and_unused_ones_are_dropped(path, scene):
     a, b = scattered(scene, np.arange(20, 60)), scattered(scene, np.arange(60, 90))
     answers = talk(
         load(path),
@@ -91,7 +91,7 @@ def test_a_picture_without_edits_is_that_of_the_scene_again(path, scene):
     np.testing.assert_array_equal(before, after)
 
 
-def test_edits_of_two_scenes_are_told_apart(path, scene, tmp_path):
+def test_edits_of_two_scenes_are_kept_separate(path, scene, tmp_path):
     other = scenes.make_scene(n=100, objects=2, seed=9)
     second = scene_file.write(other, tmp_path / "other.r5dgs")
     edits = {"a": scattered(scene, np.arange(50)), "b": PointEdit(np.arange(0, 100, 3))}

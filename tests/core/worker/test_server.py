@@ -65,7 +65,7 @@ def load(path):
     return {"command": "load", "paths": [str(path)]}
 
 
-def test_hello_says_what_is_missing_and_which_protocol():
+def test_hello_returns_missing_packages_and_protocol_version():
     (header, _), *_ = talk({"command": "hello"})
     assert header["ok"] and header["result"]["protocol"] == messages.VERSION and header["result"]["missing"] == []
 
@@ -141,7 +141,7 @@ def test_a_file_that_is_named_twice_is_two_scenes(path):
         np.testing.assert_array_equal(found[1][name], once[1][name])
 
 
-def test_what_is_not_named_any_more_is_let_go_and_what_is_stays(path, tmp_path, monkeypatch):
+def test_scenes_no_longer_requested_are_released(path, tmp_path, monkeypatch):
     copy = tmp_path / "copy.r5dgs"
     copy.write_bytes(path.read_bytes())
     read, original = [], scene_file.read
@@ -248,7 +248,7 @@ def test_a_warm_up_that_fails_after_it_was_announced_ends_with_the_reason(monkey
     assert events == (announced if compiled else [])
 
 
-def test_what_is_known_of_the_error_comes_with_the_picture(path, tmp_path):
+def test_a_picture_is_returned_with_its_known_error(path, tmp_path):
     scene = scene_file.read(path)
     rows = np.arange(20, 40, dtype=np.int32)
     shape = (len(rows), len(scene.tracks.times))
@@ -275,7 +275,7 @@ def test_what_is_known_of_the_error_comes_with_the_picture(path, tmp_path):
     assert all(one["error"] for one in stiff["result"]["scenes"])
 
 
-def test_a_check_tells_versions_device_and_speed():
+def test_a_check_returns_versions_device_and_speed():
     ((header, _),) = talk({"command": "check"})
     found = header["result"]
     assert header["ok"] and set(found["versions"]) == {"Python", "R5DGS", "torch", "numba"}

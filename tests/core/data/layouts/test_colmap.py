@@ -111,7 +111,7 @@ def test_an_image_beside_the_folders_stands_for_a_camera(rig):
     same_camera(dataset.train[0], beside[dataset.train[0].camera.name + ".png"])
 
 
-def test_times_json_says_when_and_what_is_the_test(rig):
+def test_times_json_sets_the_times_and_the_test_split(rig):
     root, views = rig
     times = {f"cam{k}/frame_{n:04d}.png": 0.1 * n for k in range(9) for n in (4, 6, 8, 12)}
     (root / "times.json").write_text(json.dumps({"times": times, "t_max": 0.8, "frames_per_unit": 25}))
@@ -145,7 +145,7 @@ def test_a_held_out_camera_is_never_trained_on(rig, caplog):
     assert "2 images of held-out cameras are left out" in caplog.text
 
 
-def test_where_only_held_out_cameras_are_early_they_are_trained_on(rig):
+def test_held_out_cameras_are_trained_on_if_no_other_is_early(rig):
     root, _ = rig
     times = {f"cam{k}/frame_0012.png": 1.2 for k in range(9)} | {"cam0/frame_0004.png": 0.4}
     (root / "times.json").write_text(json.dumps({"times": times, "t_max": 0.5}))
@@ -231,7 +231,7 @@ def test_damaged_text_is_named(flat, name, content, message):
         datasets.read(root)
 
 
-def test_what_is_missing_is_named(flat):
+def test_missing_files_are_named(flat):
     root, _ = flat
     (root / "sparse" / "0" / "images.bin").rename(root / "images.bin")
     with pytest.raises(DatasetError, match=r"images.bin: the file is missing, and so is images.txt"):

@@ -166,7 +166,7 @@ def test_nothing_grows_under_the_gradient_of_the_configuration():
     assert len(gaussians) == 40
 
 
-def test_what_no_image_needs_fades_and_is_removed():
+def test_gaussians_that_no_image_needs_fade_and_are_removed():
     gaussians, optimizer = make(n=6)
     wanted = torch.arange(6) < 4
     strategy = gradient.Share(SECTION, conditions(), 6)
@@ -243,7 +243,7 @@ def test_opacities_are_reset_as_growth_begins_where_the_background_is_white(whit
     assert found == expected
 
 
-def test_rounds_come_when_the_section_says():
+def test_rounds_follow_the_schedule_of_the_section():
     section = DensifyDefaultSection(start=100, stop=0.5, every=50, reset_every=0)
     strategy = gradient.Adaptive(section, conditions(cap=10**6), 40)
     gaussians, optimizer = make()

@@ -43,7 +43,7 @@ def test_rows_are_divided_by_their_own_counts():
     assert together[0][0] == pytest.approx(0.5) and together[1][0] == pytest.approx(1.0)
 
 
-def test_the_dead_come_back_as_parts_of_the_living():
+def test_dead_gaussians_are_relocated_onto_live_ones():
     gaussians, optimizer = with_opacities([0.9, 0.001, 0.004, 0.5, 0.003])
     (gaussians.means.sum() + gaussians.opacity_logits.sum()).backward()
     optimizer.step()

@@ -174,7 +174,7 @@ def test_identities_beside_the_geometry_learn_the_masks(training):
     assert found[-1] < 0.6 * found[0]
 
 
-def test_identities_start_as_their_training_says():
+def test_identities_are_initialized_as_configured():
     view, gaussians = wall()
     gaussians.motion_ids[7] = 5  # a shadow's group lies past the classes
     identities = make_joint(view, gaussians, "detached")
@@ -231,7 +231,7 @@ def test_each_loss_switched_off_leaves_its_part_out():
     ("representation", "variant", "active"),
     [("tracks", "r5dgs", True), ("field", "5dgs", False), ("field", "r5dgs", False), ("field", "r5dgs_extra", True)],
 )
-def test_of_the_variants_only_the_one_with_extra_losses_has_the_majority(representation, variant, active):
+def test_only_the_variant_with_extra_losses_uses_the_majority_loss(representation, variant, active):
     view, gaussians = wall()
     changes = {"train.representation": representation, "field.variant": variant, "identity.weight": 0.0}
     identities = make_joint(view, gaussians, "joint", **changes, **{"identity.majority": 0.5})
@@ -313,7 +313,7 @@ def test_gaussians_take_only_parameters_that_are_known_and_fit(name, count):
         wall()[1].add(name, torch.zeros(count, 16))
 
 
-def test_there_are_no_joint_identities_where_nothing_tells_objects_apart():
+def test_joint_identities_need_masks_of_objects():
     view, _ = row_of_blobs()
     asked = config.Config().replace(**{"identity.training": "joint"})
     assert joint_identity.joint([view], CLASSES, config.Config()) is None

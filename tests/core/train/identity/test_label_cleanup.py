@@ -100,7 +100,7 @@ def test_masks_that_contradict_each_other_change_nothing():
     assert changes == label_cleanup.Changes(gaussians=len(truth))
 
 
-def test_what_no_mask_shows_takes_the_label_around_it():
+def test_unseen_gaussians_take_the_surrounding_label():
     points, truth, opacities = scene()
     unseen = np.flatnonzero((truth == RIGHT) & (np.abs(points[:, 0] - 0.5) < 0.3))[::5]
     weights, said = votes_for(truth), truth.copy()
@@ -233,7 +233,7 @@ def test_companions_are_bodies_that_move_and_the_bind_state_is_at_the_last_knot(
     assert moving.tolist() == [False, False, True, True]
 
 
-def test_a_run_cleans_its_labels_says_how_many_and_can_be_told_not_to(tiny, tmp_path):
+def test_label_cleanup_reports_its_changes_and_can_be_disabled(tiny, tmp_path):
     steps = ("train.iterations=60", "identity.iterations=5")
     made, states = {}, {}
     for name, further in (("on", ()), ("off", ("identity.hygiene=false",))):
@@ -252,7 +252,7 @@ def test_a_run_cleans_its_labels_says_how_many_and_can_be_told_not_to(tiny, tmp_
     assert "label_hygiene" not in bake.bake(tiny_datasets.as_trained(made["off"])).provenance
 
 
-def test_the_table_of_objects_says_what_was_changed():
+def test_the_table_of_objects_shows_changed_labels():
     plain = scenes.make_scene()
     counts = {"neighbours": 5, "motion": 3, "outliers": 2, "gaussians": 600}
     told = dataclasses.replace(plain, provenance={"label_hygiene": counts})

@@ -50,7 +50,7 @@ def test_surfaces_stay_covered(count, cap):
     assert area == pytest.approx(min(count * math.exp(-6.0), len(after) * thinning.WIDEST**2), rel=1e-4)
 
 
-def test_what_is_wide_already_grows_no_more():
+def test_thinning_does_not_enlarge_wide_gaussians():
     before = gaussians([100])
     before.log_scales.data[:] = math.log(2 * thinning.WIDEST)
     after = thinning.thin(before, 10, np.random.default_rng(0))

@@ -77,7 +77,7 @@ def test_times_without_a_sighting_are_filled_from_their_neighbours():
     assert places.visibility[0, 1] == 0
 
 
-def test_an_object_that_one_camera_sees_lies_on_its_rays_and_a_warning_says_so(caplog):
+def test_an_object_seen_by_one_camera_is_placed_on_its_rays_with_a_warning(caplog):
     camera = ring()[0]
     center = np.array([0.1, 0.2, 0.3])
     seen = [disc_view(camera, t, [(1, center, 0.3)]) for t in TIMES]
@@ -158,7 +158,7 @@ def test_an_object_that_enters_the_frame_is_not_where_its_first_sliver_shows():
     assert largest_error(places, path) < 0.25
 
 
-def test_balls_that_touch_are_told_apart():
+def test_touching_balls_are_separated():
     looking = ring(7)
     path = np.array([[0.0, -0.35, 0.3], [0.0, 0.0, 0.3], [0.0, 0.35, 0.3]])
     other = np.array([0.5, 0.0, 0.3])  # half hides the first one from the side of the first camera

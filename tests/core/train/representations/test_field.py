@@ -73,7 +73,7 @@ def test_training_brings_the_images_closer(made):
     assert mean_loss(trainer) < 0.8 * before
 
 
-def test_what_the_masks_put_on_no_object_stays_still_to_the_bit(tiny):
+def test_gaussians_without_object_stay_still_to_the_bit(tiny):
     trainer = make(tiny)
     for _ in range(5):
         trainer.step()
@@ -253,7 +253,7 @@ def test_gradients_of_the_twist_loss_are_right_in_double_precision():
     assert torch.autograd.gradcheck(loss, state)
 
 
-def test_nothing_moves_where_the_user_says_that_nothing_does(tiny):
+def test_needs_tracks_off_disables_all_motion(tiny):
     trainer = make(tiny, "needs.tracks=off", "train.iterations=12")
     while not trainer.done:
         trainer.step()
@@ -321,7 +321,7 @@ def test_at_a_single_time_a_field_is_a_still_scene(tmp_path):
     assert torch.equal(early, late) and torch.isfinite(late).all()
 
 
-def test_what_the_user_switches_off_does_not_come_back_as_residuals(made, tiny):
+def test_disabled_motion_does_not_return_as_residuals(made, tiny):
     data = datasets.read(tiny.root)
     body = tiny_datasets.BRICK
 
@@ -336,7 +336,7 @@ def test_what_the_user_switches_off_does_not_come_back_as_residuals(made, tiny):
     assert travel("needs.tracks=off") < 1e-6
 
 
-def test_gaussians_of_a_field_go_with_the_group_that_explains_them_and_the_scene_says_how_many(made, scene, tiny):
+def test_baking_a_field_regroups_gaussians_by_motion_and_stores_their_number(made, scene, tiny):
     """A third of the brick was made for the ball; nobody but their motion says what they belong to."""
     data, state = datasets.read(tiny.root), checkpoint.load(made.folder)
     ids = state.tensors["gaussians.motion_ids"]

@@ -129,7 +129,7 @@ def test_the_gate_closes_once_every_time_takes_part_and_a_resumed_run_goes_throu
             assert torch.equal(tensor, expected.tensors[name]), (k, name)
 
 
-def test_where_masks_label_nothing_labelled_is_measured_and_elsewhere_it_is_not(unmasked, tiny):
+def test_labelled_gating_falls_back_to_measured_without_masks(unmasked, tiny):
     for data, expected in ((unmasked, "measured"), (tiny, "labelled")):
         trainer = make(data)
         assert gating.kind(len(trainer.object_ids), trainer.config) == expected

@@ -61,7 +61,7 @@ def spread_of(groups, truth):
     return worst
 
 
-def test_what_its_group_explains_stays_where_it_is():
+def test_gaussians_explained_by_their_group_stay_in_it():
     path, ids, opacities = scene()
     found, groups, moves = tidy(path, ids, opacities)
     np.testing.assert_array_equal(found, ids)
@@ -70,7 +70,7 @@ def test_what_its_group_explains_stays_where_it_is():
 
 
 @pytest.mark.parametrize(("wrong", "count"), [(LEFT, "to_bodies"), (RIGHT, "to_bodies"), (SHADOW, "to_shadows")])
-def test_what_another_group_explains_goes_there(wrong, count):
+def test_gaussians_explained_by_another_group_move_to_it(wrong, count):
     path, ids, opacities = scene()
     truth, start = ids.copy(), ids.copy()
     start[np.flatnonzero(ids == wrong)[:25]] = {LEFT: RIGHT, RIGHT: LEFT, SHADOW: LEFT}[wrong]
@@ -92,7 +92,7 @@ def test_members_of_the_background_that_move_with_a_body_join_it_and_those_that_
     assert (moves.to_bodies, moves.to_rest) == (20, 20)
 
 
-def test_what_moves_alike_far_away_stays_with_its_own():
+def test_distant_gaussians_with_equal_motion_keep_their_group():
     path, ids, opacities = scene()
     far = np.flatnonzero(ids == RIGHT)[:10]
     path[far] = carried(path[far][:, -1] + np.array([4.0, 0, 0]), LEFT)

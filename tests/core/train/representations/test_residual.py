@@ -88,7 +88,7 @@ def test_breathing_grows_the_gaussians_too():
     torch.testing.assert_close(change.offsets[mine], expected, atol=1e-9, rtol=0)
 
 
-def test_what_is_rigid_stays_with_the_track():
+def test_rigid_gaussians_follow_their_track():
     means, quats, weights, ids = random_state()
     field = field_on(means, ids, weights)
     generator = torch.Generator().manual_seed(3)
@@ -150,7 +150,7 @@ def test_a_body_of_one_gaussian_cannot_bend():
     assert change.offsets.abs().max() < 1e-9 and change.log_scales.isfinite().all()
 
 
-def test_what_turns_on_its_own_is_lit_like_what_its_track_turns():
+def test_residual_rotation_is_shaded_like_track_rotation():
     generator = torch.Generator().manual_seed(4)
     colors, shading = torch.rand(5, 3, generator=generator), 0.3 * torch.randn(5, 3, generator=generator)
     light, turn = torch.tensor([0.2, -0.5, 0.9]), rotations.rotvecs_to_quats(torch.tensor([[0.3, 0.1, -0.8]]))
@@ -252,7 +252,7 @@ def test_nothing_is_tried_where_one_time_alone_was_observed(tiny, tmp_path):
     assert (largest, there) == (0.0, False) and "none was tried" in reason
 
 
-def test_the_table_says_where_what_bends_is_too_little_to_be_stored():
+def test_the_table_marks_deformation_too_small_to_store():
     means, _, weights, ids = random_state()
     tensors = residual.tensors_of(field_on(means, ids, weights).only([2]))
     tensors |= {"residual.gains": torch.tensor([-1.0, 0.7]), "object_ids": torch.tensor([0, 1, 2])}
@@ -272,7 +272,7 @@ def breathing(tmp_path_factory):
     return data, done, bake.bake(done)
 
 
-def test_what_breathes_is_found_and_what_is_rigid_keeps_no_residuals(breathing):
+def test_only_the_deforming_object_gets_residuals(breathing):
     _, done, scene = breathing
     tensors = checkpoint.load(done.folder).tensors
     assert set(tensors["residual.owners"].tolist()) == {BALL}

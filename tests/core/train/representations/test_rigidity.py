@@ -45,7 +45,7 @@ def test_the_representative_is_the_visible_member_nearest_to_the_centroid(n, see
         assert float((means[found[k]] - means[rows].mean(0)).norm()) == pytest.approx(float(distances.min()))
 
 
-def test_of_equally_near_members_the_first_is_taken():
+def test_the_first_of_equally_near_members_is_the_representative():
     corners = torch.tensor([[9.0, 9, 9], [1, 1, 0], [-1, 1, 0], [1, -1, 0], [-1, -1, 0]])
     labels = torch.tensor([0, 1, 1, 1, 1])
     opacities = torch.ones(5)

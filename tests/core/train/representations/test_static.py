@@ -69,7 +69,7 @@ def test_a_scene_at_rest_has_nothing_that_moves_in_run_file_and_memory(still, tm
     np.testing.assert_array_equal(scene_player.frame(scene, 7.0).means, scene.gaussians.means)
 
 
-def test_what_moves_a_little_is_seen(still, tiny):
+def test_small_motion_is_detected(still, tiny):
     at_rest, moving = train_views(still), train_views(tiny)
     assert static.nothing_moves(at_rest) and not static.nothing_moves(moving)
     draw = np.random.default_rng(0)

@@ -59,7 +59,7 @@ def grow(motion, low, high):
 
 
 @pytest.mark.parametrize("measured", [[1] * 7, [0, 0, 1, 1, 1, 0, 0], [0] * 7])
-def test_steady_motion_goes_on_steadily_over_uneven_knots_whether_masks_show_it_or_not(measured):
+def test_constant_motion_is_extrapolated_over_uneven_knots(measured):
     motion = make(measured)
     set_knots(motion, (3, 4))
     grow(motion, 3, 4)
@@ -70,7 +70,7 @@ def test_steady_motion_goes_on_steadily_over_uneven_knots_whether_masks_show_it_
         assert rotations.angle_between(found.quats[1].detach().numpy().astype(np.float64), quat) < 1e-3, k
 
 
-def test_a_body_that_comes_back_is_where_the_masks_say_not_where_it_was_heading():
+def test_a_body_that_returns_is_placed_by_its_masks_not_by_extrapolation():
     path = np.array([truth(t)[0] for t in TIMES])
     path[5:] += [0.0, 0.7, 0.0]  # pushed while it was hidden at knot 4
     motion = make([1, 1, 1, 1, 0, 1, 1], path=path)
@@ -80,7 +80,7 @@ def test_a_body_that_comes_back_is_where_the_masks_say_not_where_it_was_heading(
     np.testing.assert_allclose(found - found[3], path - path[3], atol=1e-5)
 
 
-def test_where_the_images_show_it_without_masks_the_trained_velocity_is_kept_and_where_it_is_absent_the_masks_path():
+def test_velocity_continues_without_masks_and_follows_masks_if_absent():
     wrong = np.tile([0.0, 0.0, 0.0], (7, 1))  # the masks' path stands still
     for absent, expected in (([0] * 7, truth(TIMES[6])[0]), ([0, 0, 0, 0, 0, 1, 1], truth(TIMES[4])[0])):
         motion = make([0, 0, 1, 1, 1, 0, 0], absent, path=wrong)
