@@ -323,8 +323,8 @@ def test_excluding_an_unknown_object_raises_and_selects_nothing(blender, loaded,
         ask(blender, text)
     assert selected_ids(blender) == {6} and len(session(blender).matches) == 0
     session(blender).prompt = text  # typed into the field, the panel says so
-    assert any("leave" in note.name for note in session(blender).notes)
-    with pytest.raises(RuntimeError, match="leaves out|to leave out"):
+    assert any("exclude" in note.name for note in session(blender).notes)
+    with pytest.raises(RuntimeError, match="excludes an unknown object|nothing to exclude after"):
         blender.ops.r5dgs.isolate(text=text)
 
 
