@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 NAME = "export"
 SHORT = "write a scene in a format of other programs"
-LONG = "Write the Gaussians of a scene at a time or for a range of frames as PLY, or its cameras as transforms.json."
+LONG = "Write a scene at a time, or for a range of frames, in a format of other programs."
 EXAMPLE = "scene.r5dgs --to ply --out frame.ply --frames 1:60"
 PAGE = "user/export.md"
 
@@ -28,7 +28,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--to", required=True, metavar="FORMAT", help=f"format of the file, one of {', '.join(registry.MODULES)}"
     )
-    out = "file to write; with --frames, the frame number is inserted into the name of each PLY file"
+    out = "file to write; with --frames, formats with one file per frame insert the frame number into the name"
     p.add_argument("--out", type=Path, required=True, metavar="FILE", help=out)
     when = p.add_mutually_exclusive_group()
     when.add_argument("--time", type=float, metavar="T", help="scene time (default: t_max); may exceed t_max")

@@ -66,9 +66,8 @@ def extended(tmp_path):
     folder = tmp_path / "r5dgs_core/motion/models"
     (folder / f"{NAME}.py").write_text(code)
     registry = (folder / "__init__.py").read_text()
-    names, last = re.search(r"_NAMES = \(\n(?:.*\n)*?\)", registry).group(), '    "free_top",\n'
-    assert names.count(last) == 1
-    (folder / "__init__.py").write_text(registry.replace(names, names.replace(last, f'{last}    "{NAME}",\n')))
+    names = re.search(r"_NAMES = \(\n(?:.*\n)*?\)", registry).group()
+    (folder / "__init__.py").write_text(registry.replace(names, f'{names[:-1]}    "{NAME}",\n)'))
     return tmp_path
 
 
