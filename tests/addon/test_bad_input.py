@@ -181,7 +181,7 @@ def test_every_action_needs_a_scene_or_is_known_to_need_none(blender):
     assert needing | NEEDING_NONE == {name for name in dir(blender.ops.r5dgs) if not name.startswith("_")}
 
 
-def test_no_file_at_all_is_asked_for(blender):
+def test_loading_without_a_path_raises(blender):
     with pytest.raises(RuntimeError, match="choose a .r5dgs file"):
         blender.ops.r5dgs.load_scene()
 

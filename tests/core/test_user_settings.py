@@ -140,7 +140,7 @@ def test_config_prints_defaults_files_and_runs(tiny, tmp_path, capsys):
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_config_refuses_what_it_cannot_read(tmp_path, capsys):
+def test_config_refuses_unreadable_values(tmp_path, capsys):
     assert "no such configuration file" in complaint(capsys, "config", tmp_path / "c.toml")
     assert "not a run folder" in complaint(capsys, "config", tmp_path)
     (tmp_path / "run.json").write_text('{"config": 3}')

@@ -69,6 +69,6 @@ def test_inputs_follow_from_seed_and_index(tmp_path):
 
 
 @pytest.mark.parametrize("change", [mutations.data, mutations.text, mutations.tree])
-def test_mutations_change_what_they_are_given(change):
+def test_mutations_change_their_input(change):
     content = b'{"a": [1, 2.5], "b": {"c": "text"}}'
     assert sum(change(Random(seed), content) != content for seed in range(50)) > 35

@@ -343,7 +343,7 @@ def test_the_loss_under_another_exposure_reads_no_points_again(blender, loaded, 
     assert len(reads) == 1
 
 
-def test_curves_are_inverted_and_what_cannot_be_is_named(blender, loaded, scene, tmp_path):
+def test_invertible_curves_are_inverted_and_others_reported(blender, loaded, scene, tmp_path):
     color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     view = blender.context.scene.view_settings
     view.use_curve_mapping = True

@@ -273,9 +273,7 @@ def test_in_a_window_the_picture_comes_while_the_window_stays_free(blender, load
     np.testing.assert_array_equal(pixels_of(blender.data.images["R5DGS Preview"]), expected)
 
 
-def test_the_picture_goes_to_image_editors_that_hold_none_and_one_is_asked_for_where_none_shows_it(
-    blender, windowed, monkeypatch
-):
+def test_the_picture_opens_in_empty_image_editors_or_the_user_is_told_to_open_one(blender, windowed, monkeypatch):
     editors = [types.SimpleNamespace(image=image) for image in ("another", None)]
     areas = [
         types.SimpleNamespace(type="IMAGE_EDITOR", spaces=types.SimpleNamespace(active=one), tag_redraw=lambda: None)

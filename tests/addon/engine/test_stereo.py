@@ -44,7 +44,7 @@ def render_views(bpy, folder, suffixes):
 
 @pytest.mark.parametrize("fit", ["HORIZONTAL", "VERTICAL"])
 @pytest.mark.parametrize("mode", ["PARALLEL", "OFFAXIS"])
-def test_each_eye_sees_what_a_camera_in_its_place_sees(blender, stereo, tmp_path, mode, fit):
+def test_each_eye_renders_like_a_camera_at_its_position(blender, stereo, tmp_path, mode, fit):
     camera = stereo.camera
     data = camera.data
     data.stereo.convergence_mode, data.sensor_fit, data.shift_x = mode, fit, 0.05

@@ -53,7 +53,7 @@ def seen(matrix, intrinsics, point):
     return np.array([*pixels[0], depth[0]])
 
 
-def test_transforms_json_sees_what_blenders_camera_sees(blender, view, tmp_path):
+def test_exported_transforms_json_matches_blenders_camera(blender, view, tmp_path):
     assert blender.ops.r5dgs.export_cameras(directory=str(tmp_path / "out"), frame_step=2) == {"FINISHED"}
     assert blender.context.scene.frame_current == 3
     entries, rest = transforms.read(tmp_path / "out" / "transforms.json")

@@ -98,7 +98,7 @@ def test_the_unassigned_answer_to_nothing_and_the_background_to_its_name(blender
     assert selected_ids(blender) == {0}
 
 
-def test_the_sidebars_field_is_asked_where_no_text_is_given(blender, loaded):
+def test_without_text_the_prompt_of_the_sidebar_is_used(blender, loaded):
     blender.context.window_manager.r5dgs_words.prompt = "toy car"
     assert blender.ops.r5dgs.select_by_prompt() == {"FINISHED"}
     assert selected_ids(blender) == {3}
@@ -163,7 +163,7 @@ def test_prompts_that_found_something_are_kept_with_the_file(blender, loaded, tm
     assert history() == kept
 
 
-def test_the_panel_offers_earlier_prompts_and_what_was_meant(blender, loaded):
+def test_the_panel_offers_earlier_prompts_and_suggestions(blender, loaded):
     panel = importlib.import_module("r5dgs.r5dgs_addon.panels.prompt")
 
     def earlier():

@@ -123,7 +123,7 @@ def test_a_duplicate_moves_the_same_way_on_its_own(blender, loaded):
     assert motions.keys(mug) == before and motions.keys(twin) != before
 
 
-def test_a_duplicate_stands_beside_the_original_unless_told_otherwise(blender, loaded):
+def test_a_duplicate_is_placed_beside_the_original_by_default(blender, loaded):
     motions.choose(blender, blender.data.objects["red apple"])  # its cloud stands for it
     blender.ops.r5dgs.duplicate_object()
     a, b = (motions.points(blender, blender.data.objects[name]) for name in ("red apple", "red apple.001"))
@@ -139,7 +139,7 @@ def test_deleting_a_duplicate_leaves_everything_as_it_was(blender, loaded):
     assert {kind: {data.name for data in getattr(blender.data, kind)} for kind in KINDS} == before
 
 
-def test_deleting_takes_what_belongs_to_the_object_and_nothing_else(blender, scene_path, loaded):
+def test_deleting_removes_only_the_parts_of_the_object(blender, scene_path, loaded):
     mug = anchor(blender, "mug")
     lamp = blender.data.objects.new("lamp", blender.data.lights.new("lamp", "POINT"))
     loaded.objects.link(lamp)
@@ -182,7 +182,7 @@ def test_clouds_that_move_with_another_object_are_selected_with_their_own_object
     assert blender.context.selected_objects and not motions.addon("motion.duplicate_delete").chosen(blender.context)
 
 
-def test_shadows_stay_when_asked_to(blender, loaded):
+def test_shadows_are_kept_on_request(blender, loaded):
     motions.choose(blender, anchor(blender, "mug"))
     blender.ops.r5dgs.delete_object(shadows=False)
     shadow = blender.data.objects["mug shadow anchor"]

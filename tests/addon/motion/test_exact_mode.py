@@ -62,7 +62,7 @@ def assert_bends_like_the_core(bpy, collection, scene, times):
             assert off.max() < 1e-3
 
 
-def test_it_is_off_unless_asked_for_and_nothing_listens(blender, scene, loaded):
+def test_exact_mode_is_off_by_default_without_handlers(blender, scene, loaded):
     assert not loaded.r5dgs_exact.enabled and not listeners()
     motions.go_to(blender, loaded, 0.2)
     with pytest.raises(AssertionError, match="t = 0.2"):

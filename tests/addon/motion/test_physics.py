@@ -86,7 +86,7 @@ def test_the_motion_is_continuous_at_t_max(blender, loaded, mug):
 
 
 @pytest.mark.parametrize("kind", models.KINDS)
-def test_any_kind_of_motion_can_be_given_to_what_stood_still(blender, loaded, kind):
+def test_static_objects_can_get_any_kind_of_motion(blender, loaded, kind):
     anchor = blender.data.objects["wooden block anchor"]
     motions.choose(blender, anchor)
     state = anchor.r5dgs_motion
@@ -332,7 +332,7 @@ def test_reset_brings_the_learned_motion_back(blender, scene_path, loaded, mug):
     motions.assert_plays_like_the_core(blender, loaded, scene_file.read(scene_path), TIMES)
 
 
-def test_reset_changes_nothing_where_what_follows_refuses(blender, loaded, mug):
+def test_reset_changes_nothing_if_a_follower_cannot_be_reset(blender, loaded, mug):
     curve = next(iter(motions.curves(mug).values()))
     curve.keyframe_points[0].co.y += 1
     before = motions.keys(mug)
@@ -342,7 +342,7 @@ def test_reset_changes_nothing_where_what_follows_refuses(blender, loaded, mug):
     assert motions.keys(mug) == before
 
 
-def test_reset_reads_observed_keys_from_the_file_when_asked_to(blender, scene_path, loaded, mug):
+def test_reset_restores_observed_keys_from_the_file_on_request(blender, scene_path, loaded, mug):
     mug.scale = (2.0, 2.0, 2.0)
     mug.keyframe_insert("scale", frame=20)
     mug.scale = (1.0, 1.0, 1.0)
@@ -521,7 +521,7 @@ def test_the_panel_shows_what_a_motion_has_and_whether_it_was_edited(blender, lo
     assert "Select an object to see its motion" in layouts.draw(blender, panel)
 
 
-def test_numbers_are_written_at_once_when_that_is_wanted(blender, loaded, mug):
+def test_edited_numbers_are_written_at_once_if_enabled(blender, loaded, mug):
     observed, before = motions.keys(mug, LAST), motions.keys(mug)
     state = mug.r5dgs_motion
     state.kind = "translation"

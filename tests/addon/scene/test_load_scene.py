@@ -132,7 +132,7 @@ def test_loading_leaves_no_temporary_data(blender, scene_path):
 
 
 @pytest.mark.parametrize("degree, kept", [("0", 0), ("1", 3), ("2", 8), ("3", 15), ("ALL", 15)])
-def test_only_the_wanted_harmonics_are_stored(blender, tmp_path, degree, kept):
+def test_only_harmonics_up_to_the_chosen_degree_are_stored(blender, tmp_path, degree, kept):
     scene = scenes.make_scene(n=5000, objects=2, sh_degree=3)
     path = scene_file.write(scene, tmp_path / "scene.r5dgs")
     stored = scene_file.read(path)
@@ -163,7 +163,7 @@ def test_keys_past_t_max_are_of_another_type_and_t_max_has_a_key(blender, scene_
             assert point.interpolation == "BEZIER" and point.handle_left_type == "FREE"
 
 
-def test_only_what_moves_has_curves(blender, scene_path):
+def test_only_moving_objects_have_curves(blender, scene_path):
     collection = motions.load(blender, scene_path)
     assert not curves_of(anchor_of(collection, "background"))
     assert not curves_of(anchor_of(collection, "wooden block"))
@@ -215,7 +215,7 @@ def test_the_timeline_is_fitted_and_t_max_marked(blender, scene_path):
     assert [(marker.name, marker.frame) for marker in scene.timeline_markers] == [("t_max", 46)]
 
 
-def test_the_timeline_stays_when_asked_to(blender, scene_path):
+def test_the_timeline_is_kept_on_request(blender, scene_path):
     scene = blender.context.scene
     before = (scene.frame_start, scene.frame_end)
     motions.load(blender, scene_path, fit_timeline=False)

@@ -233,7 +233,7 @@ def test_patches_hold_neighbours_that_move_together():
     assert any(len(np.unique(side[still == k])) == 2 for k in range(still.max() + 1))
 
 
-def test_ids_beyond_what_masks_hold_are_numbered_anew():
+def test_ids_too_large_for_masks_are_renumbered():
     seen = look(3, 3, 4)
     masks = [np.where(truth > 0, truth + 70_000, 0) for truth in seen.truths]
     assert associate.associate(seen.bags(masks)).objects.tolist() == [1, 2, 3]

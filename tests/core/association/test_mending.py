@@ -59,7 +59,7 @@ def test_merged_objects_are_separated():
     np.testing.assert_array_equal(mended(masks)[2], truth())
 
 
-def test_outlines_of_segments_stay_even_where_votes_say_otherwise():
+def test_outlines_of_segments_are_kept_despite_votes():
     masks = [truth() for _ in range(TIMES)]
     masks[4][2:10, 9] = 2  # a column of object 1
     masks[4][14:20, 10] = 3  # a column of background

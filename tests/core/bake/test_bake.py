@@ -56,7 +56,7 @@ def test_a_baked_scene_is_valid_and_complete(baked, trained):
     assert len(baked.cameras) == 7
 
 
-def test_a_baked_scene_shows_what_was_trained(baked, trained):
+def test_a_baked_scene_renders_like_the_trained_state(baked, trained):
     assert_shows_what_was_trained(trained, baked)
 
 

@@ -132,7 +132,7 @@ def test_every_row_of_the_table_can_be_overridden():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_your_word_wins_over_the_number_and_is_marked(name):
+def test_overrides_of_the_user_win_over_the_measured_value_and_are_marked(name):
     measured, decided = table(**EVERYTHING)[name], table(**EVERYTHING, wanted={name: "off"})[name]
     assert (measured["decision"], decided["decision"]) == ("on", "off")
     assert decided["value"] == measured["value"] and decided["reason"].startswith("set off by the user")
@@ -141,7 +141,7 @@ def test_your_word_wins_over_the_number_and_is_marked(name):
 
 
 @pytest.mark.parametrize("name", ["tracks", "rotation"])
-def test_an_object_at_rest_may_be_said_to_move(name):
+def test_the_user_can_declare_a_resting_object_moving(name):
     row = table(wanted={name: "on"})[name]
     assert row["decision"] == "on" and row["reason"].startswith("set on by the user;")
 

@@ -87,7 +87,7 @@ def test_noise_is_simplified_to_rest_and_slow_motion_is_kept(given):
     assert model.kind == {"rest": "static", "turn": "ballistic_spin", "slide": "translation"}[name]
 
 
-def test_your_word_keeps_what_is_noise(given):
+def test_overrides_of_the_user_keep_motion_below_the_noise(given):
     name, truth, data = given
     noisy = with_noise(truth, 3e-4, 3e-5)
     scene, rows = simplified(noisy, data, rotation="on", tracks="on")

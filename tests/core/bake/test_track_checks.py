@@ -45,7 +45,7 @@ def test_a_bad_track_stays_where_it_is_and_the_others_keep_their_bits(trained, t
 
 
 @pytest.mark.parametrize(("degrees", "told"), [(100, False), (150, True)])
-def test_large_steps_are_told_once_with_name_angle_and_times(degrees, told, caplog):
+def test_large_steps_are_logged_once_with_name_angle_and_times(degrees, told, caplog):
     turns = np.radians(degrees) * np.array([0.0, 0.1, 1.1, 1.2])[:, None] * [0, 0, 1.0]
     track = np.concatenate([rotations.rotvecs_to_quats(turns), np.zeros((4, 3))], axis=1)
     with caplog.at_level(logging.WARNING):

@@ -163,7 +163,7 @@ def test_the_terminal_shows_every_figure():
     assert all(cell in text for block in sheet.blocks for line in block for cell in line)
 
 
-def test_rows_mark_what_nothing_faster_equals():
+def test_rows_mark_results_that_nothing_faster_equals():
     records = [
         record(variant="tracks", psnr=40.0, cpu=5.0, ms=4.0),
         record(variant="r5dgs", psnr=35.0, cpu=50.0, ms=3.0),

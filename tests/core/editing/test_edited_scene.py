@@ -167,7 +167,7 @@ def test_a_moved_object_keeps_the_motion_of_its_group(matrix):
         np.testing.assert_allclose(scene_player.frame(result, t).means[rows][straight], wanted[straight], atol=2e-5)
 
 
-def test_residuals_and_shading_turn_with_what_was_turned():
+def test_residuals_and_shading_rotate_with_their_object():
     scene = rich_scene()
     matrix = matrix_of(1.4 * TURN, (0.2, -1.0, 0.3))
     result, _ = edit(scene, pieces_of(scene, before={k: matrix for k in range(-1, 4)}))

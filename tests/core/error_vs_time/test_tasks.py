@@ -195,7 +195,7 @@ def test_modes_of_single_gaussians_have_poses_too(field, data):
     assert any("hybrid" in text for text in absent)
 
 
-def test_poses_without_truth_are_said_to_be_absent(scene, data):
+def test_poses_without_ground_truth_are_listed_as_absent(scene, data):
     assert "no true poses" in pose_task.measure(scene, None, 1)[1][0]
     truth = data.ground_truth
     early = dataclasses.replace(truth, times=truth.times[:3], matrices=truth.matrices[:, :3])
@@ -293,7 +293,7 @@ def test_every_task_has_a_front(report):
         assert 1 <= len([r for r in pick(rows, task=task, error_kind=kind) if r.pareto]) < len(pick(rows, task=task))
 
 
-def test_the_terminal_shows_the_tables_and_what_is_absent(report, capsys):
+def test_the_terminal_shows_the_tables_and_absent_tasks(report, capsys):
     tables.show(report)
     text = capsys.readouterr().out
     assert "Dynamics" in text and "Poses along the horizon" in text and "not measured" in text

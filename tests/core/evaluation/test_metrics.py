@@ -28,7 +28,7 @@ def test_psnr_of_equal_images_is_finite():
     assert metrics.psnr(picture(0), picture(0)) == 100.0
 
 
-def test_psnr_counts_only_the_wanted_pixels():
+def test_psnr_counts_only_the_selected_pixels():
     truth, image = np.zeros((4, 4, 3)), np.zeros((4, 4, 3))
     image[:2] = 0.1
     where = np.zeros((4, 4), bool)

@@ -34,7 +34,7 @@ def assert_equal(a, b, **tolerance):
 
 @pytest.mark.parametrize("groups", [True, False])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_reading_restores_what_was_written(tmp_path, degree, groups):
+def test_reading_restores_the_written_scene(tmp_path, degree, groups):
     original = splats(degree, groups=groups)
     assert_equal(original, ply.read(ply.write(original, tmp_path / "a.ply")))
 

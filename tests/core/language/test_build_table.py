@@ -91,7 +91,7 @@ def test_thresholds_let_so_many_false_nouns_pass_as_is_allowed():
     assert stricter.limit > found.limit and (stricter.thresholds > found.thresholds).all()
 
 
-def test_a_calibration_does_not_change_with_what_all_cosines_have_in_common():
+def test_a_calibration_ignores_an_offset_shared_by_all_cosines():
     plain = Plain().embed_texts(WORDS)
     common = np.concatenate([np.sqrt(0.5) * plain, np.full((len(plain), 1), np.sqrt(0.5))], axis=1)
     one, other = (calibration.for_words(each[:20], each, 5) for each in (plain, common))

@@ -343,7 +343,7 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("package", ["transformers", "safetensors"])
-def test_without_transformers_one_error_names_what_to_install(folder, package, monkeypatch):
+def test_without_transformers_the_error_names_the_package_to_install(folder, package, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(errors.BackendError, match=r"pip install 'r5dgs\[encoders\]'"):
         sam2_model.Sam2(folder)

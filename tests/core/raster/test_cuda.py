@@ -165,7 +165,7 @@ def test_an_empty_view_shows_the_background_with_zero_gradients(rasterize_cuda, 
     assert all(torch.equal(t.grad, torch.zeros_like(t)) for t in scene)
 
 
-def test_gradients_do_not_depend_on_which_others_are_wanted(rasterize_cuda):
+def test_gradients_do_not_depend_on_the_other_requested_gradients(rasterize_cuda):
     scene = [t.float() for t in splats.splats(100, 3, seed=17)]
 
     def gradient(position, others):

@@ -270,7 +270,7 @@ def test_a_forked_child_draws_too():
 # Laws of gradients
 
 
-def test_gradient_of_the_background_is_what_it_shows_through():
+def test_the_gradient_of_the_background_is_the_transmittance():
     scene, view = splats(300, 3, seed=12), camera()
     background = torch.rand(40, 48, 3, requires_grad=True)
     result = rasterize_splats(*[t.float() for t in scene], view, background)
@@ -280,7 +280,7 @@ def test_gradient_of_the_background_is_what_it_shows_through():
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize("position", range(5))
-def test_gradients_do_not_depend_on_which_others_are_wanted(backend, position):
+def test_gradients_do_not_depend_on_the_other_requested_gradients(backend, position):
     scene, view = splats(200, 19, seed=17), camera()
     expected = draw(scene, view, backend)[1]
     dtype = next(iter(expected.values())).dtype

@@ -46,7 +46,7 @@ def assert_shows(theatre, scene, instances, camera, sky=True):
         assert np.array_equal(getattr(found, name), getattr(expected, name)), name
 
 
-def test_playing_shows_every_frame_and_draws_what_stands_still_once(scene, made):
+def test_playing_shows_every_frame_and_draws_static_objects_once(scene, made):
     theatre = incremental_renderer.Stage(scene)
     for t in (0.0, 0.1, 0.2, 0.9, 1.4):
         assert_shows(theatre, scene, group_instances(scene, t), CAMERA)
@@ -155,7 +155,7 @@ def test_two_scenes_are_sorted_by_depth_in_one_picture(pair, made):
         np.testing.assert_allclose(found.alpha, expected.alpha, atol=1e-5)
 
 
-def test_a_light_turns_with_its_world_and_not_with_what_moves_in_it(pair):
+def test_a_light_rotates_with_its_world_and_not_with_moving_objects(pair):
     lit, _, world = pair
     still = scene_renderer.pose_instances(lit, group_instances(lit, 0.3))
     turned = [Instance(one.start, one.count, world @ one.matrix, 0, world) for one in group_instances(lit, 0.3)]

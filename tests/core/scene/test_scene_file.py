@@ -66,7 +66,7 @@ def assert_equal_scenes(a, b, rounding):
             assert x == y, field.name
 
 
-def test_reading_restores_what_was_written(scene, path):
+def test_reading_restores_the_written_scene(scene, path):
     assert_equal_scenes(scene, scene_file.read(path), ROUNDING)
 
 

@@ -48,7 +48,7 @@ def test_words_find_their_objects_best_first(scene, text, ids):
 @pytest.mark.parametrize(
     "text", ["giraffe", "cat", "table", "cupboard", "carpet", "mug handle", "", "  ", "the", "?!", "unassigned"]
 )
-def test_nothing_matches_what_is_not_there(scene, text):
+def test_a_missing_object_has_no_match(scene, text):
     assert object_search.search(scene, text) == []
 
 

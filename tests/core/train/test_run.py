@@ -200,7 +200,7 @@ def copied(unbroken, tmp_path):
     return folder
 
 
-def test_a_run_is_not_replaced_unless_this_is_asked_for(tiny, copied):
+def test_a_run_is_replaced_only_on_request(tiny, copied):
     before = contents(copied)
     with pytest.raises(CheckpointError, match="holds a run at step 150; add --resume to go on, or --overwrite"):
         run.train(tiny.root, copied, tiny_datasets.settings())

@@ -46,7 +46,7 @@ def test_each_gaussian_gets_the_class_of_the_pixels_that_it_paints():
     assert label(CLASSES, view, splats, [0, 0, 0]) == [0, 2, 1]
 
 
-def test_gaussians_that_no_mask_shows_keep_what_they_had():
+def test_gaussians_outside_all_masks_keep_their_identities():
     view, splats = row_of_blobs(opacities=(0.9, 0.0, 0.9))
     assert label(CLASSES, view, splats, [1, 1, 2]) == [0, 1, 1]
 
@@ -266,7 +266,7 @@ def test_after_the_run_too_neighbours_teach_what_no_pixel_shows():
     ("representation", "asked", "counted"),
     [("field", "auto", True), ("tracks", "auto", False), ("tracks", "on", True), ("field", "off", False)],
 )
-def test_a_gaussian_counts_among_its_neighbours_as_asked(representation, asked, counted):
+def test_a_gaussian_counts_among_its_neighbours_as_configured(representation, asked, counted):
     """Counting it takes the farthest of k away: with one neighbour nothing is left to differ from."""
     changes = {"train.representation": representation, "identity.include_self": asked, "identity.neighbours": 1}
     agreement = identity_training.Agreement(config.Config().replace(**changes, **{"identity.spatial": 1.0}))

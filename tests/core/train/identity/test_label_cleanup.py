@@ -126,7 +126,7 @@ def test_small_parts_far_from_their_object_go_and_large_ones_stay():
         np.testing.assert_array_equal(found, labels)
 
 
-def test_undecided_gaussians_go_with_what_they_move_with():
+def test_undecided_gaussians_take_the_label_that_their_motion_suggests():
     points, truth, opacities = scene()
     border = np.flatnonzero((truth == LEFT) & (points[:, 0] > -0.1))
     weights, said = plant(votes_for(truth), truth, border, RIGHT, 0.501)

@@ -87,7 +87,7 @@ def test_without_any_agreement_a_small_ball_is_the_start(posed):
     assert np.linalg.norm(points - [0.1, 0.2, 0.3], axis=1).max() < 0.6
 
 
-def test_views_without_mask_and_points_behind_a_camera_have_no_say(tiny, posed):
+def test_views_without_mask_and_points_behind_a_camera_do_not_vote(tiny, posed):
     seen, t, norm = posed
     center = (tiny.center(2, t) - norm.origin) / norm.scale
     blind = [*seen, dataclasses.replace(seen[0], mask=None)]

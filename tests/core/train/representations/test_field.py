@@ -164,7 +164,7 @@ def test_a_field_may_start_from_tracks_and_moves_as_they_did(tiny):
     assert float((after - before).abs().mean()) < 0.03
 
 
-def test_the_baked_scene_is_valid_and_shows_what_was_trained(made, scene):
+def test_the_baked_scene_is_valid_and_renders_like_the_trained_state(made, scene):
     validation.check(scene, "field")
     trainer = Trainer(datasets.read(made.dataset_root), made.config)
     trainer.restore(checkpoint.load(made.folder))
@@ -288,7 +288,7 @@ def test_a_horizon_outside_the_observed_times_is_refused(tiny, horizon):
         )
 
 
-def test_harmonics_of_what_moves_turn_with_it(tiny, tmp_path):
+def test_harmonics_rotate_with_their_moving_gaussians(tiny, tmp_path):
     """The scene plays colours that depend on the view as the trainer draws them, also of bodies that turned."""
     settings = tiny_datasets.settings(
         *FIELD, "field.trd_steps=10", "train.sh_degree=2", "train.shading=false", "train.iterations=30"

@@ -101,7 +101,7 @@ def test_distant_gaussians_with_equal_motion_keep_their_group():
     assert moves.moved == 0 and spread_of(groups, carried) < 0.01
 
 
-def test_faint_members_have_little_say():
+def test_faint_members_have_little_weight():
     path, ids, opacities = scene()
     draw = np.random.default_rng(1)
     faint = draw.random(len(ids)) < 0.4

@@ -183,7 +183,7 @@ def test_bodies_that_gain_more_than_the_threshold_keep_residuals():
 
 
 @pytest.mark.parametrize("override", ["needs.residuals=off", "needs.tracks=off", "train.representation=field"])
-def test_nothing_is_tried_where_it_is_not_wanted(override):
+def test_disabled_residuals_are_not_tried(override):
     assert residual_trial.decision_step(config.load(None, [override]), 600) is None
 
 
@@ -375,7 +375,7 @@ def test_a_run_with_residuals_goes_on_to_the_same_bits(breathing, states, tmp_pa
     assert (last.queue, last.running_loss) == (found[-1].queue, found[-1].running_loss)
 
 
-def test_you_may_say_that_every_object_bends(tiny):
+def test_the_user_can_enable_residuals_for_every_object(tiny):
     trainer = advance(make(tiny, "train.iterations=60", "needs.residuals=on"), 30)
     assert trainer.motion.residuals.bodies == [BRICK, BALL]
     assert "residual" in {group["name"] for group in trainer.optimizer.param_groups}

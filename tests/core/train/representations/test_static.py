@@ -95,7 +95,7 @@ def test_cameras_that_show_one_time_each_leave_it_open(still):
     assert static.nothing_moves([v for v in seen if v.t == seen[0].t])
 
 
-def test_your_word_wins_over_what_the_images_show(still, tiny):
+def test_overrides_of_the_user_win_over_the_images(still, tiny):
     at_rest, moving = train_views(still), train_views(tiny)
     assert not static.applies(at_rest, config.Config().replace(**{"needs.tracks": "on"}))
     assert static.applies(moving, config.Config().replace(**{"needs.tracks": "off"}))
