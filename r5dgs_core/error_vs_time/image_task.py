@@ -71,30 +71,17 @@ def measure(
         views = dataset.views(split)
         if not views:
             continue
-        motion, raster = _times(scene, views, {k: m for k, m in plan.items() if k != ORACLE}, rounds, backend)
+        name = "" if number == 0 else f"@{split}"
+        times = _times(scene, views, {k: m for k, m in plan.items() if k != ORACLE}, rounds, backend, clock)
         for mode, move in plan.items():
             found = evaluate.measure(scene, views, move, backend=backend, measured=count)
+            missing |= dict.fromkeys(kind for kind in KINDS if found[kind] is None)
             label: dict[str, Any] = {"mode": mode, "method": "playback"}
             if mode == ORACLE:  # not a selectable method, so neither timed nor on the Pareto front
                 label = {"mode": "rigid", "method": ORACLE, "note": "motion is given, not predicted"}
-                times: dict[str, Any] = {}
-            else:
-                times = {"ms_motion": motion[mode].ms(clock), "ms_raster": raster[mode].ms(clock)}
-                times |= (motion[mode] + raster[mode]).columns(clock)
-            missing |= dict.fromkeys(kind for kind in KINDS if found[kind] is None)
-            rows += [
-                Row(
-                    task="images",
-                    setting=split,
-                    error_kind=kind if number == 0 else f"{kind}@{split}",
-                    error=float(found[kind]),
-                    count=found["images"],
-                    **label,
-                    **times,
-                )
-                for kind in KINDS
-                if found[kind] is not None
-            ]
+            errors = {f"{kind}{name}": found[kind] for kind in KINDS if found[kind] is not None}
+            shared = {"task": "images", "setting": split, "count": found["images"], **label, **times.get(mode, {})}
+            rows += [Row(error_kind=kind, error=float(error), **shared) for kind, error in errors.items()]
     if missing:
         absent.append(f"images: not computed: {', '.join(missing)} (docs/reference/evaluation.md says what each needs)")
     return rows, absent
@@ -160,9 +147,9 @@ def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[M
 
 
 def _times(
-    scene: Scene, views: Sequence[View], moves: dict[str, Move], rounds: int, backend: str
-) -> tuple[dict[str, timing.Times], dict[str, timing.Times]]:
-    """Return motion time and color rasterization time per frame, by mode."""
+    scene: Scene, views: Sequence[View], moves: dict[str, Move], rounds: int, backend: str, clock: str
+) -> dict[str, dict[str, Any]]:
+    """Return the columns of a `Row` that hold times per frame, of motion and of color rasterization, by mode."""
     some = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(FRAMES, len(views))).round().astype(int))]
     calls: dict[tuple[str, str], Callable[[], object]] = {}
     for mode, move in moves.items():
@@ -173,4 +160,9 @@ def _times(
             for frame, view in zip(frames, some, strict=True)
         ]
     times = {key: found.scaled(1 / len(some)) for key, found in timing.take(calls, rounds).items()}
-    return {m: times[m, "motion"] for m in moves}, {m: times[m, "raster"] for m in moves}
+    columns = {}
+    for mode in moves:
+        motion, raster = times[mode, "motion"], times[mode, "raster"]
+        split = {"ms_motion": motion.ms(clock), "ms_raster": raster.ms(clock)}
+        columns[mode] = {**split, **(motion + raster).columns(clock)}
+    return columns

@@ -55,43 +55,13 @@ def measure(
     """
     tau, why = horizon(scene, dataset)
     rows: list[Row] = []
-    absent: list[str] = []
-
-    def add(found: tuple[list[Row], list[str]]) -> None:
-        rows.extend(found[0])
-        absent.extend(found[1])
-
-    for task in report_rows.TASKS:
-        if task not in tasks:
-            absent.append(f"{task}: not asked for")
-            continue
+    absent = [f"{task}: not asked for" for task in report_rows.TASKS if task not in tasks]
+    for task in (task for task in report_rows.TASKS if task in tasks):
         if task != "images":
             progress({"event": "report", "text": task})
-        if task == "dynamics":
-            add(integrator_task.measure(scene, tau, rounds, clock))
-        elif task == "poses":
-            if dataset is None:
-                absent.append("poses: no data set was given, so no true poses are known")
-            else:
-                add(pose_task.measure(scene, dataset.ground_truth, rounds, clock))
-        elif task == "images":
-            if dataset is None:
-                absent.append("images: no data set was given, so there is nothing to compare with")
-            else:
-                add(
-                    image_task.measure(
-                        scene,
-                        dataset,
-                        splits,
-                        rounds,
-                        clock=clock,
-                        backend=backend,
-                        progress=lambda done, total: progress({"event": "images", "done": done, "total": total}),
-                    )
-                )
-        else:
-            views = () if dataset is None else dataset.views(splits[0])
-            add(rasterizer_task.measure(scene, views, rounds, clock=clock, backend=backend))
+        measured, missing = _measure_task(task, scene, dataset, tau, splits, rounds, clock, backend, progress)
+        rows += measured
+        absent += missing
     busy = _busy(rows)
     if busy > timing.BUSY and clock == "wall":
         absent.append(
@@ -112,6 +82,36 @@ def measure(
         "absent": absent,
         "rows": [row.to_dict() for row in rows],
     }
+
+
+def _measure_task(
+    task: str,
+    scene: Scene,
+    dataset: Dataset | None,
+    tau: float,
+    splits: Sequence[str],
+    rounds: int,
+    clock: str,
+    backend: str,
+    progress: Callable[[dict[str, Any]], None],
+) -> tuple[list[Row], list[str]]:
+    """Return the rows of a task and the reasons for missing ones; ``tau`` is the horizon, other arguments `measure`."""
+
+    def count(done: int, total: int) -> None:
+        progress({"event": "images", "done": done, "total": total})
+
+    if task == "dynamics":
+        return integrator_task.measure(scene, tau, rounds, clock)
+    if task == "raster":
+        views = () if dataset is None else dataset.views(splits[0])
+        return rasterizer_task.measure(scene, views, rounds, clock=clock, backend=backend)
+    if task == "poses":
+        if dataset is None:
+            return [], ["poses: no data set was given, so no true poses are known"]
+        return pose_task.measure(scene, dataset.ground_truth, rounds, clock)
+    if dataset is None:
+        return [], ["images: no data set was given, so there is nothing to compare with"]
+    return image_task.measure(scene, dataset, splits, rounds, clock=clock, backend=backend, progress=count)
 
 
 def _busy(rows: Sequence[Row]) -> float:

@@ -63,7 +63,7 @@ class Format:
 
     @property
     def summary(self) -> str:
-        """What a file keeps and loses, for tooltips."""
+        """Text of a tooltip: the kept and the lost parts of a scene."""
         return f"Keeps: {self.keeps}. Not kept: {self.loses}"
 
     def obstacle(self) -> str | None:

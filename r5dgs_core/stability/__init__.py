@@ -21,6 +21,7 @@ from rich.table import Table
 from .. import atomic_files, errors
 from . import (
     extremes,
+    float32_playback,
     groups,
     keys,
     loading,
@@ -37,6 +38,7 @@ CASES: tuple[Case, ...] = (
     *extremes.CASES,
     *rotations.CASES,
     *groups.CASES,
+    *float32_playback.CASES,
     *playback.CASES,
     *keys.CASES,
     *loading.CASES,

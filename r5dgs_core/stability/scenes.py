@@ -14,6 +14,10 @@ from .cases import body, model_of
 T_MAX = 0.75
 TIMES = np.linspace(0.0, T_MAX, 16)
 HORIZON = 100 * T_MAX
+MODES = ("rigid", "hybrid", "standard")
+EVERY_MODE = (*MODES, "rigid_paper")
+FUTURES = (T_MAX + 1e-9, 1.0, 2.0, 10.0, HORIZON)
+PAST = (0.0, 0.123, 0.4, 0.74)
 DIAGONAL = np.array([0.6, -0.48, 0.64])
 
 MOTIONS: dict[str, MotionModel] = {
