@@ -81,6 +81,7 @@ FORMAT = registry.Format(
     keeps="lens, pose and time of every camera, as transforms.json of NeRF and D-NeRF",
     loses="everything but cameras",
     write=export,
+    has_objects=False,
 )
 
 

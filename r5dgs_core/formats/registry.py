@@ -47,6 +47,7 @@ class Format:
         loses: What it does not hold.
         write: Writes a scene and yields the path of each file when it is complete. Files are replaced atomically.
         per_frame: True if each frame is a file of its own.
+        has_objects: True if a file holds objects, so that `Options.object_ids` applies.
         extra: Extra of ``pip install r5dgs[extra]`` that it needs, or None.
         packages: Packages of the extra that `write` imports.
     """
@@ -58,6 +59,7 @@ class Format:
     loses: str
     write: Callable[[Scene, Path, Options], Iterator[Path]]
     per_frame: bool = False
+    has_objects: bool = True
     extra: str | None = None
     packages: tuple[str, ...] = ()
 

@@ -73,7 +73,7 @@ def run_export(
         The files written.
 
     Raises:
-        UsageError: The format is unknown, or ``out`` or ``t`` does not suit it.
+        UsageError: The format is unknown, or ``out``, ``t`` or ``words`` does not suit it.
         ConfigError: A file exists, or no object matches the words.
         BackendError: The format needs a package that is not installed.
     """
@@ -84,6 +84,8 @@ def run_export(
     chosen = registry.usable(to)  # imports numpy
     if out.suffix.lower() != chosen.suffix:
         raise errors.UsageError(f"--out {out}: expected a name that ends in {chosen.suffix}")
+    if words is not None and not chosen.has_objects:
+        raise errors.UsageError(f"--objects: files of format {to} hold no objects; leave it out")
     if t is not None and not math.isfinite(t):
         raise errors.UsageError(f"--time {t}: expected a finite number")
     from ...progress import make

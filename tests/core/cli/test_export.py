@@ -87,6 +87,7 @@ def test_files_are_replaced_only_on_demand(path, tmp_path, capsys):
     [
         (("--to", "obj", "--out", "a.obj"), "ply, cameras"),
         (("--to", "ply", "--out", "a.json"), ".ply"),
+        (("--to", "cameras", "--out", "a.json", "--objects", "mug"), "--objects"),
         (("--to", "ply", "--out", "a.ply", "--frames", "5:1"), "'5:1'"),
         (("--to", "ply", "--out", "a.ply", "--frames", "all"), "'all'"),
         (("--to", "ply", "--out", "a.ply", "--time", "nan"), "--time"),
