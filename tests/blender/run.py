@@ -171,7 +171,13 @@ def figures(path: Path | None) -> Table:
 
 
 def _without_torch(pytest, left_out: list[str]):
-    """A plugin for pytest that leaves out files that cannot be imported because torch is absent, and names them."""
+    """Return a plugin for pytest that skips tests for which torch or numba is missing, and collects their files.
+
+    It skips files that cannot be imported and tests that need a picture.
+    """
+    missing = [name for name in ("torch", "numba") if importlib.util.find_spec(name) is None]
+    lacking = [f"{name} is not installed; remedy" for name in missing]
+    lacking += [f"{sys.executable} lacks {', '.join(missing)}"] if missing else []
 
     class Plugin:
         @pytest.hookimpl(wrapper=True)
@@ -182,6 +188,14 @@ def _without_torch(pytest, left_out: list[str]):
                 left_out.append(collector.path.name)
             elif report.outcome == "skipped" and "torch is not installed" in str(report.longrepr):
                 left_out.append(collector.path.name)
+            return report
+
+        @pytest.hookimpl(wrapper=True)
+        def pytest_runtest_makereport(self, item, call):
+            report = yield
+            if report.outcome == "failed" and any(said in str(call.excinfo.value) for said in lacking):
+                report.outcome, report.longrepr = "skipped", (str(item.path), 0, f"Skipped: {call.excinfo.value}")
+                left_out.append(item.path.name)
             return report
 
     return Plugin()
@@ -199,7 +213,7 @@ def tests(arguments: list[str]) -> str:
     absent: list[str] = []
     options = ["-q", "-p", "no:cacheprovider", "--rootdir", str(ROOT)]
     code = pytest.main([*options, *arguments], plugins=[_without_torch(pytest, absent)])
-    left_out = f"; left out for want of torch: {', '.join(sorted(absent))}" if absent else ""
+    left_out = f"; left out for want of torch: {', '.join(sorted(set(absent)))}" if absent else ""
     return f"{'passed' if code == 0 else f'FAILED with code {int(code)}'}{left_out}"
 
 
