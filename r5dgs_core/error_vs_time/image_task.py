@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -47,10 +48,9 @@ def measure(
         The rows, and the reasons for missing measurements.
     """
     rows, absent = [], []
-    players = {mode: scene_player.Player(scene, mode) for mode in scene_player.modes(scene)}
-    if len(players) == 1:
+    moves: dict[str, Move] = {mode: scene_player.Player(scene, mode).frame for mode in scene_player.modes(scene)}
+    if len(moves) == 1:
         absent.append("images of other modes than rigid: the scene holds no dynamics of its Gaussians")
-    moves: dict[str, Move] = {mode: player.frame for mode, player in players.items()}
     oracle, why = true_move(scene, dataset, [view.t for split in splits for view in dataset.views(split)])
     if oracle is None:
         absent.append(f"images with true poses: {why}")
@@ -58,13 +58,11 @@ def measure(
         moves[ORACLE] = oracle
     plans = _plans(scene, dataset, splits, moves, absent)
     total = sum(len(dataset.views(split)) * len(plan) for split, plan in plans.items())
-    done = 0
+    done = itertools.count(1)
 
     def count() -> None:
-        nonlocal done
-        done += 1
         if progress is not None:
-            progress(done, total)
+            progress(next(done), total)
 
     missing: dict[str, None] = {}
     for number, (split, plan) in enumerate(plans.items()):

@@ -82,12 +82,7 @@ def run_export(
     input_paths.check_output("--out", out)
     input_paths.check_scene(path)
     chosen = registry.usable(to)  # imports numpy
-    if out.suffix.lower() != chosen.suffix:
-        raise errors.UsageError(f"--out {out}: expected a name that ends in {chosen.suffix}")
-    if words is not None and not chosen.has_objects:
-        raise errors.UsageError(f"--objects: files of format {to} hold no objects; leave it out")
-    if t is not None and not math.isfinite(t):
-        raise errors.UsageError(f"--time {t}: expected a finite number")
+    _check_arguments(chosen, out, t, words)
     from ...progress import make
     from ...scene import scene_file
 
@@ -108,6 +103,16 @@ def run_export(
         print(f"written: {written[0]}" + (f" to {written[-1].name}" if len(written) > 1 else ""))
         print(f"not kept: {chosen.loses}")
     return written
+
+
+def _check_arguments(chosen: registry.Format, out: Path, t: float | None, words: str | None) -> None:
+    """Raise UsageError if arguments of `run_export` do not suit the format."""
+    if out.suffix.lower() != chosen.suffix:
+        raise errors.UsageError(f"--out {out}: expected a name that ends in {chosen.suffix}")
+    if words is not None and not chosen.has_objects:
+        raise errors.UsageError(f"--objects: files of format {chosen.name} hold no objects; leave it out")
+    if t is not None and not math.isfinite(t):
+        raise errors.UsageError(f"--time {t}: expected a finite number")
 
 
 def _selection(scene: Scene, t: float | None, frames: tuple[int, int] | None, words: str | None) -> registry.Options:
