@@ -22,19 +22,11 @@ def no_plots():
 
 @pytest.fixture(scope="session", autouse=True)
 def few_views():
-    """Bake by the evidence of a dozen images; returns the limits left out."""
-    limits = image_evidence.FEWEST, image_evidence.MOST
+    """Bake by the evidence of a dozen images."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(image_evidence, "FEWEST", 8)
         patch.setattr(image_evidence, "MOST", 12)
-        yield limits
-
-
-@pytest.fixture
-def many_views(few_views, monkeypatch):
-    """Baking uses as many images as it does for users."""
-    monkeypatch.setattr(image_evidence, "FEWEST", few_views[0])
-    monkeypatch.setattr(image_evidence, "MOST", few_views[1])
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
