@@ -9,6 +9,7 @@ import numpy as np
 from ...r5dgs_core.color import srgb
 from ...r5dgs_core.scene import spherical_harmonics
 from ...r5dgs_core.scene.scene import Scene
+from ...r5dgs_core.scene.splats import to_opacities
 from .. import compat
 
 # Not `color`: a colour attribute of exactly that name renders black in Cycles.
@@ -28,8 +29,7 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
 
     Attributes: `position`; `scale` (standard deviations) and `rotation` (wxyz); `radiance:base` (degree-0 coefficients
     and opacity) and `radiance:sh_<k>` (the others), display-referred as trained; `object_id`; `gaussian`, the row in
-    the
-    scene file, kept when other points are deleted; and for display, `radius` and `display_color` (linear).
+    the scene file, kept when other points are deleted; and for display, `radius` and `display_color` (linear).
 
     Args:
         scene: Source scene.
@@ -39,7 +39,7 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     """
     sh = scene.gaussians.sh[rows]
     log_scales = scene.gaussians.log_scales[rows]
-    opacities = 1.0 / (1.0 + np.exp(-scene.gaussians.opacity_logits[rows].astype(np.float64)))
+    opacities = to_opacities(scene.gaussians.opacity_logits[rows])
     base = np.concatenate([sh[:, 0], opacities[:, None]], axis=-1)
     shown = srgb.to_linear(np.minimum(0.5 + spherical_harmonics.C0 * sh[:, 0].astype(np.float64), 1))
     radii = DISPLAY_SIGMAS * np.sqrt(opacities) * np.exp(log_scales.mean(-1))
