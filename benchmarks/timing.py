@@ -1,105 +1,79 @@
-"""Timing in interleaved rounds, so that background load affects all contenders equally."""
+"""Times and memory of functions that take turns, each with its own number of torch threads."""
 
 from __future__ import annotations
 
 import ctypes
-import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
-TURN_MS = 60.0  # a turn is one call, and more while all of them together stay below this
-PATIENCE_S = 30.0  # who has used so much leaves after `ENOUGH` turns
-ENOUGH = 3
+from r5dgs_core import timing
+
 SETTLE_S = 0.02  # until threads that wait in a spinning loop give up their cores
 
 
-@dataclass
-class Contender:
-    """A timed function and its times.
+class Contender(timing.Contender):
+    """A function with the label of its row.
 
     Attributes:
         label: Other columns of its row.
-        run: One call.
         torch_threads: Threads of torch's own operations.
-        cpu_ms: Processor time of each call, over all threads.
-        wall_ms: Time of each call.
-        turns: Turns taken.
-        peak_mb: Largest resident memory during a call beyond that before it; None if the system does not report it.
+        times: Times of a call, after `take_turns`.
+        peak_mb: Largest resident memory during a call beyond that before it; None if it is not known.
     """
 
-    label: dict[str, Any]
-    run: Callable[[], object]
-    torch_threads: int = 1
-    cpu_ms: list[float] = field(default_factory=list)
-    wall_ms: list[float] = field(default_factory=list)
-    turns: int = 0
-    peak_mb: float | None = None
+    def __init__(self, label: dict[str, Any], run: Callable[[], object], torch_threads: int = 1) -> None:
+        super().__init__(run)
+        self.label, self.torch_threads = label, torch_threads
+        self.times: timing.Times
+        self.peak_mb: float | None = None
 
-    def warm_up(self) -> None:
-        """One call that does not count."""
-        self.run()
+    def prepare(self) -> None:
+        torch.set_num_threads(self.torch_threads)
+        super().prepare()
 
-    def take_turn(self) -> None:
-        """Calls that count, see `TURN_MS`."""
-        self.turns += 1
-        spent = 0.0
-        while True:
-            cpu_start, wall_start = time.process_time(), time.perf_counter()
-            self.run()
-            wall = 1e3 * (time.perf_counter() - wall_start)
-            self.cpu_ms.append(1e3 * (time.process_time() - cpu_start))
-            self.wall_ms.append(wall)
-            spent += wall
-            if spent + wall > TURN_MS:
-                return
+    def take_turn(self) -> tuple[float, float]:
+        if torch.get_num_threads() != self.torch_threads:
+            torch.set_num_threads(self.torch_threads)
+            time.sleep(SETTLE_S)
+        return super().take_turn()
 
     def row(self) -> dict[str, Any]:
         """The label and the figures: smallest processor time, smallest and median wall time, peak memory."""
         return {
             **self.label,
-            "cpu_ms": round(min(self.cpu_ms), 3),
-            "wall_ms_min": round(min(self.wall_ms), 3),
-            "wall_ms_median": round(statistics.median(self.wall_ms), 3),
+            "cpu_ms": round(self.times.cpu[0], 4),
+            "wall_ms_min": round(self.times.wall[0], 4),
+            "wall_ms_median": round(self.times.wall[2], 4),
             "peak_mb": None if self.peak_mb is None else round(self.peak_mb, 1),
         }
 
 
 def take_turns(contenders: Sequence[Contender], turns: int, memory: bool = True) -> None:
-    """Time all contenders: after a warm-up of each, one turn of each after the other, again and again.
+    """Time all contenders in interleaved rounds.
 
     Args:
-        contenders: Get their times.
-        turns: Turns of each; slow ones take fewer (see `PATIENCE_S`).
-        memory: Whether to measure memory as well, in calls of their own: for that, freed memory is given back to the
-            system first, and asking for it again takes time.
+        contenders: They receive their times and their peak memory.
+        turns: Turns of each; slow ones take fewer.
+        memory: Whether to measure memory, in separate calls: they first return freed memory to the system, and
+            allocating it again takes time.
     """
-    spinning = any(contender.torch_threads > 1 for contender in contenders)
     before = torch.get_num_threads()
     try:
-        for contender in contenders:
+        for contender, times in timing.take(dict(enumerate(contenders)), turns).items():
+            contenders[contender].times = times
+        for contender in contenders if memory else ():
             torch.set_num_threads(contender.torch_threads)
-            contender.warm_up()
-            if memory:
-                contender.peak_mb = measure_peak(contender.run)
-        for _ in range(turns):
-            for contender in contenders:
-                if contender.turns >= ENOUGH and sum(contender.wall_ms) > 1e3 * PATIENCE_S:
-                    continue
-                torch.set_num_threads(contender.torch_threads)
-                if spinning:
-                    time.sleep(SETTLE_S)
-                contender.take_turn()
+            contender.peak_mb = measure_peak(contender.run)
     finally:
         torch.set_num_threads(before)
 
 
 def measure_peak(run: Callable[[], object], calls: int = 2) -> float | None:
-    """Largest resident memory during a call beyond that before it, MB; None on systems that do not tell."""
+    """Largest resident memory during a call beyond that before it, MB; None if the system does not report it."""
     peaks = []
     for _ in range(calls):
         before = reset_peak_mb()
@@ -111,7 +85,7 @@ def measure_peak(run: Callable[[], object], calls: int = 2) -> float | None:
 
 
 def reset_peak_mb() -> float | None:
-    """Give freed memory back and let Linux forget its largest size; returns the present one, None on other systems."""
+    """Return freed memory to the system and reset Linux's peak; returns the present size, None on other systems."""
     try:
         ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")
@@ -121,6 +95,7 @@ def reset_peak_mb() -> float | None:
 
 
 def status_mb(key: str) -> float:
+    """Size of this process by a key of Linux's process status, MB."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(key + ":"):
             return int(line.split()[1]) / 1024

@@ -24,7 +24,17 @@ from tests.support import scenes
 ROOT = Path(__file__).resolve().parents[1]
 
 # Modules without dependencies in the core; every room may import them.
-GROUND = {"atomic_files", "errors", "extras", "findings", "folder_lock", "input_paths", "strict_json", "time_left"}
+GROUND = {
+    "atomic_files",
+    "errors",
+    "extras",
+    "findings",
+    "folder_lock",
+    "input_paths",
+    "strict_json",
+    "time_left",
+    "timing",
+}
 # Rooms of the core that a room may import besides itself and `GROUND`, lower rooms first.
 ALLOWED = {
     "atomic_files": set(),
@@ -33,6 +43,7 @@ ALLOWED = {
     "motion": set(),
     "terminal": set(),
     "time_left": set(),
+    "timing": set(),
     "findings": set(),
     "input_paths": set(),
     "strict_json": set(),

@@ -19,7 +19,6 @@ import dataclasses
 import functools
 import json
 import math
-import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -154,8 +153,8 @@ def measure(name: str, variants: Sequence[Variant], repeats: int) -> list[Point]
                 f"rasterize {name}",
                 variant,
                 errors_of(contender.run(), truth),
-                min(contender.cpu_ms),
-                statistics.median(contender.wall_ms),
+                contender.times.cpu[0],
+                contender.times.ms(),
             )
             for variant, contender in zip(variants, contenders, strict=True)
         ]

@@ -74,16 +74,11 @@ class Remote(timing.Contender):
         """The image."""
         return torch.from_numpy(self._ask("draw"))
 
-    def warm_up(self) -> None:
-        """Compile."""
-        self.draw()
+    def prepare(self) -> None:
+        self._ask("prepare")
 
-    def take_turn(self) -> None:
-        """Let the process take a turn and note its times."""
-        self.turns += 1
-        cpu_ms, wall_ms = self._ask("turn")
-        self.cpu_ms += cpu_ms
-        self.wall_ms += wall_ms
+    def take_turn(self) -> tuple[float, float]:
+        return self._ask("turn")
 
     def close(self) -> None:
         """End the process and forget its machine code."""
@@ -107,15 +102,13 @@ def _serve(connection: Connection, coefficients: tuple[float, ...], make_run: Ca
     float32x16._EXP2 = coefficients
     torch.set_num_threads(1)
     compilation.set_threads(1)
-    run = make_run()
+    contender = timing.Contender({}, make_run())
     while True:
         try:
             request = connection.recv()
         except EOFError:
             return
         if request == "draw":
-            connection.send(run().numpy())
+            connection.send(contender.run().numpy())
         else:
-            contender = timing.Contender({}, run)
-            contender.take_turn()
-            connection.send((contender.cpu_ms, contender.wall_ms))
+            connection.send(contender.prepare() if request == "prepare" else contender.take_turn())

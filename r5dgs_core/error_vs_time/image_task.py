@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from .. import timing
 from ..data.dataset import Dataset, View
 from ..evaluation import evaluate, ground_truth_poses
 from ..playback import scene_player
 from ..render import scene_renderer
 from ..scene.scene import Scene
-from . import timing
 from .report_rows import Row
 
 KINDS = ("psnr", "psnr_objects", "ssim", "flip", "lpips", "miou")

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import timing
 from ..motion import models, point_dynamics, rotations, se3, twist_propagation
 from ..playback import residuals
 from ..scene.scene import MotionGroup, Scene
-from . import timing
 from .report_rows import Row, spread
 
 STEPS = (1, 2, 4, 8, 16, 32, 64)

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import timing
 from ..data.dataset import GroundTruth
 from ..evaluation import ground_truth_poses, metrics
 from ..motion import free_top, models, rigid_fit
 from ..motion_fit import candidates, model_selection
 from ..playback import group_dynamics, scene_player
 from ..scene.scene import MotionGroup, Scene
-from . import timing
 from .report_rows import Row, spread
 
 MODELS = tuple(candidates.BY_NAME)  # fitted one at a time

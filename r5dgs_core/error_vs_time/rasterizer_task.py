@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from .. import timing
 from ..data import dataset as datasets
 from ..evaluation import evaluate, metrics
 from ..playback import scene_player
@@ -14,7 +15,6 @@ from ..raster import RasterSettings, backends
 from ..render import scene_renderer
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
-from . import timing
 from .report_rows import Row, spread
 
 FINEST = {"alpha_min": 1e-4, "transmittance_min": 1e-30}

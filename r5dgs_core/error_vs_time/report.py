@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from .. import atomic_files
+from .. import atomic_files, timing
 from ..data.dataset import Dataset
 from ..errors import ConfigError
 from ..render import machine
 from ..scene.scene import Scene
-from . import image_task, integrator_task, pareto_plot, pose_task, rasterizer_task, report_rows, tables, timing
+from . import image_task, integrator_task, pareto_plot, pose_task, rasterizer_task, report_rows, tables
 from .report_rows import Row
 
 JSON_FILE, CSV_FILE, MARKDOWN_FILE, PLOT_FILE = "report.json", "report.csv", "report.md", "report.png"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import statistics
-import time
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 
+from .. import timing
 from ..raster import backends, rasterize_splats
 from ..scene.cameras import Camera
 from . import warm_up
@@ -50,10 +50,7 @@ def run() -> Trial:
     half = SIZE / 2
     camera = Camera(SIZE, SIZE, np.array([[2.2 * half, 0, half], [0, 2.2 * half, half], [0, 0, 1]]), T_cam_world)
     warm_up.warm_up(gradients=False)
-    milliseconds = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        rasterize_splats(places, turns, axes, opacities, values, camera)
-        milliseconds.append(1e3 * (time.perf_counter() - start))
+    draw = functools.partial(rasterize_splats, places, turns, axes, opacities, values, camera)
+    times = timing.take({"picture": draw}, REPEATS)["picture"]
     hardware = backends.choose("auto", places).hardware()
-    return Trial(statistics.median(milliseconds), GAUSSIANS, (SIZE, SIZE), hardware)
+    return Trial(times.ms(), GAUSSIANS, (SIZE, SIZE), hardware)

@@ -6,11 +6,10 @@ import json
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r5dgs_core.error_vs_time import report_rows, timing
+from r5dgs_core.error_vs_time import report_rows
 from r5dgs_core.error_vs_time.report_rows import Row
 from r5dgs_core.evaluation import label_placement
 
@@ -77,25 +76,6 @@ def test_spread_is_median_quartiles_and_worst():
     assert found == {"error": 3.0, "error_low": 2.0, "error_high": 4.0, "error_worst": 100.0}
     assert report_rows.spread(np.array([1.0, 2.0]), more_is_better=True)["error_worst"] == 1.0
     assert all(math.isnan(v) for v in report_rows.spread(np.array([])).values())
-
-
-def test_turns_go_forth_and_back_over_all_calls(monkeypatch):
-    monkeypatch.setattr(timing, "SAMPLE_MS", 0.0)
-    seen = []
-    times = timing.take({name: lambda name=name: seen.append(name) for name in "abc"}, 3)
-    assert "".join(seen) == "aabbcc" + "abc" + "cba" + "abc"  # two calls each to compile and to see how long one is
-    assert set(times) == set("abc") and all(
-        (np.diff(t.wall) >= 0).all() and (t.wall >= 0).all() for t in times.values()
-    )
-    with pytest.raises(ValueError, match="rounds"):
-        timing.take({}, 0)
-
-
-def test_times_add_up_and_scale_and_one_clock_is_that_of_the_rows():
-    one, two = (timing.Times(k * np.array([1.0, 2, 3]), k * np.array([4.0, 5, 6])) for k in (1, 2))
-    columns = (one + two).scaled(0.5).columns("cpu")
-    assert columns == {"ms": 7.5, "ms_low": 6.0, "ms_high": 9.0, "ms_wall": 3.0, "ms_cpu": 7.5}
-    assert one.columns()["ms"] == one.ms() == 2.0 and one.ms("cpu") == 5.0
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 25))

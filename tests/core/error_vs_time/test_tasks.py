@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from r5dgs_core import errors
+from r5dgs_core import errors, timing
 from r5dgs_core.cli import main
 from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.data import dataset as datasets
@@ -20,7 +20,6 @@ from r5dgs_core.error_vs_time import (
     rasterizer_task,
     report_rows,
     tables,
-    timing,
 )
 from r5dgs_core.error_vs_time import report as error_vs_time_report
 from r5dgs_core.evaluation import ground_truth_poses
