@@ -26,7 +26,7 @@ import numpy as np
 from r5dgs_core.language import build_table, query
 from r5dgs_core.language.encoders import encoder_base, registry
 from r5dgs_core.motion.models import MotionModel
-from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
+from r5dgs_core.scene.scene import Gaussians, MotionGroup, Scene, SceneObject, Tracks
 
 NAMES = {
     "kitchen": ("mug", "lemon", "apple", "donut", "cutting board", "bowl"),
@@ -111,15 +111,16 @@ def named(names: tuple[str, ...]) -> Scene:
     pinned = MotionGroup(0, 0, "pinned", -1, np.zeros(3), MotionModel())
     return Scene(
         name="names",
-        means=np.zeros((count, 3), np.float32),
-        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        log_scales=np.zeros((count, 3), np.float32),
-        opacity_logits=np.zeros(count, np.float32),
-        sh=np.zeros((count, 1, 3), np.float32),
-        object_ids=np.arange(1, count + 1, dtype=np.int32),
-        motion_ids=np.zeros(count, np.int32),
-        track_times=np.zeros(1),
-        track_poses=np.array([[[1.0, 0, 0, 0, 0, 0, 0]]]),
+        gaussians=Gaussians(
+            means=np.zeros((count, 3), np.float32),
+            quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+            log_scales=np.zeros((count, 3), np.float32),
+            opacity_logits=np.zeros(count, np.float32),
+            sh=np.zeros((count, 1, 3), np.float32),
+            object_ids=np.arange(1, count + 1, dtype=np.int32),
+            motion_ids=np.zeros(count, np.int32),
+        ),
+        tracks=Tracks(np.zeros(1), np.array([[[1.0, 0, 0, 0, 0, 0, 0]]])),
         objects=objects,
         groups=(pinned,),
         t_max=0.0,

@@ -13,7 +13,7 @@ import numpy as np
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.scene import sh_color
 from r5dgs_core.scene.cameras import Camera
-from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
+from r5dgs_core.scene.scene import Gaussians, MotionGroup, Scene, SceneObject, Tracks
 
 BODIES = 6
 T_MAX = 0.7
@@ -63,15 +63,16 @@ def build(count: int, camera: Camera) -> Scene:
     names = ["background"] + [f"body {k + 1}" for k in range(BODIES)]
     return Scene(
         name="tabletop",
-        means=means.astype(np.float32),
-        quats=_facing(normals).astype(np.float32),
-        log_scales=np.log(widths).astype(np.float32),
-        opacity_logits=random.normal(2.5, 1.5, count).astype(np.float32),
-        sh=sh.astype(np.float32),
-        object_ids=ids,
-        motion_ids=ids.copy(),
-        track_times=TIMES,
-        track_poses=np.stack(tracks),
+        gaussians=Gaussians(
+            means=means.astype(np.float32),
+            quats=_facing(normals).astype(np.float32),
+            log_scales=np.log(widths).astype(np.float32),
+            opacity_logits=random.normal(2.5, 1.5, count).astype(np.float32),
+            sh=sh.astype(np.float32),
+            object_ids=ids,
+            motion_ids=ids.copy(),
+        ),
+        tracks=Tracks(TIMES, np.stack(tracks)),
         objects=tuple(
             SceneObject(k, name, (), "", (0.5, 0.5, 0.5), int(starts[k]), counts[k]) for k, name in enumerate(names)
         ),

@@ -6,11 +6,11 @@ import sys
 
 import pytest
 
-from tests.support import benchmark_modules, tiny_datasets
+from tests.support import benchmark_modules, encoder_folders, tiny_datasets
 
 ONCE = ("--threads", "1", "--repeats", "1")
 SHORT = tuple(word for text in (*tiny_datasets.SETTINGS, "identity.iterations=5") for word in ("--set", text))
-# Arguments by program; {data} and {run} are the tiny data set and a finished run on it.
+# Arguments by program; {data} and {run} are the tiny data set and a finished run on it, {encoder} a sentence model.
 PROGRAMS = {
     "extrapolation.appearance": ("{data}", "--run", "{run}"),
     "association.synthetic": ("--scenes=two", "--cases=A", "--errors=0.7", "--models=drift", "--seeds=1"),
@@ -23,12 +23,13 @@ PROGRAMS = {
     "training.held_out_times": ("{data}", *SHORT, "--set", "train.iterations=10"),
     "training.memory": ("--size=48", "--cameras=5", "--times=3", "--objects=2", "--gaussians=500", *SHORT),
     "motion": ("--gaussians", "100", "--bodies", "2", "--size", "small", "--rounds", "1"),
-    "raster.speed": ("--workloads", "W0", *ONCE),
+    "raster.speed": ("--workloads", "W0", "tabletop-small", *ONCE),
     "raster.error": ("--workloads", "W0", "--groups", "resolution", "--repeats", "1"),
     "raster.extreme": ("--case", "duplicates at one place"),
     "training.step": ("{data}", "--gaussians", "400", "--steps", "2", "--variants", "tracks"),
     "training.curve": ("{data}", "--iterations", "10", *SHORT),
     "raster.workloads": ("--workloads", "W0"),
+    "words": ("--encoder", "{encoder}"),
 }
 LONG = (  # more than five seconds each
     "association.synthetic",
@@ -47,7 +48,11 @@ def figures(tree):
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in LONG)) for n in PROGRAMS])
 def test_a_benchmark_prints_a_table_and_writes_finite_figures(name, tiny, trained, tmp_path, monkeypatch, capsys):
-    given = [text.format(data=tiny.root, run=trained.folder) for text in PROGRAMS[name]]
+    encoder = tmp_path / "encoder"
+    if name == "words":
+        pytest.importorskip("transformers", reason="needs transformers, which is not installed")
+        encoder_folders.sentences(encoder)
+    given = [text.format(data=tiny.root, run=trained.folder, encoder=encoder) for text in PROGRAMS[name]]
     target = tmp_path / "rows.json"
     if name == "association.synthetic":
         given += ["--out", str(target.with_suffix(""))]
