@@ -29,21 +29,20 @@ def with_covariance(model, seed=0, size=1e-3, names=NAMES):
 def test_it_is_the_spread_of_sampled_motions(model):
     names = (*NAMES, "frequency") if model.frequency else NAMES
     model = with_covariance(model, names=names)
-    rng = np.random.default_rng(1)
-    tau = np.array([0.0, 0.2, 0.6])
-    quats, centre = models.evaluate(model, tau)
-    squares = []
-    for draw in rng.multivariate_normal(np.zeros(len(names)), model.covariance, 1500):
+    drawn_models = []
+    for draw in np.random.default_rng(1).multivariate_normal(np.zeros(len(names)), model.covariance, 1500):
         shifts = {name: getattr(model, name) + draw[3 * k : 3 * k + 3] for k, name in enumerate(RATES)}
         if model.frequency:
             shifts["frequency"] = model.frequency + draw[-1]
-        drawn_quats, drawn = models.evaluate(replace(model, **shifts), tau)
-        angle = rotations.angle_between(drawn_quats, quats)
-        squares.append(((drawn - centre) ** 2).sum(-1) + 2 / 3 * (model.radius * angle) ** 2)
-    expected = np.sqrt(np.mean(squares, axis=0))
-    found = confidence.position_sigma(model, tau)
-    assert found[0] == 0
-    np.testing.assert_allclose(found[1:], expected[1:], rtol=0.08)
+        drawn_models.append(replace(model, covariance=None, covariance_names=(), **shifts))
+    stack = models.Stack(drawn_models)
+    for tau in (0.2, 0.6):
+        quat, center = models.evaluate(model, tau)
+        quats, centers = stack.poses(tau)
+        angles = rotations.angle_between(quats, quat)
+        expected = np.sqrt(np.mean(((centers - center) ** 2).sum(-1) + 2 / 3 * (model.radius * angles) ** 2))
+        np.testing.assert_allclose(confidence.position_sigma(model, np.array([tau])), expected, rtol=0.08)
+    assert confidence.position_sigma(model, np.zeros(1)) == 0
 
 
 def test_a_certain_velocity_grows_the_spread_with_the_square_of_time():

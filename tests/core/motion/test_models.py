@@ -1,6 +1,7 @@
 import itertools
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from r5dgs_core.motion import models, rotations, se3
 from r5dgs_core.motion.models import MotionModel, evaluation
+from r5dgs_core.motion.models.base import RATES, Rates
 from tests.support import problems
 
 OFFSETS = {"offset_rotvec": [0.05, -0.02, 0.1], "offset_displacement": [0.02, 0.01, -0.03]}
@@ -96,6 +98,40 @@ def test_distances_are_kept(name):
     moved = rotations.rotate(quats, points) + displacements
     before, after = (np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (points, moved))
     np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [0.5, -2.0])
+@pytest.mark.parametrize("name", CASES)
+def test_a_model_moves_with_its_world(name, scale):
+    turn = rotations.rotvecs_to_quats(np.array([0.4, -0.9, 0.7]))
+    model = with_offsets(CASES[name])
+    rates = {f"{name}.{axis}": rate for name in RATES for axis, rate in zip("xyz", getattr(model, name), strict=True)}
+    values = np.array([*rates.values(), model.frequency])
+    model = replace(model, covariance=np.outer(values, values), covariance_names=(*rates, "frequency"))
+    moved = model.transformed(rotations.quats_to_rotmats(turn), scale)
+    tau = np.array([0.0, 0.4, 1.7])
+    (quats, displacements), (moved_quats, moved_displacements) = (models.evaluate(m, tau) for m in (model, moved))
+    expected = rotations.multiply(rotations.multiply(turn, quats), rotations.conjugate(turn))
+    assert rotations.angle_between(moved_quats, expected).max() < 1e-8
+    np.testing.assert_allclose(moved_displacements, scale * rotations.rotate(turn, displacements), atol=1e-8)
+    assert moved.radius == abs(scale) * model.radius
+    values = np.concatenate([*(getattr(moved, name) for name in RATES), [moved.frequency]])
+    np.testing.assert_allclose(moved.covariance, np.outer(values, values), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_fitted_motion_may_start_from_any_pose(name):
+    model, tau = CASES[name], np.array([0.0, 0.3, 0.9])
+    rotvec, displacement = np.array([[0.5, -0.2, 0.9]]), np.array([[0.3, 0.1, -0.2]])
+    start = rotations.rotvecs_to_quats(rotvec)
+    rates = Rates(*(rate[:, None] for rate in Rates.of([model])))
+    fitted = models.KINDS[model.kind].fitted(rates, rotvec, displacement, tau, model.inertia)
+    if model.inertia is not None:  # it rotates with the body
+        turn = rotations.quats_to_rotmats(start)[0]
+        model = replace(model, inertia=turn @ model.inertia @ turn.T)
+    quats, displacements, _, _ = models.curve(model, tau)
+    assert rotations.angle_between(fitted[0][0], rotations.multiply(quats, start)).max() < 2e-6
+    np.testing.assert_allclose(fitted[1][0], displacements + displacement, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -291,3 +327,4 @@ def test_static_and_turning_models_are_distinguished():
     assert MotionModel("ballistic_spin", center_offset=[1, 0, 0]).is_static
     assert MotionModel("ballistic_spin", frequency=3.0).is_static
     assert not MotionModel("ballistic_spin", angular_acceleration=[0, 0, 1], frequency=3.0).is_static
+    assert problems.TUMBLING.turns

@@ -80,6 +80,14 @@ def test_steps_are_counted_once(duration, count):
     assert all(abs(h) <= point_dynamics.TRACE_STEP * (1 + 1e-9) for h in sizes)
 
 
+@pytest.mark.parametrize(
+    ("first", "last", "unit"),
+    [(0, 0.25, 1), (0.3, 1, 1), (0, 0.2, 0.2), (0, 1.5, 1.5), (-0.5, 0.5, 1), (-0.1, 0.4, 0.5), (3, 3, 1), (2, 9, 7)],
+)
+def test_the_unit_of_time_is_one_or_the_observed_span(first, last, unit):
+    assert point_dynamics.time_unit(first, last) == unit
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e200])
 def test_one_bad_point_changes_no_bit_of_the_others(bad, caplog):
     still, others = STATE.copy(), [0, 1, 3, 4]
