@@ -37,6 +37,7 @@ LONG = (  # more than five seconds each
     "raster.first_frame",
     "training.curve",
     "training.held_out_times",
+    "words",
 )
 
 
