@@ -1,0 +1,13 @@
+"""Benchmarks of motion past t_max on simulated tracks.
+
+    python -m benchmarks.futures COMMAND [OPTIONS]
+
+    accuracy  error, confidence band, events and run time of the fit, for each kind of motion
+
+Results: docs/results/motion.md.
+"""
+
+from ..commands import run
+
+if __name__ == "__main__":
+    run(__package__, __doc__)
