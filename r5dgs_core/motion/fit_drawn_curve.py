@@ -71,8 +71,7 @@ def _solve(
 
     def errors(batch: np.ndarray) -> np.ndarray:
         found, zero = values(batch[:, None]), np.zeros(3)
-        v, a, w, eps, u = (found.get(name, zero) for name in models.RATES)
-        rates = models.Rates(v, a, w, eps, u, frequency=np.zeros((1, 1)))
+        rates = models.Rates(*(found.get(name, zero) for name in models.RATES))
         poses = models.KINDS[kind].fitted(rates, zero, zero, taus, None)
         return se3.differences(poses, (quats, displacements), radius, 1.0)
 

@@ -1,130 +1,145 @@
-"""Nonlinear least squares by Levenberg-Marquardt, optionally robust against outlying observations.
+"""Nonlinear least squares by Levenberg-Marquardt, for one start or many at once, optionally robust against outliers.
 
 The residuals of all parameter vectors that a step needs are evaluated in one call, since for small problems the number
-of numpy calls sets the run time. Notation: P parameters x, S observations of D components each, B parameter vectors.
+of numpy calls sets the run time. Notation: P parameters x, S observations of D components each, B starts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
-
-from . import robust_weights
 
 _DIFFERENCE = 1e-6
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-10, 1e10
 _TOLERANCE = 1e-5  # predicted gain / cost at which iteration ends
-_COARSE = 1e-2  # the same, at which the fit is close enough to tell outliers
 _NEGLIGIBLE_GAIN = 1e-20  # predicted gain at which iteration ends even if the cost is less
-_LEAST_OUTLIER = 1e-6  # size of an outlier
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A minimum.
+    """Minima of B starts; without the leading axis if there is one start.
 
     Attributes:
-        x: Parameters. [P]
-        residuals: Residuals without weights. [S, D]
-        robust: Robust weights of the observations, in (0, 1]; 1 if there are no outliers. [S]
-        normal: Normal matrix J^T W J of the weighted residuals plus the precision of the prior. [P, P]
-        gradient: Gradient of half the cost. [P]
-        cost: Weighted sum of squared residuals, or of their Cauchy losses, plus the cost of the prior.
-        scale: Scale of the Cauchy loss; infinite without robust weights.
+        x: Parameters. [B, P]
+        residuals: Residuals without weights. [B, S, D]
+        normal: Normal matrix J^T W J of the weighted residuals plus the precision of the prior. [B, P, P]
+        gradient: Gradient of half the cost. [B, P]
+        cost: Weighted sum of squared residuals, or of their Cauchy losses, plus the cost of the prior. [B]
     """
 
     x: np.ndarray
     residuals: np.ndarray
-    robust: np.ndarray
     normal: np.ndarray
     gradient: np.ndarray
-    cost: float
-    scale: float
+    cost: np.ndarray
+
+    def row(self, index: int) -> Solution:
+        """Minimum of one start."""
+        return Solution(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
-@np.errstate(over="ignore", invalid="ignore")
 def solve(
     residuals: Callable[[np.ndarray], np.ndarray],
     start: np.ndarray,
+    **options: Any,
+) -> Solution:
+    """Minimise a sum of squared residuals from one start.
+
+    Args:
+        residuals: Function from parameters [B, P] to residuals [B, S, D].
+        start: Initial guess, with finite residuals. [P]
+        options: Those of `solve_all`.
+    """
+    return solve_all(lambda x, _: residuals(x[0])[None], start[None], **options).row(0)
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def solve_all(
+    residuals: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    starts: np.ndarray,
     *,
     weights: np.ndarray | None = None,
     precision: np.ndarray | None = None,
-    robust: bool = False,
+    softness: float = np.inf,
     steps: int = 40,
+    enough: float = _NEGLIGIBLE_GAIN,
 ) -> Solution:
-    """Minimise a weighted sum of squared residuals.
+    """Minimise weighted sums of squared residuals from several starts, whose problems may differ.
 
     Args:
-        residuals: Function from parameters [B, P] to residuals [B, S, D]. Both should be of order one, residuals in
-            units of their noise. Steps to residuals that are not finite are refused.
-        start: Initial guess, with finite residuals. [P]
+        residuals: Function from parameters [L, K, P] and the starts [L] that they belong to, to residuals
+            [L, K, S, D]. Both should be of order one, residuals in units of their noise. Steps to residuals that are
+            not finite are refused.
+        starts: Initial guesses, with finite residuals. [B, P]
         weights: Weights of the observations, > 0, or None for equal ones. [S]
         precision: Inverse standard deviations of the parameters about 0, for a Gaussian prior; None for no prior. [P]
-        robust: True to reduce the weights of outlying observations.
-        steps: Largest number of steps. Each calls ``residuals`` once, with P + 1 parameter vectors.
+        softness: Squared length of the residuals of an observation at which its weight is one half; infinite for least
+            squares.
+        steps: Largest number of steps. Each calls ``residuals`` once, with P + 1 parameter vectors per start.
+        enough: Predicted gain below which a start is finished.
 
     Source: Marquardt 1963, with damping relative to the diagonal of the normal matrix and forward differences. The
-        damping follows the ratio of actual to predicted gain (Nielsen 1999). Robust fits reweight inside each step:
-        once the plain fit is close and has outliers, observations get Cauchy weights with a scale from the median.
+        damping follows the ratio of actual to predicted gain (Nielsen 1999). Robust fits reweight inside each step,
+        with Cauchy weights.
     """
+    count, size = starts.shape
     base = np.ones(1) if weights is None else weights
-    prior = np.zeros(len(start)) if precision is None else precision**2
-    nudges = _DIFFERENCE * np.eye(len(start) + 1, len(start), -1)
-    damping, growth, reweighted = _FIRST_DAMPING, 2.0, False
-    batch = residuals(start + nudges)
-    point = _linearize(start, batch, base, prior, reweighted)
+    prior = np.zeros(size) if precision is None else precision**2
+    nudges = _DIFFERENCE * np.eye(size + 1, size, -1)
+    problem = _Problem(base, prior, softness)
+    point = problem.linearize(starts, residuals(starts[:, None] + nudges, np.arange(count)))
+    damping, growth, live = np.full(count, _FIRST_DAMPING), np.full(count, 2.0), np.arange(count)
     for _ in range(steps):
-        diagonal = np.diag(point.normal) + 1e-12 * np.trace(point.normal) + np.finfo(float).tiny
-        step = -np.linalg.solve(point.normal + np.diag(damping * diagonal), point.gradient)
-        gain = float(step @ (damping * diagonal * step - point.gradient))  # if the residuals were linear
-        if robust and not reweighted and gain <= _COARSE * point.cost:
-            reweighted = robust_weights.has_outliers(_sizes(point.residuals), _LEAST_OUTLIER)
-            if reweighted:
-                point = _linearize(point.x, batch, base, prior, reweighted)
-                continue
-        if gain <= _TOLERANCE * point.cost + _NEGLIGIBLE_GAIN:
+        diagonal = np.einsum("bii->bi", point.normal[live])
+        diagonal = diagonal + 1e-12 * diagonal.sum(1, keepdims=True) + np.finfo(float).tiny
+        damped = damping[live, None] * diagonal
+        gradient = point.gradient[live]
+        step = -np.linalg.solve(point.normal[live] + damped[:, :, None] * np.eye(size), gradient[..., None])[..., 0]
+        gain = (step * (damped * step - gradient)).sum(1)  # if the residuals were linear
+        moving = (gain > _TOLERANCE * point.cost[live] + enough) & np.isfinite(gain)
+        live, step, gain = live[moving], step[moving], gain[moving]
+        if len(live) == 0:
             break
-        x = point.x + step
-        trial = residuals(x + nudges)
-        ratio = (point.cost - _cost(trial[0], x, base, prior, point.scale)) / gain
-        if ratio >= 0 and np.isfinite(trial).all():
-            batch, damping = trial, max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), _LEAST_DAMPING)
-            point, growth = _linearize(x, batch, base, prior, reweighted), 2.0
-        elif damping < _MOST_DAMPING:
-            damping, growth = damping * growth, 2 * growth
-        else:
-            break
+        x = point.x[live] + step
+        trial = problem.linearize(x, residuals(x[:, None] + nudges, live))
+        ratio = (point.cost[live] - trial.cost) / gain
+        better = (ratio >= 0) & np.isfinite(trial.normal).all((1, 2)) & np.isfinite(trial.gradient).all(1)
+        good = live[better]
+        for field in fields(Solution):
+            getattr(point, field.name)[good] = getattr(trial, field.name)[better]
+        shrink = np.maximum(0.1, 1 - (2 * np.clip(ratio[better], 0, 1) - 1) ** 3)
+        damping[good], growth[good] = np.maximum(damping[good] * shrink, _LEAST_DAMPING), 2.0
+        bad = live[~better]
+        damping[bad], growth[bad] = damping[bad] * growth[bad], 2 * growth[bad]
+        live = live[damping[live] < _MOST_DAMPING]
     return point
 
 
-def _linearize(x: np.ndarray, batch: np.ndarray, base: np.ndarray, prior: np.ndarray, reweighted: bool) -> Solution:
-    """Normal equations at x from the residuals there and at the neighbours of `solve`. batch: [P + 1, S, D]"""
-    values = batch[0]
-    scale = robust_weights.cauchy_scale(_sizes(values), _LEAST_OUTLIER) if reweighted else np.inf
-    robust = robust_weights.reweight(np.ones(len(values)), _sizes(values), scale)
-    root = np.sqrt(base * robust)[:, None]
-    jacobian = ((batch[1:] - values) / _DIFFERENCE * root).reshape(len(x), -1)
-    return Solution(
-        x,
-        values,
-        robust,
-        normal=jacobian @ jacobian.T + np.diag(prior),
-        gradient=jacobian @ (root * values).reshape(-1) + prior * x,
-        cost=_cost(values, x, base, prior, scale),
-        scale=scale,
-    )
+@dataclass(frozen=True)
+class _Problem:
+    """Weights, prior and loss of `solve_all`."""
 
+    base: np.ndarray
+    prior: np.ndarray
+    softness: float
 
-def _cost(values: np.ndarray, x: np.ndarray, base: np.ndarray, prior: np.ndarray, scale: float) -> float:
-    """Weighted sum of squares, or of Cauchy losses scale^2 log(1 + size^2 / scale^2), and the cost of the prior."""
-    squares = (values**2).sum(-1)
-    losses = squares if np.isinf(scale) else scale**2 * np.log1p(squares / scale**2)
-    return float((base * losses).sum() + (prior * x**2).sum())
-
-
-def _sizes(values: np.ndarray) -> np.ndarray:
-    """Lengths of the residuals of each observation. [S, D] -> [S]"""
-    return np.sqrt((values**2).sum(-1))
+    def linearize(self, x: np.ndarray, batch: np.ndarray) -> Solution:
+        """Normal equations at x [B, P] from the residuals there and at their neighbours. batch: [B, P + 1, S, D]"""
+        values = batch[:, 0]
+        squares = (values**2).sum(-1)
+        robust = 1 / (1 + squares / self.softness)
+        losses = squares if np.isinf(self.softness) else self.softness * np.log1p(squares / self.softness)
+        root = np.sqrt(self.base * robust)[..., None]
+        jacobian = ((batch[:, 1:] - values[:, None]) / _DIFFERENCE * root[:, None]).reshape(*x.shape, -1)
+        weighted = (root * values).reshape(len(x), -1, 1)
+        return Solution(
+            x.copy(),
+            values.copy(),
+            normal=jacobian @ jacobian.swapaxes(1, 2) + np.diag(self.prior),
+            gradient=(jacobian @ weighted)[..., 0] + self.prior * x,
+            cost=(self.base * losses).sum(-1) + (self.prior * x**2).sum(-1),
+        )

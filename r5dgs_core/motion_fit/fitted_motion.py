@@ -1,99 +1,139 @@
-"""A fitted candidate as a motion model in world units, with its covariance and the error band of its future.
+"""A fitted candidate as a motion model in world units, with its covariance and events.
 
-Notation: P parameters, S poses, H times past t_max.
+Notation: P parameters, S poses.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ..motion import models, rotations
-from . import candidates as families
-from .candidates import Solution, Track
+from ..motion.models import base
+from .candidates import Candidate, Solution
+from .evidence import Evidence
 
 FADE_PER_SPAN = 0.1 / 0.75
 _RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration")
 
 
-def to_model(
-    solution: Solution, radius: float, span: float, track: Track, sigmas: tuple[float, float]
-) -> models.MotionModel:
+def to_model(solution: Solution, evidence: Evidence, radius: float, span: float) -> models.MotionModel:
     """Motion model in world units and units of time, with the covariance of its rates."""
-    rates = _rates(solution, solution.theta, radius, span)
+    law, theta = solution.candidate.law, solution.law_theta
+    fields = _fields(law, theta, radius, span)
     step = 1e-6
-    shifted = solution.theta + step * np.eye(len(solution.theta))
-    moved = _rates(solution, shifted, radius, span)
-    names = (*_RATES, *(["frequency"] if solution.candidate.oscillates else []))
-    slopes = np.concatenate([(moved[name] - rates[name]) / step for name in names], axis=-1).T
-    frequency = float(rates.pop("frequency")[0])
+    moved = _fields(law, theta + step * np.eye(len(theta)), radius, span)
+    names = (*_RATES, *(name for name in fields if name not in _RATES and _varies(name, moved)))
+    slopes = np.concatenate([(moved[name] - fields[name]) / step for name in names], axis=-1).T
     inertia = None
-    if solution.candidate.inertia is not None and models.KINDS[solution.candidate.kind].needs_inertia:
-        turn = rotations.quats_to_rotmats(rotations.rotvecs_to_quats(rates["offset_rotvec"]))
-        inertia = turn @ solution.candidate.inertia @ turn.T
-    spread = slopes @ covariance(solution, track, sigmas) @ slopes.T
+    if law.inertia is not None and models.KINDS[law.kind].needs_inertia:
+        turn = rotations.quats_to_rotmats(rotations.rotvecs_to_quats(fields["offset_rotvec"]))
+        inertia = turn @ law.inertia @ turn.T
+    slopes = slopes @ solution.law_slopes
+    spread = evidence.variance * slopes @ solution.inverse @ slopes.T
+    values = {name: float(value[0]) if name in models.SCALARS else value for name, value in fields.items()}
+    labels = [[name] if name in models.SCALARS else [f"{name}.{axis}" for axis in "xyz"] for name in names]
     return models.MotionModel(
-        kind=solution.candidate.kind,
-        **rates,
-        frequency=frequency,
+        kind=law.kind,
+        **values,
         inertia=inertia,
         fade_time=FADE_PER_SPAN * span,
         radius=radius,
         covariance=0.5 * (spread + spread.T),
-        covariance_names=(*(f"{name}.{axis}" for name in _RATES for axis in "xyz"), *names[len(_RATES) :]),
+        covariance_names=tuple(name for group in labels for name in group),
     )
 
 
-def covariance(solution: Solution, track: Track, sigmas: tuple[float, float]) -> np.ndarray:
-    """Covariance of the parameters, inflated for residuals that are correlated in time (AR(1)). [P, P]"""
-    size, count = len(solution.theta), len(track.tau)
-    values = families.residuals(solution.candidate, solution.theta[None], track, sigmas)[0]
-    s2 = max(solution.chi2 * 6 * count / max(6 * count - size, 1), 1e-12)
-    energy = float((values**2).sum())
-    lag = float((values[1:] * values[:-1]).sum()) / energy if energy > 0 else 0.0
-    rho = min(max(lag + (size / 6 + 1) / count, 0.0), 0.9)
-    return s2 * (1 + rho) / (1 - rho) * np.linalg.pinv(solution.normal, hermitian=True)
+def _varies(name: str, moved: dict[str, np.ndarray]) -> bool:
+    """True for rates of single kinds that are free."""
+    return name not in models.RATES and not name.startswith("offset_") and bool(np.ptp(moved[name], axis=0).any())
 
 
-def band(
-    chosen: Solution,
-    near: list[Solution],
-    track: Track,
-    sigmas: tuple[float, float],
-    radius: float,
-    span: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Two standard deviations of the position of a surface point, up to one observed span past t_max."""
-    tau = np.linspace(0.0, 1.0, 17)
-    candidate, theta = chosen.candidate, chosen.theta
-    quats, displacements = (x[0] for x in candidate.poses(theta[None], tau))
-    step = 1e-5
-    moved_quats, moved = candidate.poses(theta + step * np.eye(len(theta)), tau)
-    turns = rotations.quats_to_rotvecs(rotations.multiply(moved_quats, rotations.conjugate(quats)))
-    slopes = np.concatenate([moved - displacements, turns], axis=-1) / step  # [P, H, 6]
-    spread = np.einsum("phc,pq,qhc->hc", slopes, covariance(chosen, track, sigmas), slopes)
-    # Mean over a sphere of |dd + dtheta x r|^2, r of length one radius: |dd|^2 + 2/3 |dtheta|^2. The bind state is one
-    # of the poses and as noisy as the others, hence the last two terms.
-    variance = spread[:, :3].sum(-1) + 2 / 3 * spread[:, 3:].sum(-1) + 3 * sigmas[0] ** 2 + 2 * sigmas[1] ** 2
-    others = [s for s in near if s.candidate.name != candidate.name]
-    total = sum(1 / s.candidate.parameters**2 for s in near) or 1.0
-    for other in others:
-        other_quats, other_displacements = (x[0] for x in other.candidate.poses(other.theta[None], tau))
-        angle = rotations.angle_between(other_quats, quats)
-        distance2 = ((other_displacements - displacements) ** 2).sum(-1) + 2 / 3 * angle**2
-        variance = variance + distance2 / (other.candidate.parameters**2 * total)
-    return tau * span, 2 * radius * np.sqrt(variance)
+def _fields(law: Candidate, theta: np.ndarray, radius: float, span: float) -> dict[str, np.ndarray]:
+    """Fields of the model in world units and units of time. [..., P] -> [..., 3] or [..., 1] each"""
+    rates, parts = law.rates(theta), law.parts(theta)
+    found = {"offset_rotvec": parts["r"], "offset_displacement": parts["e"] * radius}
+    for name, value in zip(base.FIELDS, rates, strict=True):
+        if name in models.SCALARS:
+            scale = span ** -models.SCALARS[name]
+        else:
+            unit = models.VECTORS[name]
+            scale = (radius if unit.is_length else 1.0) / span**unit.per_time
+        size = 1 if name in models.SCALARS else 3
+        found[name] = np.broadcast_to(value * scale, (*theta.shape[:-1], size))
+    return found
 
 
-def _rates(solution: Solution, theta: np.ndarray, radius: float, span: float) -> dict[str, np.ndarray]:
-    """Parameters converted to world units and units of time. [..., P] -> [..., 3] each"""
-    p = solution.candidate.unpack(theta)
-    return {
-        "velocity": p["v"] * radius / span,
-        "acceleration": p["a"] * radius / span**2,
-        "angular_velocity": p["w"] / span,
-        "angular_acceleration": p["eps"] / span**2,
-        "center_offset": p["u"] * radius,
-        "offset_rotvec": p["r"],
-        "offset_displacement": p["e"] * radius,
-        "frequency": p["frequency"] / span,
-    }
+@dataclass(frozen=True)
+class Event:
+    """A change of the motion in the observed window.
+
+    Attributes:
+        time: Time of the data set.
+        kind: "start", "stop", "impact" or "change".
+        sigma: Standard deviation of the time.
+    """
+
+    time: float
+    kind: str
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Motion between two events.
+
+    Attributes:
+        start, stop: Its times.
+        kind: Kind of the law, "static" for rest.
+        parameters: Velocity, acceleration and angular velocity at its end, world units and units of time.
+    """
+
+    start: float
+    stop: float
+    kind: str
+    parameters: dict[str, list[float]]
+
+
+def events(solution: Solution, evidence: Evidence, t_max: float, span: float) -> tuple[Event, ...]:
+    """Events of a solution in the observed window, in order."""
+    found = solution.candidate.events(solution.theta)
+    step = 1e-6
+    slopes = np.zeros((len(found), len(solution.theta)))
+    for k, direction in enumerate(np.eye(len(solution.theta))):
+        for i, (_, time) in enumerate(solution.candidate.events(solution.theta + step * direction)[: len(found)]):
+            slopes[i, k] = (float(time[0]) - float(found[i][1][0])) / step
+    variances = evidence.variance * np.einsum("ip,pq,iq->i", slopes, solution.inverse, slopes)
+    return tuple(
+        Event(t_max + span * float(time[0]), kind, span * float(np.sqrt(max(variance, 0.0))))
+        for (kind, time), variance in zip(found, variances, strict=True)
+    )
+
+
+def segments(
+    solution: Solution, found: tuple[Event, ...], first: float, t_max: float, radius: float, span: float
+) -> tuple[Segment, ...]:
+    """Segments between events, from the first pose to t_max; empty without events."""
+    if not found:
+        return ()
+    bounds = [first, *(event.time for event in found), t_max]
+    result = []
+    for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+        h = 0.02 * max(stop - start, 1e-9 * span)
+        tau = (stop - t_max - h * np.array([2.1, 1.1, 0.1])) / span
+        quats, d = solution.candidate.poses(solution.theta, tau)
+        d = d * radius
+        turn = rotations.quats_to_rotvecs(rotations.multiply(quats[2], rotations.conjugate(quats[1])))
+        rates = {
+            "velocity": (1.5 * d[2] - 2 * d[1] + 0.5 * d[0]) / h,
+            "acceleration": (d[2] - 2 * d[1] + d[0]) / h**2,
+            "angular_velocity": turn / h,
+        }
+        sizes = np.linalg.norm(rates["velocity"]) + radius * np.linalg.norm(rates["angular_velocity"])
+        rests = sizes * span < 1e-6 * radius
+        kind = "static" if rests else solution.candidate.law.kind
+        if not rests and kind == "static":  # a body that stopped
+            kind = "ballistic_spin"
+        result.append(Segment(start, stop, kind, {name: value.tolist() for name, value in rates.items()}))
+    return tuple(result)

@@ -1,13 +1,13 @@
 """Select the motion model of a group past t_max from its observed poses.
 
-Every candidate family (`candidates`) is fitted to the noisy poses. The simplest one with a held-out error near the best
-is selected, unless the body has come to rest. Notation: S poses, tau = t - t_max <= 0; radius weights rotations against
-displacements.
+Every candidate law (`candidates`) and every kind of break in every gap (`kinks`) is fitted to all poses. The evidence
+for each (`evidence`) decides: a break needs strong evidence, and of the laws without one, the simplest near the best is
+taken. After a break, the last part of the track is searched again. Notation: S poses, tau = t - t_max <= 0; radius
+weights rotations against displacements.
 """
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,18 +15,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..motion import free_top, models, rotations
+from ..motion.pose_track import PoseTrack
+from . import band as bands
 from . import candidates as families
-from . import fitted_motion, rest_detection
-from .candidates import Candidate, Solution, Track
+from . import evidence as evidences
+from . import fitted_motion, kinks, noise
+from .candidates import Candidate, Noise, Solution
+from .evidence import Evidence
+from .fitted_motion import Event, Segment
 
-logger = logging.getLogger(__name__)
-
-HELD_OUT = 0.2
-WITHIN = 1.5
-_FREE_AXIS = families.BY_NAME["ballistic + spin, free axis"]
-_LARGEST = families.BY_NAME["full, free centre"]
+HELD_OUT = 0.2  # share of the last poses in tests of shadows
 FREQUENCY_ERROR = 0.25  # largest relative standard deviation of a determined frequency
-PARALLEL_RAD = math.radians(15.0)  # largest angle between a spin and its rate without tumbling
+_FEW = 8  # poses below which breaks are not searched, and large candidates not tried
+_PER_POSE = 3  # parameters per pose of the largest candidate for few poses
+_ROUNDS = 3  # of the noise
+_TOO_LARGE = 0.4  # variance of the residuals below which the noise is estimated again
+_EXACT = 1e-4  # gain at which the selected candidate is final
+_LEAST_PART = 7  # poses after a break that are searched for a law of their own
 
 
 @dataclass(frozen=True)
@@ -36,14 +41,14 @@ class Score:
     Attributes:
         name: Name of the candidate.
         parameters: Number of its free parameters, including the six of the pose.
-        held_out: Root mean square of the held-out residuals in units of the noise; infinite if not fitted, or if the
-            poses do not determine the frequency of an oscillation.
-        fit: The same over all poses after the final fit, or NaN if there was no final fit.
+        evidence: Its score, see `evidence`; infinite if it was not fitted, or if the poses do not determine the
+            frequency of an oscillation.
+        fit: Root mean square of its residuals in units of the noise, or NaN if it was not fitted.
     """
 
     name: str
     parameters: int
-    held_out: float
+    evidence: float
     fit: float
 
 
@@ -53,14 +58,17 @@ class Fit:
 
     Attributes:
         model: The motion past t_max.
-        scores: The score table, in the order of the candidates.
-        chosen: Name of the candidate in `model`.
+        scores: The score table, in the order of the candidates; breaks last.
+        chosen: Name of the law in `model`.
         rested: True if the body has come to rest, in which case `chosen` is "static".
         sigma_t: Noise of the displacements, per component, world units.
         sigma_r: Noise of the rotations, per component, rad.
         band_tau: Times past t_max of `band`. [H]
-        band: Two standard deviations of the position of a point of the body, world units; scaled by the held-out error
-            of the chosen candidate if that exceeds the noise. [H]
+        band: Half width of the 95 % band of the position of a point of the body, world units. [H]
+        band_angle: The same of its rotation, rad. [H]
+        events: Changes of the motion in the observed window.
+        segments: The motion between them; empty without events.
+        predictable_until: Time past t_max from which the motion is not predictable; None if it is in all of `band_tau`.
     """
 
     model: models.MotionModel
@@ -71,6 +79,10 @@ class Fit:
     sigma_r: float
     band_tau: np.ndarray
     band: np.ndarray
+    band_angle: np.ndarray
+    events: tuple[Event, ...] = ()
+    segments: tuple[Segment, ...] = ()
+    predictable_until: float | None = None
 
 
 def fit(
@@ -92,18 +104,17 @@ def fit(
         displacements: Displacements of the pivot relative to the bind state, world units. [S, 3]
         radius: Radius of the group, world units, > 0.
         weights: Confidence of each pose, >= 0; 0 excludes a pose. None for equal weights. [S]
-        candidates: Names of candidates in `candidates.BY_NAME`; None for `candidates.FAMILY`.
-        inertia: Inertia of the group in the bind state, up to a factor (`free_top.inertia`), or None. If given, the
-            free top is tried when one of the best candidates spins about a changing axis, and selected if it predicts
-            the held-out poses better. [3, 3]
+        candidates: Names of candidates in `candidates.BY_NAME`, without breaks; None for `candidates.FAMILY` and breaks.
+        inertia: Inertia of the group in the bind state, up to a factor (`free_top.inertia`), or None. If given and
+            not nearly that of a ball, the free top is a candidate. [3, 3]
         least_noise: Lower bounds of the noise of displacements (per component, world units) and rotations (rad), if
             more is known than the scatter about a smooth motion shows.
 
     Returns:
         The fit. With fewer than four poses of positive weight, at most a velocity and a spin; with one, static.
 
-    Source: selection by held-out error (the simplest within 1.5 times the best), rest test, band from the covariance
-        inflated for correlated residuals and from the spread of the near-best candidates.
+    Source: selection by a Bayesian information criterion with Cauchy losses and an allowance for correlated noise;
+        band from the covariance and from the spread of the near-best candidates.
     """
     times, quats, displacements = (np.asarray(x, np.float64) for x in (times, quats, displacements))
     weights = np.ones(len(times)) if weights is None else np.asarray(weights, np.float64)
@@ -113,123 +124,152 @@ def fit(
     if used.sum() < 2 or times[used][-1] == times[used][0]:
         return _static(radius)
     span = float(times[-1] - times[used][0])
-    track = Track(
+    track = PoseTrack(
         (times[used] - times[-1]) / span,
         rotations.make_continuous(rotations.normalize(quats[used])),
         displacements[used] / radius,
         weights[used] / weights[used].mean(),
     )
-    family = _observable(family, track)
-    if len(track.tau) < 4:
-        return _few(track, family, radius, span)
-    return _select(track, family, inertia, (least_noise[0] / radius, least_noise[1]), radius, span)
-
-
-def _select(
-    track: Track,
-    family: tuple[Candidate, ...],
-    inertia: np.ndarray | None,
-    least_noise: tuple[float, float],
-    radius: float,
-    span: float,
-) -> Fit:
-    """Fit four or more poses. ``least_noise`` is in radii and rad; the other arguments are those of `fit`."""
-    tried = tuple(c for c in family if not c.oscillates or families.may_swing(c, track))
-    sigmas, outliers = _noise(track, tried)
-    sigmas = (max(sigmas[0], least_noise[0]), max(sigmas[1], least_noise[1]))
-    scores, solutions = _score(family, tried, track, sigmas, outliers)
-    fits = {name: math.sqrt(solution.chi2) for name, solution in solutions.items()}
-    table = [Score(c.name, c.parameters, scores[c.name], fits.get(c.name, math.nan)) for c in family]
-    solution, evidence = min(solutions.values(), key=lambda s: s.candidate.parameters), track
-    tail = rest_detection.poses_at_rest(solution, track, sigmas)
-    if tail:
-        evidence, solutions = track.rows(slice(-tail, None)), {}
-        solution = families.solve(rest_detection.STATIC, evidence, sigmas)
-        wider = math.sqrt(2.0)  # a resting body may move again: twice the variance
+    if candidates is None and inertia is not None and free_top.tumbles(np.asarray(inertia, np.float64)):
+        family = (*family, replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64)))
+    family = tuple(replace(candidate, window=track.window) for candidate in family)
+    if len(track) < 4:
+        selected = _few(track, family)
     else:
-        if inertia is not None and any(_may_tumble(s, inertia) for s in solutions.values()):
-            free = replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64))
-            held, top = _held_out(free, track, sigmas, outliers), families.solve(free, track, sigmas)
-            table.append(Score(free.name, free.parameters, held, math.sqrt(top.chi2)))
-            # A simpler motion is replaced only if clearly worse; one with a free angular acceleration has more
-            # parameters.
-            if held * (1.0 if "eps" in solution.candidate.blocks else WITHIN) < scores[solution.candidate.name]:
-                solution, solutions[free.name], scores[free.name] = top, top, held
-        missed = scores[solution.candidate.name]  # assume that the extrapolation errs like the held-out poses
-        wider = max(1.0, missed if math.isfinite(missed) else 1.0)
-    model = fitted_motion.to_model(solution, radius, span, evidence, sigmas)
-    band_tau, band = fitted_motion.band(solution, list(solutions.values()), evidence, sigmas, radius, span)
+        least = Noise(max(least_noise[0] / radius, noise.FLOOR), max(least_noise[1], noise.FLOOR))
+        selected = _select(track, family, least, breaks=candidates is None)
+    return _result(selected, family, float(times[-1]), radius, span)
+
+
+@dataclass(frozen=True)
+class _Selected:
+    """Result of the selection: the chosen solution among all of the same part of a track.
+
+    Attributes:
+        chosen: Chosen solution, refined.
+        solutions: All solutions.
+        evidence: Noise level.
+        track: The poses that they were fitted to.
+        noise: Their noise.
+        before: Breaks before this part, with the track and evidence that they were found in.
+    """
+
+    chosen: Solution
+    solutions: tuple[Solution, ...]
+    evidence: Evidence
+    track: PoseTrack
+    noise: Noise
+    before: tuple[tuple[Solution, Evidence], ...] = ()
+
+
+def _select(track: PoseTrack, family: tuple[Candidate, ...], least: Noise, breaks: bool) -> _Selected:
+    """Fit four or more poses, whose noise is at least ``least``."""
+    level = noise.contrasts(track)
+    level = Noise(max(level.place, least.place), max(level.turn, least.turn))
+    most = 6 * len(track) - 6 if len(track) >= _FEW else _PER_POSE * len(track)
+    tried = [c for c in family if c.parameters <= most] or [min(family, key=lambda c: c.parameters)]
+    found = [s for c in tried if (s := families.solve(c, track, level)) is not None]
+    found = found or [s for s in [families.solve(families.STATIC, track, level)] if s is not None]
+    broken = kinks.search(track, level) if breaks and len(track) >= _FEW else []
+    for _ in range(_ROUNDS):
+        shares = _shares((*found, *broken))
+        if min(shares) > _TOO_LARGE:
+            break
+        finer = level.scaled(*(math.sqrt(min(share, 1.0)) for share in shares))
+        finer = Noise(max(finer.place, least.place), max(finer.turn, least.turn))
+        if finer.place > 0.9 * level.place and finer.turn > 0.9 * level.turn:
+            break
+        level = finer
+        found = [_again(s, track, level) for s in found]
+        broken = kinks.search(track, level) if broken else []
+    evidence = Evidence.of((*found, *broken))
+    laws = [s for s in found if _determined(s, evidence)] or found[:1]
+    chosen = evidences.simplest(laws, evidence)
+    if broken:
+        best = min(broken, key=evidence.score)
+        if evidence.score(best) + evidences.STRONG < min(evidence.score(s) for s in laws):
+            chosen = best
+    solutions = (*laws, *broken)
+    final = _again(chosen, track, level, _EXACT)
+    solutions = tuple(final if s is chosen else s for s in solutions)
+    return _Selected(final, solutions, evidence, track, level)
+
+
+def _again(solution: Solution, track: PoseTrack, level: Noise, enough: float | None = None) -> Solution:
+    """Refit a solution from its own parameters."""
+    options = {} if enough is None else {"enough": enough, "steps": 40}
+    return families.solve(solution.candidate, track, level, [solution.theta], **options) or solution
+
+
+def _shares(solutions: Sequence[Solution]) -> tuple[float, float]:
+    """Variances of the place and turn residuals of the best solution, in units of the noise."""
+    best = min(solutions, key=lambda s: s.loss / max(s.residuals.size - s.parameters, 1))
+    weights = (best.weights * best.robust)[:, None]
+    free = max(1 - best.parameters / best.residuals.size, 0.1)
+    means = (weights * best.residuals**2).sum(0) / (weights.sum() * free)
+    return float(means[:3].mean()), float(means[3:].mean())
+
+
+def _determined(solution: Solution, evidence: Evidence) -> bool:
+    """Return True if the frequencies are inside their range and known to `FREQUENCY_ERROR`, or if none is free."""
+    candidate = solution.candidate
+    rows = candidate.parts(np.arange(candidate.parameters))
+    window = candidate.window
+    for block in ("pace", "pace2"):
+        if block not in rows:
+            continue
+        index = int(rows[block][0])
+        frequency = float(window.frequency(solution.theta[index]))
+        share = (frequency - window.low) / (window.high - window.low)
+        deviation = math.sqrt(max(evidence.variance * solution.inverse[index, index], 0.0))
+        sigma = deviation * share * (1 - share) * (window.high - window.low)
+        if not (0.01 < share < 0.99 and sigma < FREQUENCY_ERROR * frequency):
+            return False
+    return True
+
+
+def _few(track: PoseTrack, family: tuple[Candidate, ...]) -> _Selected:
+    """Fit two or three poses: the simplest of static, translation, spin and both with errors below a hundredth."""
+    level = Noise(1e-2, 1e-2)
+    allowed = [c for c in family if c.parameters <= 12 and not {"a", "kappa", "u"} & set(c.blocks)]
+    fits = [families.solve(c, track, level, enough=1e-9) for c in allowed or [families.STATIC]]
+    solutions = tuple(s for s in fits if s is not None)
+    roots = [math.sqrt(float(s.squares.mean()) / 6) for s in solutions]
+    index = next((i for i, root in enumerate(roots) if root <= 1.0), int(np.argmin(roots)))
+    return _Selected(solutions[index], solutions, Evidence(len(track), 1.0, 1.0), track, level)
+
+
+def _result(selected: _Selected, family: tuple[Candidate, ...], t_max: float, radius: float, span: float) -> Fit:
+    """Fit in world units."""
+    chosen, evidence, level = selected.chosen, selected.evidence, selected.noise
+    model = fitted_motion.to_model(chosen, evidence, radius, span)
+    found = fitted_motion.events(chosen, evidence, t_max, span)
+    first = t_max + span * float(selected.track.tau[0])
+    band = bands.of(chosen, selected.solutions, evidence, selected.track, level, radius, span)
+    name = chosen.candidate.law.name
+    rests = bool(found) and found[-1].kind == "stop"
+    by_name = {s.candidate.name: s for s in selected.solutions}
+    listed = {c.name: c.parameters for c in family} | {s.candidate.name: s.parameters for s in selected.solutions}
+    table = []
+    for each, parameters in listed.items():
+        s = by_name.get(each)
+        root = math.nan if s is None else math.sqrt(float((s.robust * s.squares).mean()) / 6)
+        table.append(Score(each, parameters, math.inf if s is None else evidence.score(s), root))
+    scale = math.sqrt(evidence.level)
     return Fit(
         model,
         tuple(table),
-        chosen=solution.candidate.name,
-        rested=tail > 0,
-        sigma_t=sigmas[0] * radius,
-        sigma_r=sigmas[1],
-        band_tau=band_tau,
-        band=wider * band,
+        chosen="static" if rests else name,
+        rested=rests,
+        sigma_t=scale * level.place * radius,
+        sigma_r=scale * level.turn,
+        band_tau=band.tau,
+        band=band.half_width,
+        band_angle=band.half_angle,
+        events=found,
+        segments=fitted_motion.segments(chosen, found, first, t_max, radius, span),
+        predictable_until=band.trusted if math.isfinite(band.trusted) else None,
     )
-
-
-def _score(
-    family: tuple[Candidate, ...],
-    tried: tuple[Candidate, ...],
-    track: Track,
-    sigmas: tuple[float, float],
-    outliers: np.ndarray,
-) -> tuple[dict[str, float], dict[str, Solution]]:
-    """Held-out errors of all candidates, and fits to all poses of those near the best, by name."""
-    scores = {c.name: _held_out(c, track, sigmas, outliers) if c in tried else math.inf for c in family}
-    solutions = {c.name: families.solve(c, track, sigmas) for c in _near(family, scores)}
-    # Reject oscillations with an undetermined frequency; other candidates may then be near the best.
-    for name, solution in solutions.items():
-        if not _determined(solution, track, sigmas):
-            scores[name] = math.inf
-    near = _near(family, scores)
-    return scores, {c.name: solutions.get(c.name) or families.solve(c, track, sigmas) for c in near}
-
-
-def _may_tumble(picked: Solution, inertia: np.ndarray) -> bool:
-    """Return True if the selected motion has a spin of changing axis that a free body of this inertia can have."""
-    if "eps" not in picked.candidate.blocks or not models.KINDS[picked.candidate.kind].may_tumble:
-        return False
-    p = picked.candidate.unpack(picked.theta)
-    across = np.linalg.norm(np.cross(p["w"], p["eps"]))
-    along = abs(float(p["w"] @ p["eps"]))
-    return bool(np.arctan2(across, along) > PARALLEL_RAD) and free_top.tumbles(inertia)
-
-
-def _near(family: Sequence[Candidate], scores: dict[str, float]) -> list[Candidate]:
-    """Candidates with a held-out error within `WITHIN` of the best, or the first candidate if none could be fitted."""
-    finite = [s for s in scores.values() if np.isfinite(s)]
-    best = max(min(finite), 1e-3) if finite else math.inf
-    return [c for c in family if scores[c.name] <= WITHIN * best and finite] or [family[0]]
-
-
-def _observable(family: tuple[Candidate, ...], track: Track) -> tuple[Candidate, ...]:
-    """Candidates adapted to the window, without oscillations if it is too short for any.
-
-    Frequencies range from a quarter of a period in the window to four poses per period.
-    """
-    low = 0.5 * math.pi / float(track.tau[-1] - track.tau[0])
-    high = 0.5 * math.pi / float(np.median(np.diff(track.tau)))
-    middle = float(0.5 * (track.tau[0] + track.tau[-1]))
-    adapted = (replace(c, tau_mid=middle, frequencies=(low, high)) for c in family)
-    return tuple(c for c in adapted if not c.oscillates or low < high)
-
-
-def _determined(solution: Solution, track: Track, sigmas: tuple[float, float]) -> bool:
-    """Return True if the frequency is inside its range and known to `FREQUENCY_ERROR`, or if none is free."""
-    candidate = solution.candidate
-    if not candidate.oscillates:
-        return True
-    low, high = candidate.frequencies
-    frequency = float(candidate.unpack(solution.theta)["frequency"][0])
-    index = candidate.index("pace")
-    variance = fitted_motion.covariance(solution, track, sigmas)[index, index]
-    share = (frequency - low) / (high - low)
-    sigma = math.sqrt(max(variance, 0.0)) * share * (1 - share) * (high - low)
-    return 0.01 < share < 0.99 and sigma < FREQUENCY_ERROR * frequency
 
 
 def _check(times: np.ndarray, quats: np.ndarray, displacements: np.ndarray, weights: np.ndarray, radius: float) -> None:
@@ -258,72 +298,4 @@ def _named(name: str, inertia: np.ndarray | None) -> Candidate:
 def _static(radius: float) -> Fit:
     model = models.MotionModel(radius=radius)
     scores = (Score("static", 6, math.nan, math.nan),)
-    return Fit(model, scores, "static", False, 0.0, 0.0, np.zeros(1), np.zeros(1))
-
-
-def _few(track: Track, family: tuple[Candidate, ...], radius: float, span: float) -> Fit:
-    """Fit two or three poses: the simplest of static, translation, spin and both with errors below a hundredth."""
-    sigmas = (1e-2, 1e-2)
-    allowed = [c for c in family if c.parameters <= 12 and not {"a", "kappa", "u"} & set(c.blocks)] or [
-        rest_detection.STATIC
-    ]
-    solutions = [families.solve(c, track, sigmas) for c in allowed]
-    roots = [math.sqrt(s.chi2) for s in solutions]
-    index = next((i for i, root in enumerate(roots) if root <= 1.0), int(np.argmin(roots)))
-    chosen = solutions[index]
-    table = tuple(Score(c.name, c.parameters, math.inf, r) for c, r in zip(allowed, roots, strict=True))
-    model = fitted_motion.to_model(chosen, radius, span, track, sigmas)
-    band_tau, band = fitted_motion.band(chosen, solutions, track, sigmas, radius, span)
-    return Fit(model, table, chosen.candidate.name, False, sigmas[0] * radius, sigmas[1], band_tau, band)
-
-
-def _noise(track: Track, family: tuple[Candidate, ...]) -> tuple[tuple[float, float], np.ndarray]:
-    """Noise of displacements and rotations from the residuals of the largest models, and their pose weights. [S]
-
-    The spread within a group's own rigid fit would be too small, because it misses errors common to all members.
-    """
-    swings = (c for c in family if c.oscillates)
-    wide = [c for c in (_FREE_AXIS, _LARGEST, *swings) if c.parameters <= 6 * len(track.tau) - 6] or [
-        max(
-            (c for c in family if c.parameters < 6 * len(track.tau)),
-            key=lambda c: c.parameters,
-            default=rest_detection.STATIC,
-        )
-    ]
-    best: tuple[float, Solution, np.ndarray] | None = None
-    starts: dict[str, np.ndarray] = {}
-    sigmas = (1.0, 1.0)
-    for _ in range(2):
-        best = None
-        for candidate in wide:
-            solution = families.solve(candidate, track, sigmas, starts.get(candidate.name))
-            starts[candidate.name] = solution.theta
-            values = families.residuals(candidate, solution.theta[None], track, (1.0, 1.0))[0]
-            dof = max(6 * len(track.tau) - candidate.parameters, 1) / (6 * len(track.tau))
-            level = solution.chi2 / dof
-            if best is None or level < best[0]:
-                best = (level, solution, values)
-        assert best is not None
-        _, solution, values = best
-        weights = (track.weights * solution.robust)[:, None]
-        dof = max(6 * len(track.tau) - solution.candidate.parameters, 1) / (6 * len(track.tau))
-        variances = (weights * values**2).sum(0) / (weights.sum() * dof)
-        sigma_t, sigma_r = np.sqrt([variances[:3].mean(), variances[3:].mean()]).tolist()
-        sigmas = (max(sigma_t, rest_detection.SIGMA_FLOOR), max(sigma_r, rest_detection.SIGMA_FLOOR))
-    assert best is not None
-    return sigmas, best[1].robust
-
-
-def _held_out(candidate: Candidate, track: Track, sigmas: tuple[float, float], outliers: np.ndarray) -> float:
-    """Root mean square residual of the last poses after a fit to the first ones, in units of the noise."""
-    count = len(track.tau)
-    held = max(3, math.ceil(HELD_OUT * count)) if count >= 8 else max(1, count // 4)
-    # At least a third of the six numbers per pose must remain to separate noise from motion.
-    if candidate.parameters > 4 * (count - held):
-        return math.inf
-    solution = families.solve(candidate, track.rows(slice(0, count - held)), sigmas)
-    tail = track.rows(slice(count - held, count))
-    values = families.residuals(candidate, solution.theta[None], tail, sigmas)[0]
-    weights = (tail.weights * np.maximum(outliers[count - held :], 1e-6))[:, None]
-    score = math.sqrt(float((weights * values**2).sum() / (6 * weights.sum())))
-    return score if math.isfinite(score) else math.inf
+    return Fit(model, scores, "static", False, 0.0, 0.0, np.zeros(1), np.zeros(1), np.zeros(1))

@@ -2,8 +2,9 @@
 
 import importlib
 
-from .base import KINDS, RATES, MotionKind, MotionModel, Rates, clocks
+from .base import BLOCKS, Block, MotionKind, Rates, clocks
 from .evaluation import Stack, curve, evaluate, evaluate_all, evaluate_with_rates, steps_needed
+from .motion_model import KINDS, RATES, SCALARS, VECTORS, MotionModel
 
 # Each kind is the module of its name. Append new ones: .blend files store the position in Blender's menu.
 _NAMES = (
@@ -13,14 +14,23 @@ _NAMES = (
     "constant_twist",
     "world_twist",
     "free_top",
+    "drag",
+    "friction",
+    "precession",
+    "bounce",
+    "two_oscillations",
 )
 KINDS.update({name: importlib.import_module(f"{__name__}.{name}").KIND for name in _NAMES})
 STATIC = MotionModel()
 
 __all__ = [
+    "BLOCKS",
     "KINDS",
     "RATES",
+    "SCALARS",
     "STATIC",
+    "VECTORS",
+    "Block",
     "MotionKind",
     "MotionModel",
     "Rates",

@@ -25,6 +25,7 @@ class BallisticSpin(MotionKind):
         "translation + spin": ("v", "w"),
         "hinge": ("w", "kappa", "u"),
         "pendulum": ("swing", "phase", "u", "pace"),
+        "damped pendulum": ("swing", "phase", "u", "pace", "decay"),
         "ballistic + spin": ("v", "a", "w"),
         "ballistic + spin, accelerating": ("v", "a", "w", "kappa"),
         "ballistic + spin, free axis": ("v", "a", "w", "eps"),
@@ -35,20 +36,20 @@ class BallisticSpin(MotionKind):
     drawn_fits = (_SPIN, (*_SPIN, "center_offset"))
 
     def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:
-        v, a, w, eps, u, _ = rates
+        v, a, w, eps, u = rates[:5]
         once, twice = rates.clocks(span)
         quats = rotations.rotvecs_to_quats(w * once + eps * twice)
         arm = rotations.rotate(quats, u + 0 * quats[..., 1:])
         return quats, v * once + a * twice + (u - arm)
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
-        v, a, w, eps, u, frequency = rates
+        v, a, w, eps, u = rates[:5]
         quats, d = self.poses(rates, span)
         once, twice = rates.clocks(span)
-        slope = np.cos(frequency * span)  # derivative of s1; that of s2 is s1
+        slope, slope2 = rates.clock_slopes(span)
         # R = exp(phi) has angular velocity V(phi) phi'.
-        spins = se3.v_matrix_times(w * once + eps * twice, w * slope + eps * once)
-        return quats, d, spins, v * slope + a * once - rotations.cross(spins, rotations.rotate(quats, u + 0 * span))
+        spins = se3.v_matrix_times(w * once + eps * twice, w * slope + eps * slope2)
+        return quats, d, spins, v * slope + a * slope2 - rotations.cross(spins, rotations.rotate(quats, u + 0 * span))
 
     def center(self, model: MotionModel) -> np.ndarray:
         return model.center_offset

@@ -1,4 +1,4 @@
-"""Motion models: rigid motion of a group past t_max as a small set of rates, and the base class of their kinds.
+"""Base class of the kinds of motion past t_max, and the notation of motion models.
 
 Notation: tau = t - t_max >= 0, p the group's pivot (its centre at t_max). A point of the bind state moves as
 x(t) = p + R(tau) (x(t_max) - p) + d(tau). The fitted curve (R_f, d_f) starts from the identity at tau = 0. The observed
@@ -10,197 +10,54 @@ are the pose of the curve at t_max relative to the bind state. They are blended 
 So R(0) = I and d(0) = 0 exactly, and the motion converges to the fitted curve R_f exp(r), d_f + e.
 
 A motion may oscillate with angular frequency W: s1 = sin(W tau)/W and s2 = (1 - cos(W tau))/W^2 then replace the
-factors tau and tau^2/2 of a steady motion. W = 0 gives the steady motion exactly.
+factors tau and tau^2/2 of a steady motion. W = 0 gives the steady motion exactly. With damping c, s1 and s2 are the
+solutions of s'' = -2 c s' - (W^2 + c^2) (s - rest) with s1' = 1 and s2'' = 1 at tau = 0, where all other values and
+derivatives up to the second are zero.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from .. import rotations, se3
+from ..pose_track import PoseTrack, Window
+from . import first_guesses
+from .motion_model import EXTRA_RATES, RATES, SCALARS, MotionModel
 
 Curve = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Quaternions [..., 4], displacements [..., 3], angular velocities in the world frame [..., 3], velocities [..., 3]."""
+_ZEROS, _NONE = np.zeros(3), np.zeros(1)
+_MOST_EXPONENT = 600.0  # of a decay backwards in time
 
 
-class Unit(NamedTuple):
-    """Unit of a rate: a vector that scales with the scene, or one of angles; per unit of time to a power."""
+class Block(NamedTuple):
+    """Size of a block of free parameters, and the standard deviation of a weak prior about 0; infinite for none."""
 
-    is_length: bool
-    per_time: int
+    size: int
+    prior: float = np.inf
 
 
-RATES = {
-    "velocity": Unit(True, 1),
-    "acceleration": Unit(True, 2),
-    "angular_velocity": Unit(False, 1),
-    "angular_acceleration": Unit(False, 2),
-    "center_offset": Unit(True, 0),
+# Priors are in radii and spans, and far wider than observed motions. They only constrain directions that the poses
+# leave undetermined (a centre along its own axis, the centre of a body that does not rotate).
+BLOCKS = {
+    "r": Block(3),
+    "e": Block(3),
+    "v": Block(3),
+    "a": Block(3, 100.0),
+    "w": Block(3),
+    "eps": Block(3, 100.0),
+    "kappa": Block(1, 30.0),
+    "u": Block(3, 10.0),
+    "swing": Block(3, 10.0),
+    "phase": Block(1, 10.0),
+    "pace": Block(1, 5.0),
+    "decay": Block(1, 2.0),
 }
-_VECTORS = {**RATES, "offset_rotvec": Unit(False, 0), "offset_displacement": Unit(True, 0)}
-_RATE_NAMES = (*(f"{name}.{axis}" for name in _VECTORS for axis in "xyz"), "frequency")
-
-
-def _zeros() -> np.ndarray:
-    return np.zeros(3)
-
-
-@dataclass(frozen=True, eq=False)
-class MotionModel:
-    """Rigid motion past t_max. Rates are at t_max, in the world frame; vectors are float64 [3].
-
-    Attributes:
-        kind: Name of the kind, a key of `KINDS`. A kind ignores the rates that are not its own.
-        velocity: v, of the point `center_offset` off the pivot, world units per unit of time.
-        acceleration: a, rate of v.
-        angular_velocity: w, rad per unit of time.
-        angular_acceleration: eps, rate of w.
-        center_offset: u, position relative to the pivot at t_max of the body point that moves with v and a
-            in kinds that spin about a centre. A hinge has v = a = 0 and u on its axis.
-        offset_rotvec: r, rotation of the fitted curve at t_max relative to the bind state, rad.
-        offset_displacement: e, its displacement.
-        fade_time: Time constant with which the offsets are blended in, > 0.
-        radius: Radius of the group, world units; tolerances are relative to it.
-        frequency: W >= 0, rad per unit of time, of kinds that may oscillate; 0 for no oscillation.
-        inertia: J in the world at tau = 0, up to a factor, of kinds that need it; None for others. [3, 3]
-        covariance: Covariance of the fitted rates, or None. [P, P] in the order of `covariance_names`
-        covariance_names: Names of its rows, such as "velocity.x"; "frequency" if it was fitted.
-    """
-
-    kind: str = "static"
-    velocity: np.ndarray = field(default_factory=_zeros)
-    acceleration: np.ndarray = field(default_factory=_zeros)
-    angular_velocity: np.ndarray = field(default_factory=_zeros)
-    angular_acceleration: np.ndarray = field(default_factory=_zeros)
-    center_offset: np.ndarray = field(default_factory=_zeros)
-    offset_rotvec: np.ndarray = field(default_factory=_zeros)
-    offset_displacement: np.ndarray = field(default_factory=_zeros)
-    fade_time: float = 0.1
-    radius: float = 1.0
-    frequency: float = 0.0
-    inertia: np.ndarray | None = None
-    covariance: np.ndarray | None = None
-    covariance_names: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {self.kind!r}")
-        for name in _VECTORS:
-            value = getattr(self, name)
-            try:
-                vector = np.array(value, np.float64)
-            except (TypeError, ValueError):
-                vector = np.zeros(0)
-            if vector.shape != (3,) or not np.isfinite(vector).all():
-                raise ValueError(f"{name}: expected three finite numbers, got {value!r}")
-            vector.flags.writeable = False
-            object.__setattr__(self, name, vector)
-        for name in ("fade_time", "radius"):
-            value = float(getattr(self, name))
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name}: expected a positive number, got {value}")
-            object.__setattr__(self, name, value)
-        frequency = float(self.frequency)
-        if not (math.isfinite(frequency) and frequency >= 0):
-            raise ValueError(f"frequency: expected a number >= 0, got {frequency}")
-        object.__setattr__(self, "frequency", frequency)
-        if (self.inertia is not None) != KINDS[self.kind].needs_inertia:
-            expected = "a (3, 3)" if KINDS[self.kind].needs_inertia else "None"
-            raise ValueError(f"inertia: expected {expected} for the kind {self.kind!r}, got {self.inertia!r}")
-        if self.inertia is not None:
-            inertia = np.array(self.inertia, np.float64)
-            sound = inertia.shape == (3, 3) and np.isfinite(inertia).all()
-            if not (sound and np.allclose(inertia, inertia.T) and np.linalg.eigvalsh(inertia)[0] > 0):
-                raise ValueError(f"inertia: expected a symmetric (3, 3) with positive moments, got {self.inertia!r}")
-            inertia.flags.writeable = False
-            object.__setattr__(self, "inertia", inertia)
-        object.__setattr__(self, "covariance_names", tuple(self.covariance_names))
-        foreign = [name for name in self.covariance_names if name not in _RATE_NAMES]
-        if foreign:
-            raise ValueError(f"covariance_names: expected names such as 'velocity.x', got {foreign[0]!r:.60}")
-        if self.covariance is not None:
-            covariance = np.array(self.covariance, np.float64)
-            size = len(self.covariance_names)
-            if covariance.shape != (size, size) or not np.isfinite(covariance).all():
-                raise ValueError(f"covariance: expected finite ({size}, {size}), got {covariance.shape}")
-            object.__setattr__(self, "covariance", covariance)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, MotionModel) and self.to_dict() == other.to_dict()
-
-    __hash__ = None  # type: ignore[assignment]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the model as JSON types; `from_dict` restores it exactly."""
-        result: dict[str, Any] = {"kind": self.kind}
-        for name in _VECTORS:
-            result[name] = getattr(self, name).tolist()
-        result.update(fade_time=self.fade_time, radius=self.radius)
-        if self.frequency > 0:
-            result["frequency"] = self.frequency
-        if self.inertia is not None:
-            result["inertia"] = self.inertia.tolist()
-        if self.covariance is not None:
-            result.update(covariance=self.covariance.tolist(), covariance_names=list(self.covariance_names))
-        return result
-
-    @staticmethod
-    def from_dict(data: dict[str, Any]) -> MotionModel:
-        """Inverse of `to_dict`. Raises ValueError that names the unknown or malformed key."""
-        if not isinstance(data, dict) or "kind" not in data:
-            raise ValueError(f"expected an object with the key 'kind', got {data!r}")
-        known = {f.name for f in fields(MotionModel)}
-        unknown = sorted(set(data) - known)
-        if unknown:
-            raise ValueError(f"{unknown[0]}: unknown key of a motion model")
-        try:
-            return MotionModel(**data)
-        except TypeError as error:
-            raise ValueError(f"malformed motion model: {error}") from error
-
-    @property
-    def is_static(self) -> bool:
-        """True if `evaluate` returns the identity at every time."""
-        offset = self.offset_rotvec.any() or self.offset_displacement.any()
-        return not (offset or KINDS[self.kind].moves(self))
-
-    @property
-    def turns(self) -> bool:
-        """True if `evaluate` returns a rotation at any time."""
-        return bool(KINDS[self.kind].spins(self) or self.offset_rotvec.any())
-
-    def transformed(self, turn: np.ndarray, scale: float) -> MotionModel:
-        """Motion of the group after a similarity of the world, with its covariance.
-
-        Args:
-            turn: Rotation, which transforms rates of angles. [3, 3]
-            scale: Scale of lengths, negative for a mirror.
-        """
-        maps = {name: scale * turn if unit.is_length else turn for name, unit in _VECTORS.items()}
-        values = {name: linear @ getattr(self, name) for name, linear in maps.items()}
-        if self.inertia is not None:
-            inertia = turn @ self.inertia @ turn.T
-            values["inertia"] = 0.5 * (inertia + inertia.T)
-        if self.covariance is not None:
-            change = _change(self.covariance_names, maps)
-            values["covariance"] = change @ self.covariance @ change.T
-        return replace(self, radius=abs(scale) * self.radius, **values)
-
-
-def _change(names: tuple[str, ...], maps: dict[str, np.ndarray]) -> np.ndarray:
-    """Change of basis for rates given by name, such as "velocity.x". [P, P]"""
-    change = np.eye(len(names))
-    parts = [name.partition(".") for name in names]
-    for i, (field_name, _, axis) in enumerate(parts):
-        for j, (other, _, other_axis) in enumerate(parts):
-            if axis and field_name == other and field_name in maps:
-                change[i, j] = maps[field_name]["xyz".index(axis), "xyz".index(other_axis)]
-    return change
+LOGARITHMS = (-6.0, 4.0)  # limits of the logarithms of decay rates per span
 
 
 class Rates(NamedTuple):
@@ -212,25 +69,50 @@ class Rates(NamedTuple):
         w: Angular velocity. [..., 3]
         eps: Angular acceleration. [..., 3]
         u: Centre of rotation relative to the pivot. [..., 3]
-        frequency: [..., 1]
+        p: Precession. [..., 3]
+        v2, a2, w2, eps2: The same of a second oscillation. [..., 3]
+        frequency, frequency2, damping, stop_time, bounce_time, restitution: [..., 1]
     """
 
-    v: np.ndarray
-    a: np.ndarray
-    w: np.ndarray
-    eps: np.ndarray
-    u: np.ndarray
-    frequency: np.ndarray
+    v: np.ndarray = _ZEROS
+    a: np.ndarray = _ZEROS
+    w: np.ndarray = _ZEROS
+    eps: np.ndarray = _ZEROS
+    u: np.ndarray = _ZEROS
+    p: np.ndarray = _ZEROS
+    v2: np.ndarray = _ZEROS
+    a2: np.ndarray = _ZEROS
+    w2: np.ndarray = _ZEROS
+    eps2: np.ndarray = _ZEROS
+    frequency: np.ndarray = _NONE
+    frequency2: np.ndarray = _NONE
+    damping: np.ndarray = _NONE
+    stop_time: np.ndarray = _NONE
+    bounce_time: np.ndarray = _NONE
+    restitution: np.ndarray = _NONE
 
     @classmethod
     def of(cls, models: Sequence[MotionModel]) -> Rates:
         """Rates of K models. [K, 3], [K, 1]"""
-        v, a, w, eps, u = (np.array([getattr(model, name) for model in models]) for name in RATES)
-        return cls(v, a, w, eps, u, np.array([[model.frequency] for model in models]))
+        return cls(*(np.array([np.atleast_1d(getattr(model, name)) for model in models]) for name in FIELDS))
+
+    @classmethod
+    def of_one(cls, model: MotionModel) -> Rates:
+        """Rates of a model. [3], [1]"""
+        return cls(*(np.atleast_1d(getattr(model, name)) for name in FIELDS))
 
     def clocks(self, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Factors s1 of v and w and s2 of a and eps at times since t_max. [..., 1]"""
-        return clocks(self.frequency, span)
+        return clocks(self.frequency, span, self.damping)
+
+    def clock_slopes(self, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of `clocks` by time."""
+        return clock_slopes(self.frequency, span, self.damping)
+
+
+FIELDS = (*RATES, *EXTRA_RATES, "frequency", "second_frequency", "damping", "stop_time", "bounce_time", "restitution")
+"""Fields of `MotionModel` in the order of `Rates`."""
+assert set(FIELDS) == {*RATES, *EXTRA_RATES, *SCALARS}
 
 
 class MotionKind:
@@ -246,7 +128,9 @@ class MotionKind:
         fields: Fields of `MotionModel` that users edit.
         needs_inertia: True if `MotionModel.inertia` is needed.
         center_on_axis: True if each point of the axis serves as the centre.
-        fits: Name -> free blocks of the candidates with which `motion_fit` identifies this kind, see `Candidate`.
+        fits: Name -> free blocks of the candidates with which `motion_fit` identifies this kind, beside the pose at
+            t_max (r, e).
+        blocks: Sizes and priors of blocks of `fits` that no other kind has; `BLOCKS` has the common ones.
         fits_by_default: False if a caller must choose these candidates by name.
         may_tumble: True if the fit of a body that tumbles freely may be of this kind.
         drawn_fits: Sets of free rates with which `fit_drawn_curve` tries this kind.
@@ -259,6 +143,7 @@ class MotionKind:
     needs_inertia = False
     center_on_axis = False
     fits: Mapping[str, tuple[str, ...]] = {}
+    blocks: Mapping[str, Block] = {}
     fits_by_default = True
     may_tumble = False
     drawn_fits: tuple[tuple[str, ...], ...] = ()
@@ -276,8 +161,7 @@ class MotionKind:
 
     def curve(self, model: MotionModel, tau: np.ndarray, most_steps: int | None) -> Curve:
         """`motion` of a model at times [...], in at most ``most_steps`` integration steps."""
-        v, a, w, eps, u = (getattr(model, name) for name in RATES)
-        return self.motion(Rates(v, a, w, eps, u, np.array(model.frequency)), tau[..., None])
+        return self.motion(Rates.of_one(model), tau[..., None])
 
     def stacked(self, models: Sequence[MotionModel]) -> Callable[[float], se3.Pose] | None:
         """Function from a time > 0 to the poses of K models; None if they do not move. [K, 4], [K, 3]"""
@@ -301,6 +185,48 @@ class MotionKind:
         """
         quats, d = self.poses(rates, tau[:, None])
         return rotations.multiply(quats, rotations.rotvecs_to_quats(rotvec)), d + displacement
+
+    def rates(self, parts: Mapping[str, np.ndarray], window: Window) -> Rates:
+        """Rates at t_max from the values of free blocks. [..., size of the block] each
+
+        "v", "a", "w", "eps", "u" are those of `Rates`; "kappa" is the relative rate of a spin about a fixed axis:
+        w(tau) = w_mid (1 + kappa (tau - middle)). "swing" q and "phase" f are an angle about a fixed axis,
+        q exp(-c tau) sin(W tau + f), which stays determined if w or eps is zero; "pace" is the logit of W in the
+        window, and "decay" the logarithm of c.
+        """
+        found = {name: parts[name] for name in ("v", "a", "w", "eps", "u") if name in parts}
+        if "kappa" in parts:
+            kappa, w_mid = parts["kappa"], parts["w"]
+            found["eps"], found["w"] = kappa * w_mid, w_mid * (1 - kappa * window.middle)
+        if "pace" in parts:
+            found["frequency"] = window.frequency(parts["pace"])
+        if "decay" in parts:
+            found["damping"] = np.exp(np.clip(parts["decay"], *LOGARITHMS))
+        if "swing" in parts:
+            swing, phase, frequency, c = parts["swing"], parts["phase"], found["frequency"], found.get("damping", 0.0)
+            cosine, sine = swing * np.cos(phase), swing * np.sin(phase)
+            found["w"] = frequency * cosine - c * sine
+            found["eps"] = (c**2 - frequency**2) * sine - 2 * c * frequency * cosine
+        return Rates(**found)
+
+    def observed(
+        self, parts: Mapping[str, np.ndarray], tau: np.ndarray, window: Window, inertia: np.ndarray | None
+    ) -> se3.Pose:
+        """Poses of a candidate at times of the window and later. [..., 1, size] each, [S] -> [..., S, 4], [..., S, 3]
+
+        Past t_max they are those of the rates of `rates`. Kinds with events in the window override it.
+        """
+        return self.fitted(self.rates(parts, window), parts["r"], parts["e"], tau, inertia)
+
+    def starts(self, blocks: Sequence[str], track: PoseTrack, window: Window) -> list[first_guesses.Guess]:
+        """First guesses of a candidate's blocks, most promising first; empty if it cannot apply."""
+        if "pace" in blocks:
+            return first_guesses.swings(blocks, track, window, clocks)
+        return [first_guesses.parabola(blocks, track)]
+
+    def events(self, parts: Mapping[str, np.ndarray], window: Window) -> list[tuple[str, np.ndarray]]:
+        """Kinds of the events in the window and their times, each [..., 1], from values of free blocks."""
+        return []
 
     def steps_needed(self, model: MotionModel, tau: np.ndarray) -> np.ndarray:
         """Number of integration steps for each pose. [S] -> [S]"""
@@ -331,19 +257,46 @@ class MotionKind:
         )
 
 
-KINDS: dict[str, MotionKind] = {}
-"""Kinds by name, in the order of Blender's menu; the package fills it."""
-
-
-def clocks(frequency: float | np.ndarray, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def clocks(frequency: float | np.ndarray, span: np.ndarray, damping: float | np.ndarray = 0.0) -> se3.Pose:
     """Factors of the rates and of their derivatives in a motion that may oscillate.
 
     Args:
         frequency: W >= 0, rad per unit of time. [..., 1]
         span: Times tau since t_max, of either sign. [..., 1]
+        damping: c >= 0, per unit of time; counts only if W > 0. [..., 1]
 
     Returns:
-        s1 = sin(W tau)/W and s2 = (1 - cos(W tau))/W^2; exactly tau and tau^2/2 for W = 0.
+        s1 and s2 of the module's notation; exactly tau and tau^2/2 for W = 0.
     """
+    if not np.any(damping):
+        phase2 = (frequency * span) ** 2
+        return span * rotations.sine_ratio(phase2), span**2 * rotations.versine_ratio(phase2)
+    c = np.where(np.asarray(frequency) > 0, damping, 0.0)
+    p, s, stiffness = _decaying(frequency, span, c)
+    small = stiffness * span**2 < 1e-6
+    safe = np.where(stiffness > 0, stiffness, 1.0)
+    # Each is k - k p + b s with the constants of the initial values.
+    once = np.where(small, span - stiffness * span**3 / 6, (2 * c * (1 - p) + (safe - 2 * c**2) * s) / safe)
+    twice = np.where(small, 0.5 * span**2 - c * span**3 / 3, (1 - p - c * s) / safe)
+    return once, twice
+
+
+def clock_slopes(frequency: float | np.ndarray, span: np.ndarray, damping: float | np.ndarray) -> se3.Pose:
+    """Derivatives by time of the factors of `clocks`; same arguments."""
+    if not np.any(damping):
+        return np.cos(frequency * span), clocks(frequency, span)[0]
+    c = np.where(np.asarray(frequency) > 0, damping, 0.0)
+    p, s, stiffness = _decaying(frequency, span, c)
+    slope_s, slope_p = p - c * s, -c * p - np.asarray(frequency) ** 2 * s
+    safe = np.where(stiffness > 0, stiffness, 1.0)
+    once = np.where(stiffness > 0, (-2 * c * slope_p + (safe - 2 * c**2) * slope_s) / safe, 1.0)
+    return once, s
+
+
+def _decaying(
+    frequency: float | np.ndarray, span: np.ndarray, c: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """exp(-c tau) cos(W tau), exp(-c tau) sin(W tau) / W, and W^2 + c^2."""
     phase2 = (frequency * span) ** 2
-    return span * rotations.sine_ratio(phase2), span**2 * rotations.versine_ratio(phase2)
+    decay = np.exp(np.minimum(-c * span, _MOST_EXPONENT))
+    return decay * np.cos(frequency * span), decay * span * rotations.sine_ratio(phase2), np.asarray(frequency) ** 2 + c**2

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from .. import rotations
-from .base import KINDS, Curve, MotionModel
+from .base import Curve
+from .motion_model import KINDS, MotionModel
 
 log = logging.getLogger(__name__)
 

@@ -11,13 +11,15 @@ from .base import Curve, MotionKind, MotionModel, Rates
 
 
 class Translation(MotionKind):
-    """R_f = I, d_f = v s1 + a s2. A spring is centred at a / W^2."""
+    """R_f = I, d_f = v s1 + a s2. A spring is centred at (a + 2 c v) / (W^2 + c^2)."""
 
     label = "Slide"
     tooltip = "Moves without turning; with swings, it oscillates like a mass on a spring"
     word = "slide"
     fields = ("velocity", "acceleration", "frequency")
-    fits = {"translation": ("v",), "translation, quadratic": ("v", "a"), "spring": ("v", "a", "pace")}
+    fits = {"translation": ("v",), "translation, quadratic": ("v", "a"), "spring": ("v", "a", "pace")} | {
+        "damped spring": ("v", "a", "pace", "decay")
+    }
     drawn_fits = (("velocity", "acceleration"),)
 
     def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:
@@ -27,17 +29,22 @@ class Translation(MotionKind):
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
         quats, d = self.poses(rates, span)
-        slope = np.cos(rates.frequency * span)  # derivative of s1; that of s2 is s1
-        return quats, d, np.zeros(d.shape), rates.v * slope + rates.a * rates.clocks(span)[0]
+        slope, slope2 = rates.clock_slopes(span)
+        return quats, d, np.zeros(d.shape), rates.v * slope + rates.a * slope2
 
     def spins(self, model: MotionModel) -> bool:
         return False
 
     def center(self, model: MotionModel) -> np.ndarray | None:
-        return model.acceleration / model.frequency**2 if model.frequency > 0 else None
+        if model.frequency == 0:
+            return None
+        if model.damping == 0:
+            return model.acceleration / model.frequency**2
+        return (model.acceleration + 2 * model.damping * model.velocity) / (model.frequency**2 + model.damping**2)
 
     def with_center(self, model: MotionModel, point: np.ndarray, old: np.ndarray) -> MotionModel:
-        return replace(model, acceleration=model.frequency**2 * point)
+        stiffness = model.frequency**2 + model.damping**2
+        return replace(model, acceleration=stiffness * point - 2 * model.damping * model.velocity)
 
 
 KIND = Translation()

@@ -1,0 +1,187 @@
+"""A body that flies, spins and bounces off a floor, each time with a share of its speed, until it rests there.
+
+Gravity a sets the upward direction n = -a / |a|. Between bounces the height over the floor is V y - |a| y^2 / 2, with
+y the time since the last bounce and V the speed after it. V falls by the factor rho (restitution) at each bounce.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from .. import rotations, se3
+from ..pose_track import PoseTrack, Window
+from . import first_guesses
+from .base import Block, Curve, MotionKind, MotionModel, Rates
+
+_LEAST = 1e-300
+_NEAR = 9  # poses about a bounce that give its first guess
+_PLACES = (0.2, 0.5, 0.8)  # tried times of a bounce between two poses
+
+
+class Bounce(MotionKind):
+    """d_f = v tau + a tau^2 / 2 up to the next bounce, R_f = exp(w tau)."""
+
+    label = "Bounce"
+    tooltip = "Flies and bounces off a floor that is perpendicular to its acceleration, ever lower"
+    word = "bounce"
+    fields = ("velocity", "acceleration", "angular_velocity")
+    fits = {"bounces": ("w", "v", "a", "bounce", "logit_rho")}
+    blocks = {"bounce": Block(1, 3.0), "logit_rho": Block(1, 3.0)}
+
+    def motion(self, rates: Rates, span: np.ndarray) -> Curve:
+        g, up = _gravity(rates.a)
+        since = span - rates.bounce_time
+        hit = rates.v + rates.a * rates.bounce_time  # velocity at the next bounce
+        down = -(hit * up).sum(-1)[..., None]
+        speed = rates.restitution * np.maximum(down, 0.0)
+        flies = (since < 0) | (down < 0) | (g == 0)  # up to the bounce; or a body that moves away from the floor
+        high, rise = _heights(np.where(flies, 0.0, since), speed, np.maximum(g, _LEAST), rates.restitution)
+        free = rates.v * span + rates.a * (0.5 * span**2)
+        at = rates.v * rates.bounce_time + rates.a * (0.5 * rates.bounce_time**2)
+        along = hit + down * up
+        d = np.where(flies, free, at + along * since + high * up)
+        velocities = np.where(flies, rates.v + rates.a * span, along + rise * up)
+        return rotations.rotvecs_to_quats(rates.w * span), d, rates.w + 0 * span, velocities
+
+    def rates(self, parts: Mapping[str, np.ndarray], window: Window) -> Rates:
+        """ "v" is the velocity just after a bounce at the time "bounce" of the window."""
+        g, up = _gravity(parts["a"])
+        rho = _restitution(parts)
+        speed, along = _split(parts["v"], up)
+        number, start = _flight(-parts["bounce"], speed, np.maximum(g, _LEAST), rho)
+        at = parts["bounce"] + start
+        rising = np.where(number >= _RESTING, 0.0, speed * rho ** np.minimum(number, _RESTING))
+        v = along + (rising + g * at) * up  # at t_max, -at after the bounce
+        ahead = np.maximum(at + 2 * rising / np.maximum(g, _LEAST), 0.0)
+        resting = number >= _RESTING
+        return Rates(
+            v=np.where(resting, along, v),
+            a=parts["a"],
+            w=parts["w"],
+            bounce_time=np.where(resting, 0.0, ahead),
+            restitution=rho,
+        )
+
+    def observed(
+        self, parts: Mapping[str, np.ndarray], tau: np.ndarray, window: Window, inertia: np.ndarray | None
+    ) -> se3.Pose:
+        g, up = _gravity(parts["a"])
+        speed, along = _split(parts["v"], up)
+        rho = _restitution(parts)
+
+        def place(at: np.ndarray) -> np.ndarray:
+            high, _ = _heights(at - parts["bounce"], speed, np.maximum(g, _LEAST), rho)
+            return along * at + high * up
+
+        quats = rotations.multiply(
+            rotations.rotvecs_to_quats(parts["w"] * tau[:, None]), rotations.rotvecs_to_quats(parts["r"])
+        )
+        return quats, parts["e"] + place(tau[:, None]) - place(np.zeros((1, 1)))
+
+    def starts(self, blocks: Sequence[str], track: PoseTrack, window: Window) -> list[first_guesses.Guess]:
+        """Two parabolas with one acceleration meet between two poses, for each gap; the best two with a real bounce."""
+        count, tau = len(track), track.tau
+        if count < 8:
+            return []
+        gaps = np.arange(2, count - 1)
+        times = (tau[gaps - 1, None] + np.array(_PLACES) * np.diff(tau)[gaps - 1, None]).reshape(-1)
+        gaps = np.repeat(gaps, len(_PLACES))
+        x = tau - times[:, None]
+        near = np.abs(np.arange(count) - gaps[:, None] + 0.5) < 0.5 * _NEAR
+        columns = np.stack([np.ones_like(x), np.maximum(x, 0), np.minimum(x, 0), 0.5 * x**2], -1) * near[..., None]
+        path = track.displacements * near[..., None]
+        fits = np.linalg.pinv(columns) @ path  # [K, 4, 3]
+        misses = ((columns @ fits - path) ** 2).sum((-1, -2)) / near.sum(-1)
+        found: list[tuple[float, first_guesses.Guess]] = []
+        for row in np.argsort(misses, kind="stable"):
+            e, after, before, a = fits[row]
+            g, up = _gravity(a)
+            rise, fall = float(after @ up), float(before @ up)
+            if not (rise > 0.05 and fall < -0.05 and float(g[0]) > 0.1):
+                continue
+            if any(abs(times[row] - other) < 0.05 for other, _ in found):
+                continue
+            rho = np.clip(rise / -fall, 0.1, 0.95)
+            d = after * -times[row] + 0.5 * a * times[row] ** 2 + e
+            guess = {"r": np.zeros(3), "e": d, "w": track.spin, "v": after, "a": a}
+            guess |= {"bounce": times[row : row + 1], "logit_rho": np.log(np.array([rho / (1 - rho)]))}
+            found.append((float(times[row]), guess))
+            if len(found) == 2:
+                break
+        return [guess for _, guess in found]
+
+    def events(self, parts: Mapping[str, np.ndarray], window: Window) -> list[tuple[str, np.ndarray]]:
+        g, up = _gravity(parts["a"])
+        speed, _ = _split(parts["v"], up)
+        rho, gravity = _restitution(parts), np.maximum(g, _LEAST)
+        first = float(_flight(window.first - parts["bounce"], speed, gravity, rho)[0].reshape(-1)[0])
+        last = float(_flight(-parts["bounce"], speed, gravity, rho)[0].reshape(-1)[0])
+        numbers = range(int(first) + 1, int(min(last, first + 50)) + 1)
+        return [("impact", parts["bounce"] + _start(np.float64(k), speed, gravity, rho)) for k in numbers]
+
+    def moves(self, model: MotionModel) -> bool:
+        return bool(model.velocity.any() or model.acceleration.any() or model.angular_velocity.any())
+
+    def spins(self, model: MotionModel) -> bool:
+        return bool(model.angular_velocity.any())
+
+
+_RESTING = 1000.0  # number of bounces after which a body rests on the floor
+
+
+def _gravity(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Strength of an acceleration [..., 1] and the direction against it [..., 3]."""
+    g = np.sqrt((a * a).sum(-1))[..., None]
+    return g, -a / np.maximum(g, _LEAST)
+
+
+def _restitution(parts: Mapping[str, np.ndarray]) -> np.ndarray:
+    return 1 / (1 + np.exp(-np.clip(parts["logit_rho"], -4.0, 5.0)))
+
+
+def _split(v: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Upward speed, at least a little, and the velocity along the floor. [..., 1], [..., 3]"""
+    speed = (v * up).sum(-1)[..., None]
+    return np.maximum(speed, 1e-6), v - speed * up
+
+
+def _start(number: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray) -> np.ndarray:
+    """Time of the bounce before a flight, since bounce 0: 2 V / g times 1 + rho + ... + rho^(number - 1)."""
+    first = 2 * speed / g
+    steady = np.abs(1 - rho) < 1e-9
+    return first * np.where(steady, number, (1 - rho**number) / np.where(steady, 1.0, 1 - rho))
+
+
+def _flight(
+    since: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Number of the flight at a time since bounce 0, after which it flies up at ``speed``; `_RESTING` for rest.
+
+    Returns:
+        The number, negative before bounce 0, and the time of the bounce before that flight since bounce 0.
+    """
+    first = 2 * speed / g
+    flights = since / np.maximum(first, _LEAST)
+    steady = np.abs(1 - rho) < 1e-9
+    rest = 1 - flights * (1 - rho)  # rho^number, for whole numbers
+    with np.errstate(divide="ignore", invalid="ignore"):
+        number = np.where(
+            steady, np.floor(flights), np.floor(np.log(np.maximum(rest, _LEAST)) / np.log(np.maximum(rho, _LEAST)))
+        )
+    number = np.where((rest <= 1e-3 * (1 - rho)) | (first <= _LEAST) & (since >= 0), _RESTING, number)
+    number = np.clip(number, -60.0, _RESTING)
+    return number, np.where(number < _RESTING, _start(np.minimum(number, 400.0), speed, g, rho), 0.0)
+
+
+def _heights(since: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Height over the floor and its rate at a time since bounce 0, after which the body flies up at ``speed``."""
+    number, start = _flight(since, speed, g, rho)
+    rising = speed * rho ** np.minimum(number, 400.0)
+    y = since - start
+    resting = number >= _RESTING
+    return np.where(resting, 0.0, rising * y - 0.5 * g * y**2), np.where(resting, 0.0, rising - g * y)
+
+
+KIND = Bounce()

@@ -1,0 +1,55 @@
+"""The sum of two oscillations with different frequencies, such as a Lissajous figure or a coupled pendulum."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from .. import rotations, se3
+from ..pose_track import PoseTrack, Window
+from . import first_guesses
+from .base import Block, Curve, MotionKind, MotionModel, Rates, clock_slopes, clocks
+
+
+class TwoOscillations(MotionKind):
+    """d_f = v s1 + a s2 + v2 s1' + a2 s2', R_f = exp(w s1 + eps s2 + w2 s1' + eps2 s2'), ' of the second frequency."""
+
+    label = "Two Swings"
+    tooltip = "Oscillates with two frequencies at once"
+    word = "two swings"
+    fields = ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "frequency")
+    fits = {
+        "two oscillations": ("v", "a", "pace", "v2", "a2", "pace2"),
+        "two oscillations, rocking": ("v", "a", "pace", "v2", "a2", "pace2", "w", "eps", "w2", "eps2"),
+    }
+    blocks = {"v2": Block(3, 100.0), "a2": Block(3, 1000.0), "w2": Block(3, 100.0), "eps2": Block(3, 1000.0)} | {
+        "pace2": Block(1, 5.0)
+    }
+
+    def motion(self, rates: Rates, span: np.ndarray) -> Curve:
+        once, twice = clocks(rates.frequency, span)
+        once2, twice2 = clocks(rates.frequency2, span)
+        slope, slope2 = (clock_slopes(f, span, 0.0)[0] for f in (rates.frequency, rates.frequency2))
+        phi = rates.w * once + rates.eps * twice + rates.w2 * once2 + rates.eps2 * twice2
+        d = rates.v * once + rates.a * twice + rates.v2 * once2 + rates.a2 * twice2
+        rate = rates.w * slope + rates.eps * once + rates.w2 * slope2 + rates.eps2 * once2
+        velocity = rates.v * slope + rates.a * once + rates.v2 * slope2 + rates.a2 * once2
+        return rotations.rotvecs_to_quats(phi), d, se3.v_matrix_times(phi, rate), velocity
+
+    def rates(self, parts: Mapping[str, np.ndarray], window: Window) -> Rates:
+        rest = {name: parts[name] for name in ("v2", "a2", "w2", "eps2") if name in parts}
+        return super().rates(parts, window)._replace(frequency2=window.frequency(parts["pace2"]), **rest)
+
+    def starts(self, blocks: Sequence[str], track: PoseTrack, window: Window) -> list[first_guesses.Guess]:
+        return first_guesses.pairs(track, window, clocks)
+
+    def moves(self, model: MotionModel) -> bool:
+        return super().moves(model) or bool(model.second_velocity.any() or model.second_acceleration.any())
+
+    def spins(self, model: MotionModel) -> bool:
+        second = model.second_angular_velocity.any() or model.second_angular_acceleration.any()
+        return super().spins(model) or bool(second)
+
+
+KIND = TwoOscillations()

@@ -1,0 +1,144 @@
+"""Confidence band of a predicted motion, and the time up to which it can be trusted.
+
+The variance of a point of the body comes from the covariance of the parameters and from the distance to other
+candidates, each weighted by its evidence. Notation: H times past t_max; variances are in squared radii.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..motion import rotations, se3
+from ..motion.pose_track import PoseTrack
+from . import candidates as families
+from .candidates import Noise, Solution
+from .evidence import Evidence
+from .fitted_motion import FADE_PER_SPAN
+
+LEVEL = 0.95
+KNOTS = 16
+WIDE = 0.4  # half width from which a motion is not predictable, in radii: a fifth of the body's size
+_MULTIPLE = 1.6  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
+_WARNING = 2.0  # the same for the warning
+_SOFT = 4.0  # difference of scores that reduces a candidate's weight by e
+_FARTHEST = 8.0  # radii; largest counted distance of another candidate
+_MOST_SQUARE, _MOST_SCALE = 600.0, 9.0  # limits of the misses of rolling origins
+
+
+@dataclass(frozen=True)
+class Band:
+    """Confidence band at times past t_max.
+
+    Attributes:
+        tau: Times since t_max, units of time. [H]
+        half_width: Half width of the position of a point of the body, world units. [H]
+        half_angle: Half width of the rotation, rad. [H]
+        trusted: Time since t_max up to which the motion is predictable; infinite if up to the last one.
+    """
+
+    tau: np.ndarray
+    half_width: np.ndarray
+    half_angle: np.ndarray
+    trusted: float
+
+
+def of(
+    chosen: Solution,
+    all_solutions: Sequence[Solution],
+    evidence: Evidence,
+    track: PoseTrack,
+    noise: Noise,
+    radius: float,
+    span: float,
+) -> Band:
+    """Band of a chosen solution, up to one observed span past t_max."""
+    tau = np.linspace(0.0, 1.0, KNOTS)
+    place, turn = _variance(chosen, evidence, tau)
+    place2, turn2 = _spread(chosen, all_solutions, evidence, tau)
+    fading = np.exp(-2 * tau / FADE_PER_SPAN)  # of the bind state, which is a noisy pose
+    last = evidence.level * fading
+    place_noise, turn_noise = 3 * noise.place**2 * last, 3 * noise.turn**2 * last
+
+    def width(scale: float) -> np.ndarray:
+        return np.sqrt(scale * (place + 2 / 3 * turn) + place2 + 2 / 3 * turn2 + place_noise + 2 / 3 * turn_noise)
+
+    warning = _WARNING * width(_rolling(chosen, track, noise, evidence))
+    wide = np.flatnonzero(warning > WIDE)
+    return Band(
+        tau * span,
+        _MULTIPLE * radius * width(1.0),
+        _MULTIPLE * np.sqrt((turn + turn2 + turn_noise) / 3) * math.sqrt(3),
+        _crossing(tau, warning, int(wide[0])) * span if len(wide) else math.inf,
+    )
+
+
+def _crossing(tau: np.ndarray, values: np.ndarray, row: int) -> float:
+    """Time at which linear interpolation reaches `WIDE`, in the interval before a row."""
+    if row == 0:
+        return 0.0
+    share = (WIDE - values[row - 1]) / (values[row] - values[row - 1])
+    return float(tau[row - 1] + share * (tau[row] - tau[row - 1]))
+
+
+def _poses(solution: Solution, tau: np.ndarray) -> se3.Pose:
+    return solution.candidate.law.poses(solution.law_theta, tau)
+
+
+def _variance(solution: Solution, evidence: Evidence, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Variance of the place and of the rotation vector, summed over components, from the covariance. [H]"""
+    law, theta = solution.candidate.law, solution.law_theta
+    quats, d = law.poses(theta, tau)
+    step = 1e-5
+    moved_quats, moved = law.poses(theta + step * np.eye(len(theta)), tau)
+    turns = rotations.quats_to_rotvecs(rotations.multiply(moved_quats, rotations.conjugate(quats)))
+    slopes = np.concatenate([moved - d, turns], axis=-1) / step  # [P', H, 6]
+    covariance = solution.law_slopes @ solution.inverse @ solution.law_slopes.T
+    spread = evidence.variance * np.einsum("phc,pq,qhc->hc", slopes, covariance, slopes)
+    return np.maximum(spread[:, :3].sum(-1), 0.0), np.clip(spread[:, 3:].sum(-1), 0.0, math.pi**2)
+
+
+def _spread(
+    chosen: Solution, all_solutions: Sequence[Solution], evidence: Evidence, tau: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean squared distance of the near candidates' places and rotations from the chosen one's. [H]"""
+    scores = [evidence.score(s) for s in all_solutions]
+    best = min(scores)
+    weights = np.exp(-(np.array(scores) - best) / _SOFT)
+    weights = np.where(weights < math.exp(-6.0), 0.0, weights)
+    index = next(i for i, s in enumerate(all_solutions) if s is chosen)
+    weights[index] = max(weights[index], 0.5)
+    weights /= weights.sum()
+    quats, d = _poses(chosen, tau)
+    place, turn = np.zeros(len(tau)), np.zeros(len(tau))
+    for weight, other in zip(weights, all_solutions, strict=True):
+        if other is chosen or weight == 0:
+            continue
+        other_quats, other_d = _poses(other, tau)
+        angle = rotations.angle_between(other_quats, quats)
+        place += weight * np.minimum(((other_d - d) ** 2).sum(-1), _FARTHEST**2)
+        turn += weight * angle**2
+    return place, turn
+
+
+def _rolling(chosen: Solution, track: PoseTrack, noise: Noise, evidence: Evidence) -> float:
+    """Mean square of the chosen law's misses when it is refitted to earlier poses, in units of the noise; 1 to 9."""
+    count = len(track)
+    if chosen.candidate.placed or count < 8:
+        return 1.0
+    misses = []
+    for held in sorted({1, max(3, math.ceil(0.2 * count)), count // 3}):
+        if chosen.parameters > 4 * (count - held):
+            continue
+        earlier = families.solve(chosen.candidate, track.rows(slice(0, count - held)), noise, [chosen.theta], steps=8)
+        if earlier is None:
+            return _MOST_SCALE
+        late = families.residuals(chosen.candidate, earlier.theta, track.rows(slice(count - held, None)), noise)
+        misses.append(np.minimum((late**2).sum(-1), _MOST_SQUARE * evidence.variance))
+    if not misses:
+        return _MOST_SCALE
+    mean = float(np.concatenate(misses).mean()) / 6 / evidence.variance
+    return min(max(mean, 1.0), _MOST_SCALE)

@@ -1,0 +1,69 @@
+"""Evidence for candidate motions: one score for laws with and without breaks.
+
+The score B of a candidate is its Cauchy loss in units of the noise level s2 of the best candidate, divided by the
+inflation a for noise that is correlated in time, plus P log(N / a) for its P parameters, with N numbers in the track,
+and 2 log S if it chooses one of S poses. Differences of 10 are strong evidence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .candidates import Solution
+
+STRONG = 10.0  # difference of scores that a break needs, and within which the simplest law is taken
+_LEAST_LEVEL = 0.05
+_MOST_LAG = 0.8
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Noise level of a track, from all candidates together.
+
+    Attributes:
+        count: Number of poses S.
+        level: s2, variance of the scaled residuals.
+        inflation: a = (1 + rho) / (1 - rho) of noise with the correlation rho between neighbours.
+    """
+
+    count: int
+    level: float
+    inflation: float
+
+    @staticmethod
+    def of(solutions: Sequence[Solution]) -> Evidence:
+        """Noise level from solutions, of which one must be close to the truth."""
+        count = len(solutions[0].weights)
+        numbers = 6 * count
+        level = max(_LEAST_LEVEL, min(s.loss / max(numbers - s.parameters, 1) for s in solutions))
+        best = min(solutions, key=lambda s: s.loss / level + s.parameters * math.log(numbers))
+        rho = min(max(_lag(best) + (best.parameters / 6 + 1) / count, 0.0), _MOST_LAG)
+        return Evidence(count, level, (1 + rho) / (1 - rho))
+
+    @property
+    def variance(self) -> float:
+        """Factor of the parameters' covariance, s2 a."""
+        return self.level * self.inflation
+
+    def score(self, solution: Solution) -> float:
+        """B of a candidate; less is better."""
+        penalty = solution.parameters * math.log(6 * self.count / self.inflation)
+        return solution.loss / self.variance + penalty + 2 * solution.candidate.placed * math.log(self.count)
+
+
+def _lag(solution: Solution) -> float:
+    """Correlation between neighbouring residuals, weighted robustly."""
+    values = np.sqrt(solution.robust)[:, None] * solution.residuals
+    energy = float((values**2).sum())
+    return float((values[1:] * values[:-1]).sum()) / energy if energy > 0 else 0.0
+
+
+def simplest(solutions: Sequence[Solution], evidence: Evidence) -> Solution:
+    """Solution with the fewest parameters among those with scores near the best; among equals, that of the best."""
+    best = min(evidence.score(s) for s in solutions)
+    near = [s for s in solutions if evidence.score(s) <= best + STRONG]
+    return min(near, key=lambda s: (s.parameters, evidence.score(s)))
