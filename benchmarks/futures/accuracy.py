@@ -85,7 +85,7 @@ def measure(name: str, noise: simulated.Noise, seed: int) -> dict[str, Any]:
         "still": still(track),
         "inside": float((error <= half).mean()),
         "width": float(half[-1]),
-        "flagged": getattr(fit, "predictable_until", None) is not None,
+        "flagged": getattr(fit, "predictable_until", None) is not None and fit.predictable_until < tau[-1],
         "event": bool(found),
         "near": near if times else None,
         "recalled": near if times and track.motion.jump > 5 * sigma else None,

@@ -255,15 +255,17 @@ def bounces(rng: np.random.Generator) -> Motion:
     speed = g * rng.uniform(0.25, 0.4) / 2
     across, w = np.array([*(0.6 * rng.normal(size=2)), 0.0]), 1.5 * rng.normal(size=3)
     hits, speeds = [first], [speed]
-    while hits[-1] < 1.5:
+    while hits[-1] < 1.5 and len(hits) < 60:
         hits.append(hits[-1] + 2 * speeds[-1] / g)
         speeds.append(keep * speeds[-1])
 
     def path(t: np.ndarray) -> Poses:
         k = np.searchsorted(hits, t, side="right") - 1
         since = t - np.array(hits)[np.maximum(k, 0)]
-        up = np.where(k < 0, -speed / keep, np.array(speeds)[np.maximum(k, 0)])
-        return across * t[:, None] + (up * since - 0.5 * g * since**2)[:, None] * UP, _turned(w * t[:, None])
+        up = np.where(k < 0, speed / keep, np.array(speeds)[np.maximum(k, 0)])
+        since = np.where(k < 0, t - first + 2 * up / g, since)
+        high = np.where(k == len(hits) - 1, 0.0, up * since - 0.5 * g * since**2)
+        return across * t[:, None] + high[:, None] * UP, _turned(w * t[:, None])
 
     seen = tuple(hit for hit in hits if hit < T_MAX)
     return Motion(path, seen, speed * (1 + 1 / keep))
