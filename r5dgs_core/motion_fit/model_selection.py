@@ -180,8 +180,9 @@ def _select(track: PoseTrack, family: tuple[Candidate, ...], least: Noise, break
         if finer.place > 0.9 * level.place and finer.turn > 0.9 * level.turn:
             break
         level = finer
+        gaps_matter = _best(found, broken).candidate.placed
         found = [_again(s, track, level) for s in found]
-        broken = kinks.search(track, level) if broken else []
+        broken = kinks.search(track, level) if gaps_matter else [_again(s, track, level) for s in broken]
     evidence = Evidence.of((*found, *broken))
     laws = [s for s in found if _determined(s, evidence)] or found[:1]
     chosen = evidences.simplest(laws, evidence)
@@ -201,9 +202,15 @@ def _again(solution: Solution, track: PoseTrack, level: Noise, enough: float | N
     return families.solve(solution.candidate, track, level, [solution.theta], **options) or solution
 
 
+def _best(*groups: Sequence[Solution]) -> Solution:
+    """Solution with the least loss per degree of freedom."""
+    every = [s for group in groups for s in group]
+    return min(every, key=lambda s: s.loss / max(s.residuals.size - s.parameters, 1))
+
+
 def _shares(solutions: Sequence[Solution]) -> tuple[float, float]:
     """Variances of the place and turn residuals of the best solution, in units of the noise."""
-    best = min(solutions, key=lambda s: s.loss / max(s.residuals.size - s.parameters, 1))
+    best = _best(solutions)
     weights = (best.weights * best.robust)[:, None]
     free = max(1 - best.parameters / best.residuals.size, 0.1)
     means = (weights * best.residuals**2).sum(0) / (weights.sum() * free)

@@ -153,7 +153,9 @@ def pairs(track: PoseTrack, window: Window, clocks: Clocks) -> list[Guess]:
     ones = np.ones((len(i), len(track), 1))
     both = np.concatenate([ones, columns[i], columns[j]], -1)
     path = np.concatenate([track.displacements, track.turned - track.turned[-1]], -1)
-    fits = np.linalg.pinv(both) @ path
+    normal = both.swapaxes(1, 2) @ both
+    normal += _RIDGE**2 * np.eye(5) * np.einsum("kii->k", normal)[:, None, None]
+    fits = np.linalg.solve(normal, both.swapaxes(1, 2) @ path)
     misses = ((both @ fits - path) ** 2).sum((-1, -2))
     single = np.concatenate([ones[:_PAIRED], columns], -1)
     alone = float(((single @ (np.linalg.pinv(single) @ path) - path) ** 2).sum((-1, -2)).min())
