@@ -72,9 +72,11 @@ def measure(name: str, noise: simulated.Noise, seed: int) -> dict[str, Any]:
     tau = track.later - track.times[-1]
     quats, moved = models.evaluate(fit.model, tau)
     error = simulated.errors(track.places[-1] + moved, _turns(quats) * track.turns[-1], track)
-    half = 50 / simulated.RADIUS * np.interp(tau, fit.band_tau, fit.band)
+    band = fit.history.band
+    assert band is not None
+    half = 50 / simulated.RADIUS * band.widths(track.later)
     step = track.times[1] - track.times[0]
-    found = [event.time for event in getattr(fit, "events", ())]
+    found = [event.time for event in fit.history.events]
     times = [event for event in track.motion.events if event < track.times[-1]]
     last = max(times, default=None)
     near = last is not None and any(abs(event - last) <= step for event in found)
@@ -85,7 +87,7 @@ def measure(name: str, noise: simulated.Noise, seed: int) -> dict[str, Any]:
         "still": still(track),
         "inside": float((error <= half).mean()),
         "width": float(half[-1]),
-        "flagged": getattr(fit, "predictable_until", None) is not None and fit.predictable_until < tau[-1],
+        "flagged": band.predictable_until is not None and band.predictable_until < track.later[-1],
         "event": bool(found),
         "near": near if times else None,
         "recalled": near if times and track.motion.jump > 5 * sigma else None,

@@ -131,14 +131,14 @@ def simplify(
         travel = float(np.linalg.norm(bound.tracks.poses[g.id, :, 4:], axis=1).max()) / (2 * g.model.radius)
         found = [_row(part, part in dropped, losses.get(id(part)), said, travel) for part in mine]
         rows += [{"object": names[g.object_id], **row} for row in found]
-    models = falling_bodies.share_gravity(fits, scene.world_convention)
+    models, histories = falling_bodies.share_gravity(fits, scene.world_convention)
     groups = list(bound.groups)
     for part in parts:  # a model fitted without noise starts at the bind state
         if part.noise and part.group in models:
             offset = "offset_rotvec" if part.name == "rotation" else "offset_displacement"
             models[part.group] = dataclasses.replace(models[part.group], **{offset: np.zeros(3)})
     for index, model in models.items():
-        groups[index] = dataclasses.replace(groups[index], model=model)
+        groups[index] = dataclasses.replace(groups[index], model=model, history=histories[index])
     return Simplified(dataclasses.replace(bound, groups=tuple(groups)), tuple(rows))
 
 
@@ -287,7 +287,9 @@ def _said(fit: model_selection.Fit | None) -> str:
     """Description of a body's motion past t_max."""
     if fit is None:
         return "static"
-    return f"came to rest, {fit.chosen}" if fit.rested else fit.chosen
+    said = f"came to rest, {fit.chosen}" if fit.rested else fit.chosen
+    more = fit.history.text()
+    return f"{said}; {more}" if more else said
 
 
 _SPREADS = {

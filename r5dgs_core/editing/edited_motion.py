@@ -221,11 +221,14 @@ def _go_on(
         for model in (*given, source.model):
             turned = _turned_model(model, course.parent)
             if shown(*models.evaluate(turned, later)):
-                return replace(source, **known, model=turned), course.same and turned == source.model
+                band = source.history if model is source.model else replace(source.history, band=None)
+                history = band if (course.parent == np.eye(3)).all() else band.transformed(*_turn_of(course.parent))
+                return replace(source, **known, model=turned, history=history), course.same and turned == source.model
     model, error = fit_drawn_curve.fit(later, quats, moves, course.reach, course.allowed)
     if error > 10 * course.allowed:
         notes.append(
             f"{first.name}: no motion model matches its curves past t_max; the nearest one deviates by up to "
             f"{error:.3g}"
         )
-    return replace(source, **known, model=model, follows=None, follow_matrix=None), False
+    history = replace(source.history, band=None)
+    return replace(source, **known, model=model, follows=None, follow_matrix=None, history=history), False

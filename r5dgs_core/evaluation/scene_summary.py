@@ -23,6 +23,8 @@ def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
             words.append("still")
         else:
             words.append(KINDS[group.model.kind].word)
+        if history := group.history.text():
+            words[-1] += f"; {history}"
     return ", ".join(dict.fromkeys(words)) or "pinned"
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..motion import rotations, se3
+from ..motion.history import MOST_KNOTS, Band
 from ..motion.pose_track import PoseTrack
 from . import candidates as families
 from .candidates import Noise, Solution
@@ -20,7 +21,6 @@ from .evidence import Evidence
 from .fitted_motion import FADE_PER_SPAN
 
 LEVEL = 0.95
-KNOTS = 16
 WIDE = 0.4  # half width from which a motion is not predictable, in radii: a fifth of the body's size
 _MULTIPLE = 1.6  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
 _WARNING = 2.0  # the same for the warning
@@ -29,34 +29,15 @@ _FARTHEST = 8.0  # radii; largest counted distance of another candidate
 _MOST_SQUARE, _MOST_SCALE = 600.0, 9.0  # limits of the misses of rolling origins
 
 
-@dataclass(frozen=True)
-class Band:
-    """Confidence band at times past t_max.
-
-    Attributes:
-        tau: Times since t_max, units of time. [H]
-        half_width: Half width of the position of a point of the body, world units. [H]
-        half_angle: Half width of the rotation, rad. [H]
-        trusted: Time since t_max up to which the motion is predictable; infinite if up to the last one.
-    """
-
-    tau: np.ndarray
-    half_width: np.ndarray
-    half_angle: np.ndarray
-    trusted: float
-
-
 def of(
     chosen: Solution,
     all_solutions: Sequence[Solution],
     evidence: Evidence,
     track: PoseTrack,
     noise: Noise,
-    radius: float,
-    span: float,
-) -> Band:
+) -> Widths:
     """Band of a chosen solution, up to one observed span past t_max."""
-    tau = np.linspace(0.0, 1.0, KNOTS)
+    tau = np.linspace(0.0, 1.0, MOST_KNOTS)
     place, turn = _variance(chosen, evidence, tau)
     place2, turn2 = _spread(chosen, all_solutions, evidence, tau)
     fading = np.exp(-2 * tau / FADE_PER_SPAN)  # of the bind state, which is a noisy pose
@@ -68,12 +49,35 @@ def of(
 
     warning = _WARNING * width(_rolling(chosen, track, noise, evidence))
     wide = np.flatnonzero(warning > WIDE)
-    return Band(
-        tau * span,
-        _MULTIPLE * radius * width(1.0),
-        _MULTIPLE * np.sqrt((turn + turn2 + turn_noise) / 3) * math.sqrt(3),
-        _crossing(tau, warning, int(wide[0])) * span if len(wide) else math.inf,
-    )
+    trusted = _crossing(tau, warning, int(wide[0])) if len(wide) else None
+    return Widths(tau, _MULTIPLE * width(1.0), _MULTIPLE * np.sqrt(turn + turn2 + turn_noise), trusted)
+
+
+@dataclass(frozen=True)
+class Widths:
+    """Confidence band in radii and spans.
+
+    Attributes:
+        tau: Times since t_max. [H]
+        half_width: Half width of the place of a point of the body. [H]
+        half_angle: Half width of the rotation, rad. [H]
+        trusted: Time since t_max up to which the motion is predictable; None if up to the last one.
+    """
+
+    tau: np.ndarray
+    half_width: np.ndarray
+    half_angle: np.ndarray
+    trusted: float | None
+
+    def scaled(self, t_max: float, radius: float, span: float) -> Band:
+        """Band in scene times and world units."""
+        return Band(
+            tuple((t_max + span * self.tau).tolist()),
+            tuple((radius * self.half_width).tolist()),
+            tuple(np.minimum(self.half_angle, math.pi).tolist()),
+            LEVEL,
+            None if self.trusted is None else t_max + span * self.trusted,
+        )
 
 
 def _crossing(tau: np.ndarray, values: np.ndarray, row: int) -> float:

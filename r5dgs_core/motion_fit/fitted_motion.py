@@ -5,11 +5,10 @@ Notation: P parameters, S poses.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ..motion import models, rotations
+from ..motion.history import Event, Segment
 from ..motion.models import base
 from .candidates import Candidate, Solution
 from .evidence import Evidence
@@ -65,37 +64,6 @@ def _fields(law: Candidate, theta: np.ndarray, radius: float, span: float) -> di
     return found
 
 
-@dataclass(frozen=True)
-class Event:
-    """A change of the motion in the observed window.
-
-    Attributes:
-        time: Time of the data set.
-        kind: "start", "stop", "impact" or "change".
-        sigma: Standard deviation of the time.
-    """
-
-    time: float
-    kind: str
-    sigma: float
-
-
-@dataclass(frozen=True)
-class Segment:
-    """Motion between two events.
-
-    Attributes:
-        start, stop: Its times.
-        kind: Kind of the law, "static" for rest.
-        parameters: Velocity, acceleration and angular velocity at its end, world units and units of time.
-    """
-
-    start: float
-    stop: float
-    kind: str
-    parameters: dict[str, list[float]]
-
-
 def events(solution: Solution, evidence: Evidence, t_max: float, span: float) -> tuple[Event, ...]:
     """Events of a solution in the observed window, in order."""
     found = solution.candidate.events(solution.theta)
@@ -135,5 +103,5 @@ def segments(
         kind = "static" if rests else solution.candidate.law.kind
         if not rests and kind == "static":  # a body that stopped
             kind = "ballistic_spin"
-        result.append(Segment(start, stop, kind, {name: value.tolist() for name, value in rates.items()}))
+        result.append(Segment(start, stop, kind, {name: tuple(value.tolist()) for name, value in rates.items()}))
     return tuple(result)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..motion import free_top, models, rotations
+from ..motion.history import NONE, History
 from ..motion.pose_track import PoseTrack
 from . import band as bands
 from . import candidates as families
@@ -22,7 +23,6 @@ from . import evidence as evidences
 from . import fitted_motion, kinks, noise
 from .candidates import Candidate, Noise, Solution
 from .evidence import Evidence
-from .fitted_motion import Event, Segment
 
 HELD_OUT = 0.2  # share of the last poses in tests of shadows
 FREQUENCY_ERROR = 0.25  # largest relative standard deviation of a determined frequency
@@ -63,12 +63,7 @@ class Fit:
         rested: True if the body has come to rest, in which case `chosen` is "static".
         sigma_t: Noise of the displacements, per component, world units.
         sigma_r: Noise of the rotations, per component, rad.
-        band_tau: Times past t_max of `band`. [H]
-        band: Half width of the 95 % band of the position of a point of the body, world units. [H]
-        band_angle: The same of its rotation, rad. [H]
-        events: Changes of the motion in the observed window.
-        segments: The motion between them; empty without events.
-        predictable_until: Time past t_max from which the motion is not predictable; None if it is in all of `band_tau`.
+        history: Events and segments in the observed window, and the confidence band past t_max.
     """
 
     model: models.MotionModel
@@ -77,12 +72,7 @@ class Fit:
     rested: bool
     sigma_t: float
     sigma_r: float
-    band_tau: np.ndarray
-    band: np.ndarray
-    band_angle: np.ndarray
-    events: tuple[Event, ...] = ()
-    segments: tuple[Segment, ...] = ()
-    predictable_until: float | None = None
+    history: History = NONE
 
 
 def fit(
@@ -252,7 +242,7 @@ def _result(selected: _Selected, family: tuple[Candidate, ...], t_max: float, ra
     model = fitted_motion.to_model(chosen, evidence, radius, span)
     found = fitted_motion.events(chosen, evidence, t_max, span)
     first = t_max + span * float(selected.track.tau[0])
-    band = bands.of(chosen, selected.solutions, evidence, selected.track, level, radius, span)
+    band = bands.of(chosen, selected.solutions, evidence, selected.track, level).scaled(t_max, radius, span)
     name = chosen.candidate.law.name
     rests = bool(found) and found[-1].kind == "stop"
     by_name = {s.candidate.name: s for s in selected.solutions}
@@ -270,12 +260,7 @@ def _result(selected: _Selected, family: tuple[Candidate, ...], t_max: float, ra
         rested=rests,
         sigma_t=scale * level.place * radius,
         sigma_r=scale * level.turn,
-        band_tau=band.tau,
-        band=band.half_width,
-        band_angle=band.half_angle,
-        events=found,
-        segments=fitted_motion.segments(chosen, found, first, t_max, radius, span),
-        predictable_until=band.trusted if math.isfinite(band.trusted) else None,
+        history=History(found, fitted_motion.segments(chosen, found, first, t_max, radius, span), band),
     )
 
 
@@ -305,4 +290,4 @@ def _named(name: str, inertia: np.ndarray | None) -> Candidate:
 def _static(radius: float) -> Fit:
     model = models.MotionModel(radius=radius)
     scores = (Score("static", 6, math.nan, math.nan),)
-    return Fit(model, scores, "static", False, 0.0, 0.0, np.zeros(1), np.zeros(1), np.zeros(1))
+    return Fit(model, scores, "static", False, 0.0, 0.0)

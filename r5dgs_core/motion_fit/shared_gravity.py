@@ -59,7 +59,7 @@ def share(
         if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
             raise ValueError(f"up: expected a direction, got {up!r}")
         basis = up[:, None] / np.linalg.norm(up)
-    found = {i: _acceleration(fit) for i, fit in enumerate(fits) if fit.chosen in FALLING and not fit.rested}
+    found = {i: _acceleration(fit) for i, fit in enumerate(fits) if fit.chosen in FALLING and not fit.history.events}
     if up is not None:
         found = {i: (a, cov) for i, (a, cov) in found.items() if _apart(a, cov, *_mean([(a, cov)], basis)) < AGREE}
     agreeing = _largest_agreeing(found)
@@ -127,7 +127,10 @@ def _refit(
     spread = again.model.covariance.copy()
     spread[np.ix_(rows, rows)] = covariance
     model = dataclasses.replace(again.model, acceleration=acceleration, covariance=spread)
-    late = again.band_tau**4 * float(np.trace(covariance))  # (2 sigma)^2 of the displacement a tau^2 / 2
-    return dataclasses.replace(
-        again, model=model, scores=fit.scores, chosen=fit.chosen, band=np.sqrt(again.band**2 + late)
-    )
+    band = again.history.band
+    if band is not None:
+        late = (np.array(band.times) - track.times[-1]) ** 4 * float(np.trace(covariance))  # (2 sigma)^2 of a tau^2 / 2
+        widths = np.sqrt(np.array(band.half_width) ** 2 + late)
+        band = dataclasses.replace(band, half_width=tuple(widths.tolist()))
+    history = dataclasses.replace(again.history, band=band)
+    return dataclasses.replace(again, model=model, scores=fit.scores, chosen=fit.chosen, history=history)

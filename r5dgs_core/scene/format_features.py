@@ -5,7 +5,7 @@
     "features": [{"name": "origin", "required": true, "since": "0.2.0"}]
 
 A reader rejects a file with a required feature that it does not support, and skips an optional one. Names reserved for
-later releases: events, parts, hulls, trajectory, quantised.
+later releases: parts, hulls, trajectory, quantised.
 """
 
 from __future__ import annotations
@@ -39,19 +39,30 @@ class Feature:
 
 
 ORIGIN = Feature("origin", required=True, since="0.2.0")
-_KNOWN_NAMES = {ORIGIN.name}
+MOTIONS = Feature("motions", required=True, since="0.2.0")
+EVENTS = Feature("events", required=False, since="0.2.0")
+_KNOWN_NAMES = {ORIGIN.name, MOTIONS.name, EVENTS.name}
+
+
+def _used(scene: Scene) -> list[Feature]:
+    """Features that a scene needs."""
+    found = [ORIGIN] if scene.origin.any() else []
+    found += [MOTIONS] if any(not group.model.is_basic for group in scene.groups) else []
+    return found + ([EVENTS] if any(group.history.events for group in scene.groups) else [])
 
 
 def version(scene: Scene) -> int:
     """Lowest format version that can store a scene."""
-    return 2 if scene.origin.any() else 1
+    return 2 if _used(scene) else 1
 
 
 def dump(scene: Scene) -> dict[str, Any]:
     """Features of a scene and their entries in ``scene.json``; empty if version 1 suffices."""
-    if version(scene) == 1:
+    used = _used(scene)
+    if not used:
         return {}
-    return {"features": [asdict(ORIGIN)], "origin": scene.origin.tolist()}
+    origin = {"origin": scene.origin.tolist()} if ORIGIN in used else {}
+    return {"features": [asdict(feature) for feature in used], **origin}
 
 
 def fields(top: scene_json.Row) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ..motion import history
 from ..motion.models import MotionModel
 from .cameras import Camera
 from .lookup_table import Table
@@ -90,6 +91,7 @@ class MotionGroup:
         rigid_max: The same as a maximum.
         seen: First and last time at which masks localised the object; before them, the track is extrapolated or holds
             its first pose. None if never observed.
+        history: Events in the observed time, and the confidence band of the motion past t_max.
     """
 
     id: int
@@ -103,6 +105,7 @@ class MotionGroup:
     rigid_rms: float = 0.0
     rigid_max: float = 0.0
     seen: tuple[float, float] | None = None
+    history: history.History = history.NONE
 
 
 @dataclass(frozen=True)

@@ -64,6 +64,15 @@ _MODEL_LIMITS = {
     "fade_time": MOST_TIME,
     "radius": cameras.FARTHEST,
     "frequency": _SPIN,
+    "damping": _SPIN,
+    "stop_time": MOST_TIME,
+    "bounce_time": MOST_TIME,
+    "precession": _SPIN,
+    "second_velocity": cameras.FARTHEST,
+    "second_acceleration": cameras.FARTHEST,
+    "second_angular_velocity": _SPIN,
+    "second_angular_acceleration": _SPIN,
+    "second_frequency": _SPIN,
 }
 _MOST_ID = np.iinfo(np.int32).max
 _CONVERTED = ("background_sh", "identities", *EMBEDDINGS)  # any float dtype in memory; converted on writing

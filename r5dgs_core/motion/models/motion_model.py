@@ -48,6 +48,7 @@ SCALARS = {
 }
 """Numbers >= 0, with the power of their unit per time; stored only if they are not zero."""
 VECTORS = {**RATES, "offset_rotvec": Unit(False, 0), "offset_displacement": Unit(True, 0), **EXTRA_RATES}
+_BASIC_KINDS = ("static", "translation", "ballistic_spin", "constant_twist", "world_twist", "free_top")
 _RATE_NAMES = (*(f"{name}.{axis}" for name in VECTORS for axis in "xyz"), *SCALARS)
 
 
@@ -197,6 +198,12 @@ class MotionModel:
         """True if `evaluate` returns the identity at every time."""
         offset = self.offset_rotvec.any() or self.offset_displacement.any()
         return not (offset or KINDS[self.kind].moves(self))
+
+    @property
+    def is_basic(self) -> bool:
+        """True if R5DGS 0.1.0 knows the kind and all of its rates."""
+        added = (*EXTRA_RATES, *(name for name in SCALARS if name != "frequency"))
+        return self.kind in _BASIC_KINDS and not any(np.any(getattr(self, name)) for name in added)
 
     @property
     def turns(self) -> bool:

@@ -1,0 +1,121 @@
+"""Observed events of a body and the confidence in its prediction, in times and units of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+EVENTS = ("start", "stop", "impact", "change")
+MOST_KNOTS = 16
+_RATES = {"velocity": True, "acceleration": True, "angular_velocity": False}  # name: it scales with the scene
+_DONE = {"start": "set off", "stop": "stopped", "impact": "hit", "change": "changed"}
+
+
+@dataclass(frozen=True)
+class Event:
+    """A change of the motion in the observed window.
+
+    Attributes:
+        time: Scene time.
+        kind: One of `EVENTS`.
+        sigma: Standard deviation of the time, >= 0.
+    """
+
+    time: float
+    kind: str
+    sigma: float
+
+    def text(self) -> str:
+        """Event in words, such as "hit at 0.55"."""
+        return f"{_DONE[self.kind]} at {self.time:.2f}"
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Motion between two events.
+
+    Attributes:
+        start, stop: Scene times.
+        kind: Kind of the motion, "static" for rest.
+        parameters: "velocity", "acceleration" and "angular_velocity" at its end, world frame. [3] each
+    """
+
+    start: float
+    stop: float
+    kind: str
+    parameters: Mapping[str, tuple[float, ...]]
+
+    def transformed(self, turn: np.ndarray, scale: float) -> Segment:
+        """Segment after a similarity of the world, see `MotionModel.transformed`."""
+        found = {
+            name: tuple(((scale if _RATES[name] else 1.0) * turn @ np.array(value)).tolist())
+            for name, value in self.parameters.items()
+        }
+        return replace(self, parameters=found)
+
+
+@dataclass(frozen=True)
+class Band:
+    """Confidence band of the motion past t_max, at most `MOST_KNOTS` knots; linear in between.
+
+    Attributes:
+        times: Scene times, increasing, the first is t_max. [H]
+        half_width: Half width of the place of a point of the body, world units. [H]
+        half_angle: Half width of the rotation, rad. [H]
+        level: Probability that the truth lies inside.
+        predictable_until: Scene time after which the motion is not predictable; None if it is up to the last knot.
+    """
+
+    times: tuple[float, ...]
+    half_width: tuple[float, ...]
+    half_angle: tuple[float, ...]
+    level: float = 0.95
+    predictable_until: float | None = None
+
+    def widths(self, times: np.ndarray) -> np.ndarray:
+        """Half widths of the place at scene times; constant after the last knot. [H]"""
+        return np.interp(times, self.times, self.half_width)
+
+    def angles(self, times: np.ndarray) -> np.ndarray:
+        """Half widths of the rotation at scene times. [H]"""
+        return np.interp(times, self.times, self.half_angle)
+
+
+@dataclass(frozen=True)
+class History:
+    """What the observed poses tell about a motion besides its model.
+
+    Attributes:
+        events: Changes of the motion, in order.
+        segments: Motion between them, one more than events; empty without events.
+        band: Confidence band, or None if it is unknown.
+    """
+
+    events: tuple[Event, ...] = field(default=())
+    segments: tuple[Segment, ...] = field(default=())
+    band: Band | None = None
+
+    def transformed(self, turn: np.ndarray, scale: float) -> History:
+        """History after a similarity of the world, see `MotionModel.transformed`."""
+        band = self.band
+        if band is not None:
+            band = replace(band, half_width=tuple(abs(scale) * width for width in band.half_width))
+        return replace(self, segments=tuple(s.transformed(turn, scale) for s in self.segments), band=band)
+
+    def warning(self) -> str:
+        """Reason to distrust the prediction, such as "not predictable past 0.85 (hit at 0.55)", or ""."""
+        if self.band is None or self.band.predictable_until is None:
+            return ""
+        last = f" ({self.events[-1].text()})" if self.events else ""
+        return f"not predictable past {self.band.predictable_until:.2f}{last}"
+
+    def text(self) -> str:
+        """Events and warning in words, or ""."""
+        warning = self.warning()
+        words = [event.text() for event in (self.events[:-1] if warning else self.events)]
+        return ", ".join([*words, *([warning] if warning else [])])
+
+
+NONE = History()
