@@ -80,7 +80,7 @@ def _training(run: checkpoint.Run) -> str:
 
 
 def _objects(scene: Scene, dataset: Dataset) -> list[dict[str, Any]]:
-    """Errors of poses at the last time, in diameters and degrees, and the share of errors outside the 2-sigma band."""
+    """Errors of poses at the last time, in diameters and degrees, and the share of errors outside the 95 % band."""
     rows, _ = pose_task.measure(scene, dataset.ground_truth, 1, "cpu")
     rows = [row for row in rows if row.error_kind in ("position", "rotation", "outside_band")]
     return [{"mode": row.mode, "method": row.method, "kind": row.error_kind, "error": row.error} for row in rows]

@@ -113,7 +113,7 @@ def _of_models(
     for name, some in found.items():
         predicted = np.stack([_model_motion(b, m, taus) for b, m in zip(bodies, sets[name], strict=True)])
         count = counts.get(name)
-        setting = "held-out error, rest test" if count is None else f"chosen for {count} of {len(bodies)}"
+        setting = "evidence, breaks" if count is None else f"chosen for {count} of {len(bodies)}"
         rested = sum(fit is not None and fit.rested for fit in some.fits)
         notes = [f"{rested} found at rest"] if rested else []
         notes += [f"{STEADY[name]} where nothing swings"] if name in STEADY else []
@@ -221,33 +221,34 @@ def _errors(
 def _band(
     bodies: tuple[ground_truth_poses.Body, ...], chosen: _Fitted, times: np.ndarray, taus: np.ndarray
 ) -> tuple[list[Row], list[str]]:
-    """Return the share of errors outside two standard deviations, over bodies and times within reach of the band.
+    """Return the share of errors outside the 95 % band, over bodies and times within reach of the band.
 
     The error of a body is the RMS over a sphere of its radius: |dd|^2 + 2/3 (dtheta radius)^2. If the images do not
     determine the rotation of the body, it is the position error.
     """
     inside, count, widths = 0, 0, []
     for body, fit in zip(bodies, chosen.fits, strict=True):
-        if fit is None or len(fit.band_tau) == 0:
+        band = None if fit is None else fit.history.band
+        if fit is None or band is None:
             continue
-        reached = taus <= fit.band_tau[-1] + _SAME
+        reached = times <= band.times[-1] + _SAME
         truth = body.motion[np.isin(body.times, times)]
         distances, angles = metrics.pose_errors(_model_motion(body, fit.model, taus), truth, body.group.pivot)
         if not body.turn_seen:  # then neither its rotation nor the pivot's place in the true body is known
             places = body.group.pivot + models.evaluate(fit.model, taus)[1]
             distances, angles = np.linalg.norm(places - body.path[np.isin(body.times, times)], axis=-1), 0.0 * angles
         errors = np.sqrt(distances**2 + 2 / 3 * (np.radians(angles) * fit.model.radius) ** 2)
-        band = np.interp(taus, fit.band_tau, fit.band)
-        inside += int((errors <= band)[reached].sum())
+        half = band.widths(times)
+        inside += int((errors <= half)[reached].sum())
         count += int(reached.sum())
-        widths.append(float(band[reached][-1]) / body.size if reached.any() else np.nan)
+        widths.append(float(half[reached][-1]) / body.size if reached.any() else np.nan)
     if count == 0:
         return [], ["poses: no body has a confidence band that reaches the times of the truth"]
     width = f"; median half width at the last time {np.nanmedian(widths):.3g} of the size"
     row = Row(
         task="poses",
         mode="rigid/fitted",
-        method="2-sigma band",
+        method="95 % band",
         setting="chosen of the family",
         error_kind="outside_band",
         error=1 - inside / count,

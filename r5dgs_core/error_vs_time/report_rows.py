@@ -36,7 +36,7 @@ class Kind:
 KINDS = {
     "position": Kind("position error, share of the object's size"),
     "rotation": Kind("rotation error, degrees"),
-    "outside_band": Kind("share of true errors outside the 2-sigma band"),
+    "outside_band": Kind("share of true errors outside the 95 % band"),
     "psnr": Kind("PSNR, dB", more_is_better=True),
     "psnr_objects": Kind("PSNR on object pixels, dB", more_is_better=True),
     "ssim": Kind("SSIM", more_is_better=True),

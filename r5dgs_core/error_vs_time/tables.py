@@ -23,7 +23,7 @@ _TITLES = {
 _HEADS = {
     "position": "position, % of size",
     "rotation": "rotation, deg",
-    "outside_band": "outside 2-sigma band, %",
+    "outside_band": "outside the 95 % band, %",
     "psnr": "PSNR, dB",
     "psnr_objects": "PSNR objects, dB",
     "ssim": "SSIM",

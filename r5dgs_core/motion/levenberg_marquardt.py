@@ -26,6 +26,7 @@ class Solution:
     Attributes:
         x: Parameters. [B, P]
         residuals: Residuals without weights. [B, S, D]
+        robust: Robust weights of the observations, in (0, 1]; 1 for least squares. [B, S]
         normal: Normal matrix J^T W J of the weighted residuals plus the precision of the prior. [B, P, P]
         gradient: Gradient of half the cost. [B, P]
         cost: Weighted sum of squared residuals, or of their Cauchy losses, plus the cost of the prior. [B]
@@ -33,6 +34,7 @@ class Solution:
 
     x: np.ndarray
     residuals: np.ndarray
+    robust: np.ndarray
     normal: np.ndarray
     gradient: np.ndarray
     cost: np.ndarray
@@ -139,6 +141,7 @@ class _Problem:
         return Solution(
             x.copy(),
             values.copy(),
+            robust,
             normal=jacobian @ jacobian.swapaxes(1, 2) + np.diag(self.prior),
             gradient=(jacobian @ weighted)[..., 0] + self.prior * x,
             cost=(self.base * losses).sum(-1) + (self.prior * x**2).sum(-1),

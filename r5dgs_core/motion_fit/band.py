@@ -22,7 +22,7 @@ from .fitted_motion import FADE_PER_SPAN
 
 LEVEL = 0.95
 WIDE = 0.4  # half width from which a motion is not predictable, in radii: a fifth of the body's size
-_MULTIPLE = 1.6  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
+_MULTIPLE = 1.75  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
 _WARNING = 2.0  # the same for the warning
 _SOFT = 4.0  # difference of scores that reduces a candidate's weight by e
 _FARTHEST = 8.0  # radii; largest counted distance of another candidate

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import model_selection, rest_detection
+from . import model_selection, noise
 
 # Candidates with a free acceleration -> the same without it.
 FALLING = {"translation, quadratic": "translation", "ballistic + spin": "translation + spin"}
@@ -76,7 +76,7 @@ def _acceleration(fit: model_selection.Fit) -> tuple[np.ndarray, np.ndarray]:
     """Acceleration of a fit and its covariance. [3], [3, 3]"""
     assert fit.model.covariance is not None
     rows = [fit.model.covariance_names.index(f"acceleration.{axis}") for axis in "xyz"]
-    floor = (rest_detection.SIGMA_FLOOR * fit.model.radius) ** 2  # so that noise-free fits can agree
+    floor = (noise.FLOOR * fit.model.radius) ** 2  # so that noise-free fits can agree
     return fit.model.acceleration, fit.model.covariance[np.ix_(rows, rows)] + floor * np.eye(3)
 
 

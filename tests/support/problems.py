@@ -80,6 +80,68 @@ MOTIONS: dict[str, tuple[MotionModel, tuple[str, ...]]] = {
         MotionModel("translation", velocity=[0.3, 0.1, -0.9], acceleration=[0, 0.4, 6.0], frequency=8.0),
         ("spring",),
     ),
+    "damped spring": (
+        MotionModel("translation", velocity=[0.3, 0.1, -0.9], acceleration=[0, 0.4, 6.0], frequency=9.0, damping=1.5),
+        ("damped spring",),
+    ),
+    "damped pendulum": (
+        MotionModel(
+            "ballistic_spin",
+            angular_velocity=[0, 0.9, 0.3],
+            angular_acceleration=[0, -3.6, -1.2],
+            center_offset=[0.2, -0.2, 0.6],
+            frequency=9.0,
+            damping=1.2,
+        ),
+        ("damped pendulum",),
+    ),
+    "drag": (
+        MotionModel("drag", velocity=[0.4, 0.1, -0.2], angular_velocity=[0.5, -1, 0.3], damping=3.0),
+        ("drag",),
+    ),
+    "fall with drag": (
+        MotionModel(
+            "drag", velocity=[0.4, 0, -0.9], acceleration=[0, 0, -6], angular_velocity=[0.5, -1, 0.3], damping=2.5
+        ),
+        ("fall with drag",),
+    ),
+    "sliding friction": (
+        MotionModel("friction", velocity=[0.5, -0.2, 0.1], stop_time=0.4),
+        ("slide, friction",),
+    ),
+    "rolling friction": (
+        MotionModel("friction", velocity=[0.5, 0, 0], angular_velocity=[0, 1.7, 0], stop_time=0.6),
+        ("slide + turn, friction",),
+    ),
+    "precession": (
+        MotionModel("precession", angular_velocity=[0.5, 1.5, 6.0], precession=[0, 0, 3], center_offset=[0.1, 0, -0.4]),
+        ("precession",),
+    ),
+    "bounces": (
+        MotionModel(
+            "bounce",
+            velocity=[0.4, 0.3, -0.6],
+            acceleration=[0, 0, -14],
+            angular_velocity=[1, 0.5, -0.4],
+            bounce_time=0.11,
+            restitution=0.8,
+        ),
+        ("bounces",),
+    ),
+    "two oscillations": (
+        MotionModel(
+            "two_oscillations",
+            velocity=[1, 0.5, 0],
+            acceleration=[5, -20, 3],
+            frequency=9.0,
+            second_velocity=[-1, 2, 1],
+            second_acceleration=[0, 30, -20],
+            second_frequency=14.0,
+            angular_velocity=[0, 1, 1],
+            angular_acceleration=[0, -6, -6],
+        ),
+        ("two oscillations, rocking",),
+    ),
 }
 
 

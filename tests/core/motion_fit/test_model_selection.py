@@ -98,7 +98,7 @@ def test_a_tumbling_box_is_recovered_without_noise():
     fit = model_selection.fit(TIMES, quats, d, radius=RADIUS, inertia=inertia)
     assert fit.chosen == "free top"
     assert problems.error_percent(fit.model, problems.TUMBLING, HORIZON, last_quat, last).max() < 0.1
-    assert np.isfinite(fit.band).all() and (np.diff(fit.band) >= 0).all()
+    assert np.isfinite(fit.history.band.half_width).all()
 
 
 def test_the_inertia_changes_nothing_for_bodies_that_do_not_tumble():
@@ -236,9 +236,9 @@ def test_the_band_holds_the_true_error():
             )
             fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
             error = problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0]
-            inside.append(error <= 100 / SIZE * np.interp(HORIZON[0], fit.band_tau, fit.band))
+            inside.append(error <= 100 / SIZE * fit.history.band.widths(TIMES[-1] + HORIZON[0]))
     assert np.mean(inside) >= 0.9
-    assert (np.diff(fit.band) > 0).all()
+    assert fit.history.band.half_width[-1] > fit.history.band.half_width[4] > 0
 
 
 def test_the_band_is_wider_where_the_held_out_poses_surprised():
@@ -338,7 +338,8 @@ def test_poses_without_sense_give_finite_motions(count):
     times = np.sort(rng.uniform(size=count))
     quats = rotations.normalize(rng.normal(size=(count, 4)))
     fit = model_selection.fit(times, quats, rng.normal(size=(count, 3)), radius=RADIUS)
-    for values in (*models.evaluate(fit.model, np.array([0.0, 1.0, 100.0])), fit.band):
+    band = fit.history.band
+    for values in (*models.evaluate(fit.model, np.array([0.0, 1.0, 100.0])), band.half_width, band.half_angle):
         assert np.isfinite(values).all()
 
 
@@ -422,7 +423,7 @@ def test_over_many_seeds_the_band_holds_the_true_error(correlation):
             quats, d, last_quat, last = problems.observe(truth, TIMES, rng, *NOISE, correlation)
             fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
             error = problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0]
-            inside.append(error <= 100 / SIZE * np.interp(HORIZON[0], fit.band_tau, fit.band))
+            inside.append(error <= 100 / SIZE * fit.history.band.widths(TIMES[-1] + HORIZON[0]))
     assert np.mean(inside) >= 0.9
 
 
