@@ -279,6 +279,7 @@ def _fit(
         weights=track.weights,
         inertia=body,
         least_noise=(noise.get(False, 0.0), noise.get(True, 0.0)),
+        up=falling_bodies.UP.get(scene.world_convention),
     )
     return track, fit
 

@@ -89,13 +89,13 @@ def _crossing(tau: np.ndarray, values: np.ndarray, row: int) -> float:
 
 
 def _poses(solution: Solution, tau: np.ndarray) -> se3.Pose:
-    return solution.candidate.law.poses(solution.law_theta, tau)
+    return solution.candidate.law.path(solution.law_theta, tau)
 
 
 def _variance(solution: Solution, evidence: Evidence, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Variance of the place and of the rotation vector, summed over components, from the covariance. [H]"""
     law, theta = solution.candidate.law, solution.law_theta
-    quats, d = law.poses(theta, tau)
+    quats, d = law.path(theta, tau)
     step = 1e-5
     moved_quats, moved = law.poses(theta + step * np.eye(len(theta)), tau)
     turns = rotations.quats_to_rotvecs(rotations.multiply(moved_quats, rotations.conjugate(quats)))

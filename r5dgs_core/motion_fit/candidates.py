@@ -96,6 +96,11 @@ class Candidate:
         parts = {name: part[..., None, :] for name, part in self.parts(theta).items()}
         return models.KINDS[self.kind].observed(parts, tau, self.window, self.inertia)
 
+    def path(self, theta: np.ndarray, tau: np.ndarray) -> se3.Pose:
+        """Poses of one parameter vector. [P], [S] -> quaternions [S, 4], displacements [S, 3]"""
+        quats, displacements = self.poses(theta[None], tau)
+        return quats[0], displacements[0]
+
     def starts(self, track: PoseTrack) -> list[np.ndarray]:
         """First guesses; empty if the candidate cannot apply. [P] each"""
         guesses: list[Guess] = models.KINDS[self.kind].starts(self.blocks, track, self.window)

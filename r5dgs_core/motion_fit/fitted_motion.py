@@ -90,7 +90,7 @@ def segments(
     for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
         h = 0.02 * max(stop - start, 1e-9 * span)
         tau = (stop - t_max - h * np.array([2.1, 1.1, 0.1])) / span
-        quats, d = solution.candidate.poses(solution.theta, tau)
+        quats, d = solution.candidate.path(solution.theta, tau)
         d = d * radius
         turn = rotations.quats_to_rotvecs(rotations.multiply(quats[2], rotations.conjugate(quats[1])))
         rates = {

@@ -28,6 +28,7 @@ HELD_OUT = 0.2  # share of the last poses in tests of shadows
 FREQUENCY_ERROR = 0.25  # largest relative standard deviation of a determined frequency
 _FEW = 8  # poses below which breaks are not searched, and large candidates not tried
 _PER_POSE = 3  # parameters per pose of the largest candidate for few poses
+STEEP = 0.9  # cosine of the angle to the vertical below which a motion is vertical
 _ROUNDS = 3  # of the noise
 _TOO_LARGE = 0.4  # variance of the residuals below which the noise is estimated again
 _EXACT = 1e-4  # gain at which the selected candidate is final
@@ -85,6 +86,7 @@ def fit(
     candidates: Sequence[str] | None = None,
     inertia: np.ndarray | None = None,  # [3, 3]
     least_noise: tuple[float, float] = (0.0, 0.0),
+    up: np.ndarray | None = None,  # [3]
 ) -> Fit:
     """Fit all candidates to a pose track and select one.
 
@@ -99,6 +101,8 @@ def fit(
             not nearly that of a ball, the free top is a candidate. [3, 3]
         least_noise: Lower bounds of the noise of displacements (per component, world units) and rotations (rad), if
             more is known than the scatter about a smooth motion shows.
+        up: Upward direction, or None if unknown. A body that slows down on a vertical line falls back; on any other
+            line, and if ``up`` is None, friction may stop it. [3]
 
     Returns:
         The fit. With fewer than four poses of positive weight, at most a velocity and a spin; with one, static.
@@ -127,7 +131,7 @@ def fit(
         selected = _few(track, family)
     else:
         least = Noise(max(least_noise[0] / radius, noise.FLOOR), max(least_noise[1], noise.FLOOR))
-        selected = _select(track, family, least, breaks=candidates is None)
+        selected = _select(track, family, least, candidates is None, up)
     return _result(selected, family, float(times[-1]), radius, span)
 
 
@@ -152,7 +156,9 @@ class _Selected:
     before: tuple[tuple[Solution, Evidence], ...] = ()
 
 
-def _select(track: PoseTrack, family: tuple[Candidate, ...], least: Noise, breaks: bool) -> _Selected:
+def _select(
+    track: PoseTrack, family: tuple[Candidate, ...], least: Noise, breaks: bool, up: np.ndarray | None
+) -> _Selected:
     """Fit four or more poses, whose noise is at least ``least``."""
     level = noise.contrasts(track)
     level = Noise(max(level.place, least.place), max(level.turn, least.turn))
@@ -174,7 +180,7 @@ def _select(track: PoseTrack, family: tuple[Candidate, ...], least: Noise, break
         found = [_again(s, track, level) for s in found]
         broken = kinks.search(track, level) if gaps_matter else [_again(s, track, level) for s in broken]
     evidence = Evidence.of((*found, *broken))
-    laws = [s for s in found if _determined(s, evidence)] or found[:1]
+    laws = [s for s in found if _determined(s, evidence) and not _rises(s, up)] or found[:1]
     chosen = evidences.simplest(laws, evidence)
     if broken:
         best = min(broken, key=evidence.score)
@@ -223,6 +229,14 @@ def _determined(solution: Solution, evidence: Evidence) -> bool:
         if not (0.01 < share < 0.99 and sigma < FREQUENCY_ERROR * frequency):
             return False
     return True
+
+
+def _rises(solution: Solution, up: np.ndarray | None) -> bool:
+    """Return True for friction without spin on a vertical line, which is the way of a body thrown upwards."""
+    if up is None or solution.candidate.kind != "friction" or "w" in solution.candidate.blocks:
+        return False
+    v = solution.candidate.parts(solution.theta)["v"]
+    return bool(abs(v @ up) > STEEP * np.linalg.norm(v) * np.linalg.norm(up))
 
 
 def _few(track: PoseTrack, family: tuple[Candidate, ...]) -> _Selected:

@@ -106,7 +106,7 @@ MOTIONS: dict[str, tuple[MotionModel, tuple[str, ...]]] = {
         ("fall with drag",),
     ),
     "sliding friction": (
-        MotionModel("friction", velocity=[0.5, -0.2, 0.1], stop_time=0.4),
+        MotionModel("friction", velocity=[0.5, -0.2, 0.1], stop_time=0.45),
         ("slide, friction",),
     ),
     "rolling friction": (
@@ -116,17 +116,6 @@ MOTIONS: dict[str, tuple[MotionModel, tuple[str, ...]]] = {
     "precession": (
         MotionModel("precession", angular_velocity=[0.5, 1.5, 6.0], precession=[0, 0, 3], center_offset=[0.1, 0, -0.4]),
         ("precession",),
-    ),
-    "bounces": (
-        MotionModel(
-            "bounce",
-            velocity=[0.4, 0.3, -0.6],
-            acceleration=[0, 0, -14],
-            angular_velocity=[1, 0.5, -0.4],
-            bounce_time=0.11,
-            restitution=0.8,
-        ),
-        ("bounces",),
     ),
     "two oscillations": (
         MotionModel(
@@ -145,6 +134,16 @@ MOTIONS: dict[str, tuple[MotionModel, tuple[str, ...]]] = {
 }
 
 
+# A ball before its next bounce. Earlier bounces are not part of the model.
+BOUNCING = MotionModel(
+    "bounce",
+    velocity=[0.4, 0.3, -0.6],
+    acceleration=[0, 0, -14],
+    angular_velocity=[1, 0.5, -0.4],
+    bounce_time=0.11,
+    restitution=0.8,
+    radius=RADIUS,
+)
 # A thrown box that tumbles; it needs the inertia of the body to be told from others.
 TUMBLING = MotionModel(
     "free_top",

@@ -1,3 +1,4 @@
+import dataclasses
 import itertools
 import json
 import math
@@ -26,6 +27,7 @@ WORLD_TWIST = MotionModel(
 CASES = {name: model for name, (model, _) in problems.MOTIONS.items()} | {
     "world twist": WORLD_TWIST,
     "tumbling": problems.TUMBLING,
+    "bounces": problems.BOUNCING,
 }
 
 
@@ -158,7 +160,7 @@ def test_overflow_is_finite_or_logged(kind, caplog):
     inertia = np.diag([1.0, 2.0, 2.5]) if models.KINDS[kind].needs_inertia else None
     sane = CASES["hinge"]
     expected = models.evaluate_all([sane, models.STATIC], 0.8)
-    rates = ("velocity", "acceleration", "angular_velocity", "angular_acceleration")
+    rates = ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "precession", "second_velocity")
     for rate, size in itertools.product(rates, (1e30, 1e200, 1e308)):
         evaluation._warn_of_wild_motion.cache_clear()
         caplog.clear()
@@ -210,6 +212,93 @@ def test_a_spring_is_pulled_back_in_proportion_to_its_way():
     rest = model.acceleration / model.frequency**2  # of d, where nothing pulls
     before, here, after = (models.curve(model, tau + shift)[1] for shift in (-h, 0, h))
     np.testing.assert_allclose((after - 2 * here + before) / h**2, -(model.frequency**2) * (here - rest), atol=1e-4)
+
+
+def test_a_damped_swing_decays_to_its_centre():
+    spring = CASES["damped spring"]
+    centre = models.KINDS["translation"].center(spring)
+    np.testing.assert_allclose(models.curve(spring, 20.0)[1], centre, atol=1e-9)
+    pull = spring.frequency**2 + spring.damping**2
+    for tau in (0.0, 0.2, 0.7):
+        h = 1e-4
+        before, here, after = (models.curve(spring, tau + shift)[1] for shift in (-h, 0, h))
+        rate, bend = (after - before) / (2 * h), (after - 2 * here + before) / h**2
+        np.testing.assert_allclose(bend, -2 * spring.damping * rate - pull * (here - centre), atol=1e-4)
+
+
+def test_damped_clocks_approach_undamped_ones_and_each_other_smoothly():
+    tau = np.array([[-1.3], [0.0], [0.3], [2.1]])
+    for frequency in (1e-3, 1.0, 30.0):
+        for damped, plain in zip(models.clocks(frequency, tau, 1e-9), models.clocks(frequency, tau), strict=True):
+            np.testing.assert_allclose(damped, plain, atol=1e-7)
+    # Both sides of the size at which a series replaces the closed form.
+    for low, high in zip(models.clocks(0.9e-3, np.ones(1), 0.4e-3), models.clocks(1.0e-3, np.ones(1), 0.4e-3), strict=True):
+        np.testing.assert_allclose(low, high, rtol=1e-6)
+
+
+def test_drag_without_damping_is_free_flight():
+    rates = {"velocity": [1, 0, 2], "acceleration": [0, 0.5, -9], "angular_velocity": [0.3, 2, 1]}
+    for damping in (0.0, 1e-12, 1e-7):
+        slowed = MotionModel("drag", **rates, damping=damping)
+        for x, y in zip(models.evaluate(slowed, 1.3), models.evaluate(MotionModel("ballistic_spin", **rates), 1.3)):
+            np.testing.assert_allclose(x, y, atol=1e-5)
+
+
+def test_a_fall_with_drag_nears_its_terminal_velocity_however_stiff():
+    for damping in (2.5, 1e3, 1e6):
+        model = MotionModel("drag", velocity=[5, 0, 1], acceleration=[0, 0, -6], damping=damping)
+        _, d, spin, velocity = models.evaluate_with_rates(model, np.array([0.0, 30.0, 1e4]))
+        np.testing.assert_allclose(velocity[1:], [[0, 0, -6 / damping]] * 2, atol=1e-12)
+        assert np.isfinite(d).all() and not spin.any()
+        np.testing.assert_allclose(d[2] - d[1], [0, 0, -6 / damping * (1e4 - 30)], rtol=1e-9)
+
+
+def test_friction_ends_in_rest_and_stays_there():
+    model = CASES["rolling friction"]
+    quats, d, spins, velocities = models.evaluate_with_rates(model, np.array([0.0, 0.3, 0.6, 0.7, 50.0]))
+    np.testing.assert_allclose(velocities[1], 0.5 * model.velocity)
+    assert not velocities[2:].any() and not spins[2:].any()
+    assert (d[2:] == d[2]).all() and (quats[2:] == quats[2]).all()
+    np.testing.assert_allclose(d[2], 0.5 * 0.6 * model.velocity)
+    assert MotionModel("friction", velocity=[1, 0, 0]).is_static
+
+
+def test_a_precessing_body_keeps_its_pivot_and_the_tilt_of_its_axis():
+    model, tau = CASES["precession"], np.linspace(0, 3, 20)
+    quats, d, spins, _ = models.evaluate_with_rates(model, tau)
+    pivot = rotations.rotate(quats, np.broadcast_to(model.center_offset, d.shape)) + d
+    np.testing.assert_allclose(pivot, np.broadcast_to(model.center_offset, d.shape), atol=1e-12)
+    own = spins - model.precession
+    np.testing.assert_allclose(own @ model.precession, own[0] @ model.precession, rtol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(own, axis=1), np.linalg.norm(own[0]), rtol=1e-9)
+
+
+def test_a_ball_bounces_off_its_floor_with_a_share_of_its_speed_until_it_rests():
+    ball = CASES["bounces"]
+    fall = ball.velocity[2] + ball.acceleration[2] * ball.bounce_time
+    floor = ball.velocity[2] * ball.bounce_time + 0.5 * ball.acceleration[2] * ball.bounce_time**2
+    tau, speed = ball.bounce_time, -fall
+    for _ in range(6):
+        h = 1e-7
+        _, d, _, v = models.evaluate_with_rates(ball, np.array([tau - h, tau + h]))
+        np.testing.assert_allclose(d[:, 2], floor, atol=1e-5)
+        np.testing.assert_allclose(v[:, 2], [-speed, ball.restitution * speed], atol=1e-4)
+        np.testing.assert_allclose(v[:, :2], [[0.4, 0.3]] * 2)
+        speed *= ball.restitution
+        tau += 2 * speed / 14
+    _, d, _, v = models.evaluate_with_rates(ball, np.array([10.0, 20.0, 1e6]))
+    np.testing.assert_allclose(d[:, 2], floor, atol=1e-9)
+    assert not v[:, 2].any()
+    heights = models.evaluate(ball, np.linspace(0, 5, 500))[1][:, 2]
+    assert (heights >= floor - 1e-9).all()
+
+
+def test_a_ball_that_does_not_bounce_stays_on_the_floor_and_one_that_loses_nothing_bounces_on():
+    clay, steel = (dataclasses.replace(CASES["bounces"], restitution=rho) for rho in (0.0, 1.0))
+    later = models.evaluate(clay, np.array([0.11, 0.5, 9.0]))[1][:, 2]
+    np.testing.assert_allclose(later, later[0], atol=1e-9)
+    high = models.evaluate(steel, np.linspace(50, 60, 800))[1][:, 2]
+    assert high.max() > later[0] + 0.1 and high.min() > later[0] - 1e-6
 
 
 def test_the_clocks_run_steadily_without_a_frequency_to_the_bit_and_smoothly_towards_it():
