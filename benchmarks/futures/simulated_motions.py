@@ -249,6 +249,41 @@ def lissajous(rng: np.random.Generator) -> Motion:
     return Motion(path)
 
 
+def slow_lissajous(rng: np.random.Generator) -> Motion:
+    """Three oscillations, of which less than a period is seen."""
+    ways, frequencies, phases = (rng.uniform(*limits, 3) for limits in ((0.2, 0.5), (3, 9), (0, math.tau)))
+
+    def path(t: np.ndarray) -> Poses:
+        angle = frequencies * t[:, None]
+        return ways * np.sin(angle + phases), _turned(0.4 * np.sin(angle))
+
+    return Motion(path)
+
+
+def double_pendulum(rng: np.random.Generator) -> Motion:
+    """The lower link of a double pendulum."""
+    length, g = 0.5, rng.uniform(10, 18)
+
+    def rates(_: float, s: np.ndarray) -> list[float]:
+        a, b, p, q = s
+        c = math.cos(a - b)
+        scale = 6 / length**2 / (16 - 9 * c**2)
+        da, db = scale * (2 * p - 3 * c * q), scale * (8 * q - 3 * c * p)
+        pull = da * db * math.sin(a - b)
+        half = -0.5 * length**2
+        return [da, db, half * (pull + 3 * g / length * math.sin(a)), half * (-pull + g / length * math.sin(b))]
+
+    first = [rng.uniform(0.5, 1.3), rng.uniform(-0.5, 1), 0, 0]
+    solved = solve_ivp(rates, (0, 1), first, dense_output=True, rtol=1e-9).sol
+
+    def path(t: np.ndarray) -> Poses:
+        a, b = solved(t)[:2]
+        ends = [np.stack([np.sin(x), 0 * x, -np.cos(x)], -1) * length for x in (a, b)]
+        return ends[0] + 0.5 * ends[1], _turned(-b[:, None] * np.array([0, 1.0, 0]))
+
+    return Motion(path)
+
+
 def bounces(rng: np.random.Generator) -> Motion:
     """A ball that bounces several times and loses speed each time."""
     g, keep, first = rng.uniform(15, 25), rng.uniform(0.7, 0.9), rng.uniform(0.1, 0.3)
@@ -355,6 +390,8 @@ MOTIONS: dict[str, Maker] = {
     "damped spring": damped_spring,
     "damped pendulum": damped_pendulum,
     "Lissajous": lissajous,
+    "double pendulum": double_pendulum,
+    "slow Lissajous": slow_lissajous,
     "collision, 3 left": left(collides, 3),
     "late start, 3 left": left(starts, 3),
     "stop, 3 left": left(stops, 3),

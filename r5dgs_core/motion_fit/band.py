@@ -21,12 +21,12 @@ from .evidence import Evidence
 from .fitted_motion import FADE_PER_SPAN
 
 LEVEL = 0.95
-WIDE = 0.4  # half width from which a motion is not predictable, in radii: a fifth of the body's size
-_MULTIPLE = 1.75  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
-_WARNING = 2.0  # the same for the warning
+WIDE = 0.33  # half width from which a motion is not predictable, in radii
+_MULTIPLE = 1.65  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
 _SOFT = 4.0  # difference of scores that reduces a candidate's weight by e
 _FARTHEST = 8.0  # radii; largest counted distance of another candidate
-_MOST_SQUARE, _MOST_SCALE = 600.0, 9.0  # limits of the misses of rolling origins
+_FEWEST = 8  # poses of a track that can be refitted to fewer
+_MOST_SQUARE, _MOST_SCALE = 600.0, 36.0  # limits of the misses of rolling origins
 
 
 def of(
@@ -42,15 +42,11 @@ def of(
     place2, turn2 = _spread(chosen, all_solutions, evidence, tau)
     fading = np.exp(-2 * tau / FADE_PER_SPAN)  # of the bind state, which is a noisy pose
     last = evidence.level * fading
-    place_noise, turn_noise = 3 * noise.place**2 * last, 3 * noise.turn**2 * last
-
-    def width(scale: float) -> np.ndarray:
-        return np.sqrt(scale * (place + 2 / 3 * turn) + place2 + 2 / 3 * turn2 + place_noise + 2 / 3 * turn_noise)
-
-    warning = _WARNING * width(_rolling(chosen, track, noise, evidence))
-    wide = np.flatnonzero(warning > WIDE)
-    trusted = _crossing(tau, warning, int(wide[0])) if len(wide) else None
-    return Widths(tau, _MULTIPLE * width(1.0), _MULTIPLE * np.sqrt(turn + turn2 + turn_noise), trusted)
+    scale = _rolling(chosen, track, noise, evidence)
+    turn = scale * turn + turn2 + 3 * noise.turn**2 * last
+    width = _MULTIPLE * np.sqrt(scale * place + place2 + 3 * noise.place**2 * last + 2 / 3 * turn)
+    wide = np.flatnonzero(width > WIDE)
+    return Widths(tau, width, _MULTIPLE * np.sqrt(turn), _crossing(tau, width, int(wide[0])) if len(wide) else None)
 
 
 @dataclass(frozen=True)
@@ -129,20 +125,26 @@ def _spread(
 
 
 def _rolling(chosen: Solution, track: PoseTrack, noise: Noise, evidence: Evidence) -> float:
-    """Mean square of the chosen law's misses when it is refitted to earlier poses, in units of the noise; 1 to 9."""
+    """Mean square of the chosen law's misses when it is refitted to earlier poses, over that expected; 1 to 36.
+
+    The expected square of a miss is that of the noise plus the variance of the refitted prediction.
+    """
     count = len(track)
-    if chosen.candidate.placed or count < 8:
+    if count < _FEWEST:
         return 1.0
-    misses = []
+    shares = []
+    most = count - chosen.candidate.last_choice  # poses that may be left out
     for held in sorted({1, max(3, math.ceil(0.2 * count)), count // 3}):
-        if chosen.parameters > 4 * (count - held):
+        if chosen.parameters > 4 * (count - held) or held > most:
             continue
         earlier = families.solve(chosen.candidate, track.rows(slice(0, count - held)), noise, [chosen.theta], steps=8)
         if earlier is None:
             return _MOST_SCALE
-        late = families.residuals(chosen.candidate, earlier.theta, track.rows(slice(count - held, None)), noise)
-        misses.append(np.minimum((late**2).sum(-1), _MOST_SQUARE * evidence.variance))
-    if not misses:
-        return _MOST_SCALE
-    mean = float(np.concatenate(misses).mean()) / 6 / evidence.variance
-    return min(max(mean, 1.0), _MOST_SCALE)
+        step = 1e-6
+        nearby = earlier.theta + step * np.eye(len(earlier.theta) + 1, len(earlier.theta), -1)
+        late = families.residuals(chosen.candidate, nearby, track.rows(slice(count - held, None)), noise)
+        slopes = (late[1:] - late[0]) / step  # [P, H, 6]
+        expected = 6 + np.einsum("phc,pq,qhc->h", slopes, earlier.inverse, slopes)
+        squares = np.minimum((late[0] ** 2).sum(-1), _MOST_SQUARE * evidence.variance)
+        shares.append(squares / np.maximum(expected, 6.0) / evidence.variance)
+    return min(max(float(np.concatenate(shares).mean()), 1.0), _MOST_SCALE) if shares else 1.0

@@ -51,6 +51,11 @@ class Candidate:
         return 0
 
     @property
+    def last_choice(self) -> int:
+        """Least number of first poses that determine all discrete choices."""
+        return 0
+
+    @property
     def law(self) -> Candidate:
         """Candidate of the motion past t_max."""
         return self

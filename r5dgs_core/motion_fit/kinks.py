@@ -85,6 +85,10 @@ class Kink(Candidate):
     def placed(self) -> int:
         return 1
 
+    @property
+    def last_choice(self) -> int:
+        return self.gap + LEAST_AFTER
+
     def _block(self, name: str) -> Block:
         return _BLOCKS[name] if name in _BLOCKS else super()._block(name)
 

@@ -26,6 +26,7 @@ from .evidence import Evidence
 
 HELD_OUT = 0.2  # share of the last poses in tests of shadows
 FREQUENCY_ERROR = 0.25  # largest relative standard deviation of a determined frequency
+_SEEN = 0.9  # periods of each of two oscillations that must be seen
 _FEW = 8  # poses below which breaks are not searched, and large candidates not tried
 _PER_POSE = 3  # parameters per pose of the largest candidate for few poses
 STEEP = 0.9  # cosine of the angle to the vertical below which a motion is vertical
@@ -214,7 +215,10 @@ def _shares(solutions: Sequence[Solution]) -> tuple[float, float]:
 
 
 def _determined(solution: Solution, evidence: Evidence) -> bool:
-    """Return True if the frequencies are inside their range and known to `FREQUENCY_ERROR`, or if none is free."""
+    """Return True if the frequencies are inside their range and known to `FREQUENCY_ERROR`, or if none is free.
+
+    Of a sum of oscillations, nearly a full period of each must be seen, since slower ones can imitate any curve.
+    """
     candidate = solution.candidate
     rows = candidate.parts(np.arange(candidate.parameters))
     window = candidate.window
@@ -223,6 +227,8 @@ def _determined(solution: Solution, evidence: Evidence) -> bool:
             continue
         index = int(rows[block][0])
         frequency = float(window.frequency(solution.theta[index]))
+        if "pace2" in rows and frequency < _SEEN * 2 * math.pi / -window.first:
+            return False
         share = (frequency - window.low) / (window.high - window.low)
         deviation = math.sqrt(max(evidence.variance * solution.inverse[index, index], 0.0))
         sigma = deviation * share * (1 - share) * (window.high - window.low)
