@@ -87,7 +87,7 @@ def measure(name: str, noise: simulated.Noise, seed: int) -> dict[str, Any]:
         "still": still(track),
         "inside": float((error <= half).mean()),
         "width": float(half[-1]),
-        "flagged": band.predictable_until is not None and bool( band.predictable_until < track.later[-1]),
+        "flagged": band.predictable_until is not None and bool(band.predictable_until < track.later[-1]),
         "event": bool(found),
         "near": near if times else None,
         "recalled": near if times and track.motion.jump > 5 * sigma else None,

@@ -75,9 +75,7 @@ class PoseTrack:
     def window(self) -> Window:
         """Window of all poses."""
         span = float(self.tau[-1] - self.tau[0])
-        return Window(
-            float(self.tau[0]), 0.5 * math.pi / span, 0.5 * math.pi / float(np.median(np.diff(self.tau)))
-        )
+        return Window(float(self.tau[0]), 0.5 * math.pi / span, 0.5 * math.pi / float(np.median(np.diff(self.tau))))
 
     @functools.cached_property
     def turns(self) -> np.ndarray:

@@ -163,9 +163,14 @@ class Solution:
         return (self.residuals**2).sum(-1)
 
     @functools.cached_property
+    def losses(self) -> np.ndarray:
+        """Cauchy losses of the poses. [S]"""
+        return self.weights * SOFTNESS * np.log1p(self.squares / SOFTNESS)
+
+    @functools.cached_property
     def loss(self) -> float:
-        """Sum of the Cauchy losses of the poses."""
-        return float((self.weights * SOFTNESS * np.log1p(self.squares / SOFTNESS)).sum())
+        """Sum of the losses."""
+        return float(self.losses.sum())
 
     @property
     def robust(self) -> np.ndarray:

@@ -5,6 +5,8 @@ Notation: P parameters, S poses.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..motion import models, rotations
@@ -80,14 +82,20 @@ def events(solution: Solution, evidence: Evidence, t_max: float, span: float) ->
 
 
 def segments(
-    solution: Solution, found: tuple[Event, ...], first: float, t_max: float, radius: float, span: float
+    solutions: Sequence[Solution], found: tuple[Event, ...], first: float, t_max: float, radius: float, span: float
 ) -> tuple[Segment, ...]:
-    """Segments between events, from the first pose to t_max; empty without events."""
+    """Segments between events, from the first pose to t_max; empty without events.
+
+    Args:
+        solutions: Solution of each segment.
+        found: Events.
+        first: Time of the first pose.
+    """
     if not found:
         return ()
     bounds = [first, *(event.time for event in found), t_max]
     result = []
-    for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+    for solution, start, stop in zip(solutions, bounds[:-1], bounds[1:], strict=True):
         h = 0.02 * max(stop - start, 1e-9 * span)
         tau = (stop - t_max - h * np.array([2.1, 1.1, 0.1])) / span
         quats, d = solution.candidate.path(solution.theta, tau)

@@ -59,7 +59,11 @@ def share(
         if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
             raise ValueError(f"up: expected a direction, got {up!r}")
         basis = up[:, None] / np.linalg.norm(up)
-    found = {i: _acceleration(fit) for i, fit in enumerate(fits) if fit.chosen in FALLING and not (fit.rested or fit.history.events)}
+    found = {
+        i: _acceleration(fit)
+        for i, fit in enumerate(fits)
+        if fit.chosen in FALLING and not (fit.rested or fit.history.events)
+    }
     if up is not None:
         found = {i: (a, cov) for i, (a, cov) in found.items() if _apart(a, cov, *_mean([(a, cov)], basis)) < AGREE}
     agreeing = _largest_agreeing(found)

@@ -299,4 +299,8 @@ def _decaying(
     """exp(-c tau) cos(W tau), exp(-c tau) sin(W tau) / W, and W^2 + c^2."""
     phase2 = (frequency * span) ** 2
     decay = np.exp(np.minimum(-c * span, _MOST_EXPONENT))
-    return decay * np.cos(frequency * span), decay * span * rotations.sine_ratio(phase2), np.asarray(frequency) ** 2 + c**2
+    return (
+        decay * np.cos(frequency * span),
+        decay * span * rotations.sine_ratio(phase2),
+        np.asarray(frequency) ** 2 + c**2,
+    )

@@ -154,9 +154,7 @@ def _start(number: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray
     return first * np.where(steady, number, (1 - rho**number) / np.where(steady, 1.0, 1 - rho))
 
 
-def _flight(
-    since: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _flight(since: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Number of the flight at a time since bounce 0, after which it flies up at ``speed``; `_RESTING` for rest.
 
     Returns:

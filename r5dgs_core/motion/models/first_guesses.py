@@ -128,7 +128,7 @@ def _swinging(blocks: Sequence[str], track: PoseTrack, window: Window, sweep: _S
     guess = {"r": np.zeros(3), "e": rates[0], "v": rates[1], "a": rates[2], "pace": np.array([window.pace(frequency)])}
     guess["decay"] = np.log(np.array([max(decay, 1e-2)]))
     if "swing" in blocks:
-        # phi = q exp(-c tau) sin(W tau + f) has the rates (W cos f - c sin f) q and ((c^2 - W^2) sin f - 2 c W cos f) q.
+        # q exp(-c tau) sin(W tau + f) has the rates (W cos f - c sin f) q and ((c^2 - W^2) sin f - 2 c W cos f) q.
         rock = np.linalg.solve(
             [[frequency, -decay], [-2 * decay * frequency, decay**2 - frequency**2]], rates[1:]
         )  # q cos f, q sin f

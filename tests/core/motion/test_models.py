@@ -232,7 +232,8 @@ def test_damped_clocks_approach_undamped_ones_and_each_other_smoothly():
         for damped, plain in zip(models.clocks(frequency, tau, 1e-9), models.clocks(frequency, tau), strict=True):
             np.testing.assert_allclose(damped, plain, atol=1e-7)
     # Both sides of the size at which a series replaces the closed form.
-    for low, high in zip(models.clocks(0.9e-3, np.ones(1), 0.4e-3), models.clocks(1.0e-3, np.ones(1), 0.4e-3), strict=True):
+    series, closed = (models.clocks(frequency, np.ones(1), 0.4e-3) for frequency in (0.9e-3, 1.0e-3))
+    for low, high in zip(series, closed, strict=True):
         np.testing.assert_allclose(low, high, rtol=1e-6)
 
 
@@ -240,7 +241,8 @@ def test_drag_without_damping_is_free_flight():
     rates = {"velocity": [1, 0, 2], "acceleration": [0, 0.5, -9], "angular_velocity": [0.3, 2, 1]}
     for damping in (0.0, 1e-12, 1e-7):
         slowed = MotionModel("drag", **rates, damping=damping)
-        for x, y in zip(models.evaluate(slowed, 1.3), models.evaluate(MotionModel("ballistic_spin", **rates), 1.3)):
+        free = MotionModel("ballistic_spin", **rates)
+        for x, y in zip(models.evaluate(slowed, 1.3), models.evaluate(free, 1.3), strict=True):
             np.testing.assert_allclose(x, y, atol=1e-5)
 
 
