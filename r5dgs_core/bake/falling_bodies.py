@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..motion.history import History
-from ..motion.models import MotionModel
 from ..motion_fit import model_selection, shared_gravity
 
 UP = {"blender": np.array([0.0, 0.0, 1.0]), "opengl": np.array([0.0, 1.0, 0.0])}  # up axis
@@ -13,8 +11,8 @@ UP = {"blender": np.array([0.0, 0.0, 1.0]), "opengl": np.array([0.0, 1.0, 0.0])}
 
 def share_gravity(
     fits: dict[int, tuple[shared_gravity.Track, model_selection.Fit]], convention: str
-) -> tuple[dict[int, MotionModel], dict[int, History]]:
-    """Return the fitted models and histories, with one common acceleration for bodies that fall alike.
+) -> dict[int, model_selection.Fit]:
+    """Return the fits, with one common acceleration for bodies that fall alike.
 
     Args:
         fits: Track and fit of each moving group, by group index.
@@ -23,5 +21,4 @@ def share_gravity(
     shared = [fit for _, fit in fits.values()]
     if convention in UP and fits:
         shared, _ = shared_gravity.share([track for track, _ in fits.values()], shared, UP[convention])
-    models = {index: fit.model for index, fit in zip(fits, shared, strict=True)}
-    return models, {index: fit.history for index, fit in zip(fits, shared, strict=True)}
+    return dict(zip(fits, shared, strict=True))

@@ -131,14 +131,15 @@ def simplify(
         travel = float(np.linalg.norm(bound.tracks.poses[g.id, :, 4:], axis=1).max()) / (2 * g.model.radius)
         found = [_row(part, part in dropped, losses.get(id(part)), said, travel) for part in mine]
         rows += [{"object": names[g.object_id], **row} for row in found]
-    models, histories = falling_bodies.share_gravity(fits, scene.world_convention)
+    shared = falling_bodies.share_gravity(fits, scene.world_convention)
+    models = {index: fit.model for index, fit in shared.items()}
     groups = list(bound.groups)
     for part in parts:  # a model fitted without noise starts at the bind state
         if part.noise and part.group in models:
             offset = "offset_rotvec" if part.name == "rotation" else "offset_displacement"
             models[part.group] = dataclasses.replace(models[part.group], **{offset: np.zeros(3)})
     for index, model in models.items():
-        groups[index] = dataclasses.replace(groups[index], model=model, history=histories[index])
+        groups[index] = dataclasses.replace(groups[index], model=model, history=shared[index].history)
     return Simplified(dataclasses.replace(bound, groups=tuple(groups)), tuple(rows))
 
 

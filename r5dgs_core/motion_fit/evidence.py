@@ -41,8 +41,14 @@ class Evidence:
         numbers = 6 * count
         level = max(_LEAST_LEVEL, min(s.loss / max(numbers - s.parameters, 1) for s in solutions))
         best = min(solutions, key=lambda s: s.loss / level + s.parameters * math.log(numbers))
-        rho = min(max(_lag(best) + (best.parameters / 6 + 1) / count, 0.0), _MOST_LAG)
-        return Evidence(count, level, (1 + rho) / (1 - rho))
+        return Evidence(count, level, _inflation([best], count, best.parameters))
+
+    @staticmethod
+    def of_parts(parts: Sequence[Solution]) -> Evidence:
+        """Noise level from solutions of successive parts of a track."""
+        count, parameters = sum(len(s.weights) for s in parts), sum(s.parameters for s in parts)
+        level = sum(s.loss for s in parts) / max(6 * count - parameters, 1)
+        return Evidence(count, max(_LEAST_LEVEL, level), _inflation(parts, count, parameters))
 
     @property
     def variance(self) -> float:
@@ -51,15 +57,24 @@ class Evidence:
 
     def score(self, solution: Solution) -> float:
         """B of a candidate; less is better."""
-        penalty = solution.parameters * math.log(6 * self.count / self.inflation)
-        return solution.loss / self.variance + penalty + 2 * solution.candidate.placed * math.log(self.count)
+        return self.of_sums(solution.loss, solution.parameters, solution.candidate.placed)
+
+    def of_sums(self, loss: float, parameters: int, placed: int = 0) -> float:
+        """B of a loss with a number of parameters, of which some are choices of a pose."""
+        penalty = parameters * math.log(6 * self.count / self.inflation)
+        return loss / self.variance + penalty + 2 * placed * math.log(self.count)
 
 
-def _lag(solution: Solution) -> float:
-    """Correlation between neighbouring residuals, weighted robustly."""
-    values = np.sqrt(solution.robust)[:, None] * solution.residuals
-    energy = float((values**2).sum())
-    return float((values[1:] * values[:-1]).sum()) / energy if energy > 0 else 0.0
+def _inflation(parts: Sequence[Solution], count: int, parameters: int) -> float:
+    """a from the correlation between neighbouring residuals, weighted robustly; it corrects for the fit."""
+    energy = product = 0.0
+    for solution in parts:
+        values = np.sqrt(solution.robust)[:, None] * solution.residuals
+        energy += float((values**2).sum())
+        product += float((values[1:] * values[:-1]).sum())
+    lag = product / energy if energy > 0 else 0.0
+    rho = min(max(lag + (parameters / 6 + 1) / count, 0.0), _MOST_LAG)
+    return (1 + rho) / (1 - rho)
 
 
 def simplest(solutions: Sequence[Solution], evidence: Evidence) -> Solution:

@@ -23,6 +23,12 @@ STEEP = 0.9  # cosine of the angle to the vertical below which a motion is verti
 _ROUNDS = 3  # of the noise
 _TOO_LARGE = 0.4  # variance of the residuals below which the noise is estimated again
 _EXACT = 1e-4  # gain at which the selected candidate is final
+_POOR = 3.0  # noise level, in that of neighbouring poses, from which a track may have several breaks
+_HOPELESS = 30.0  # excess of plain parts above which a track is not cut
+_CUTS = 4  # breaks at which such a track is cut
+_FEWEST = 4  # poses of its parts
+_PLAIN = ("static", "translation + spin", "ballistic + spin", "drag")  # laws that decide where to cut
+_WELL = 1.3  # loss of a part, in that of the whole track, below which it is not searched again
 _LEAST_PART = 7  # poses after a break that are searched for a law of their own
 
 
@@ -90,7 +96,9 @@ def select(
     solutions = (*laws, *broken)
     final = _again(chosen, track, level, _EXACT)
     solutions = tuple(final if s is chosen else s for s in solutions)
-    return _with_parts(Selected(final, solutions, evidence, track, level, float(track.tau[0])), family, up)
+    whole = Selected(final, solutions, evidence, track, level, float(track.tau[0]))
+    cut = _cut(whole, broken, family, up) if broken and evidence.variance > _POOR else None
+    return cut or _with_parts(whole, family, up)
 
 
 def _with_parts(whole: Selected, family: tuple[Candidate, ...], up: np.ndarray | None) -> Selected:
@@ -104,13 +112,13 @@ def _with_parts(whole: Selected, family: tuple[Candidate, ...], up: np.ndarray |
     result = whole
     for rows in (slice(0, kink.gap), slice(kink.gap, None)):
         track = whole.track.rows(rows)
-        if len(track) < _LEAST_PART:
+        loss, free = float(whole.chosen.losses[rows].sum()), 6 * len(track) - kink.law.parameters
+        if len(track) < _LEAST_PART or loss < _WELL * whole.evidence.level * free:
             continue
         own = tuple(replace(candidate, window=track.window) for candidate in family)
         part = select(track, own, whole.noise, breaks=len(track) >= _FEW, up=up)
         level = replace(whole.evidence, count=len(track))
-        shared = math.log(6 * len(track) / level.inflation) * kink.law.parameters
-        shared += float((whole.chosen.losses[rows]).sum()) / level.variance
+        shared = level.of_sums(loss, kink.law.parameters)
         if level.score(part.chosen) + evidences.STRONG > shared:
             continue
         if rows.start:
@@ -118,6 +126,57 @@ def _with_parts(whole: Selected, family: tuple[Candidate, ...], up: np.ndarray |
         elif part.chosen.candidate.placed:
             result = replace(result, earlier=(*part.earlier, part.chosen))
     return result
+
+
+def _cut(
+    whole: Selected, broken: Sequence[Solution], family: tuple[Candidate, ...], up: np.ndarray | None
+) -> Selected | None:
+    """Search the parts before and after the best break independently, for tracks that no candidate explains.
+
+    Returns:
+        None if this is not clearly better than the best single candidate.
+    """
+    track, found = whole.track, []
+    for kink in sorted(broken, key=lambda s: s.loss)[:_CUTS]:
+        gap = kink.candidate.last_choice - kinks.LEAST_AFTER
+        rows = (slice(0, gap), slice(gap, None))
+        sides = [track.rows(row) for row in rows]
+        if min(map(len, sides)) < _FEWEST or any(gap == other[1] for other in found):
+            continue
+        plain = [_plain(side, whole.noise) for side in sides]
+        found.append((sum(s.loss + s.parameters for s in plain), gap, kink, sides, plain))
+    if not found:
+        return None
+    _, _, kink, sides, plain = min(found, key=lambda entry: entry[:2])
+    best = min(whole.solutions, key=whole.evidence.score)
+    if _excess(plain, best) > _HOPELESS:
+        return None
+    parts = []
+    for side in sides:
+        own = tuple(replace(candidate, window=side.window) for candidate in family)
+        parts.append(select(side, own, whole.noise, breaks=len(side) >= _FEW, up=up))
+    before, after = parts
+    pieces = (before.chosen, after.chosen)
+    if _excess(pieces, best) > -evidences.STRONG:
+        return None
+    evidence = Evidence.of_parts(pieces)
+    earlier = (*before.earlier, *([before.chosen] if before.chosen.candidate.placed else []), kink, *after.earlier)
+    return replace(after, evidence=replace(evidence, count=len(after.track)), first=whole.first, earlier=earlier)
+
+
+def _plain(track: PoseTrack, level: Noise) -> Solution:
+    """Fit of the best plain law to a part of a track."""
+    laws = (replace(families.BY_NAME[name], window=track.window) for name in _PLAIN)
+    found = [s for law in laws if (s := families.solve(law, track, level)) is not None]
+    return min(found, key=lambda s: s.loss + s.parameters)
+
+
+def _excess(parts: Sequence[Solution], single: Solution) -> float:
+    """Score of two parts of a track minus that of a single candidate, by the noise level of the parts."""
+    evidence = Evidence.of_parts(parts)
+    placed = 1 + sum(part.candidate.placed for part in parts)
+    loss, parameters = sum(part.loss for part in parts), sum(part.parameters for part in parts)
+    return evidence.of_sums(loss, parameters, placed) - evidence.score(single)
 
 
 def _again(solution: Solution, track: PoseTrack, level: Noise, enough: float | None = None) -> Solution:

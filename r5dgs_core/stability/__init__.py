@@ -27,6 +27,7 @@ from . import (
     loading,
     orders,
     playback,
+    predictions,
     rotations,
     steps,
 )
@@ -40,12 +41,13 @@ CASES: tuple[Case, ...] = (
     *groups.CASES,
     *float32_playback.CASES,
     *playback.CASES,
+    *predictions.CASES,
     *keys.CASES,
     *loading.CASES,
 )
 _CAPTION = (
-    f"Less is better. A case over {MOST_SECONDS:g} s of processor time fails. No motion model has drag, so no case "
-    "tests stiffness caused by drag. --json FILE adds the quantity, the function, the result of TRACE's integrator and "
+    f"Less is better. A case over {MOST_SECONDS:g} s of processor time fails. "
+    "--json FILE adds the quantity, the function, the result of TRACE's integrator and "
     "the origin of each tolerance."
 )
 

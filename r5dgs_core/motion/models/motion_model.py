@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from .base import MotionKind
-
-KINDS: dict[str, MotionKind] = {}
-"""Kinds by name, in the order of Blender's menu; the package fills it."""
+KINDS: dict[str, Any] = {}
+"""Kinds (`MotionKind`) by name, in the order of Blender's menu; the package fills it."""
 
 
 class Unit(NamedTuple):

@@ -76,7 +76,7 @@ def test_a_required_feature_that_is_lacking_is_named_with_its_release(path, tmp_
     listed = [
         {"name": "origin", "required": True, "since": "0.2.0"},
         {"name": "quantised", "required": True, "since": "0.9.1"},
-        {"name": "events", "required": True, "since": "0.10.0"},
+        {"name": "parts", "required": True, "since": "0.10.0"},
     ]
     newer = with_features(path, tmp_path / "newer.r5dgs", listed, origin=[0, 0, 1e7])
     for reader in (scene_file.read, scene_file.read_meanings, scene_file.is_exact):

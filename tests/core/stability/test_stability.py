@@ -13,7 +13,7 @@ from rich.console import Console
 
 from r5dgs_core import stability
 from r5dgs_core.cli import main
-from r5dgs_core.motion import models, rigid_fit, rotations, se3
+from r5dgs_core.motion import rigid_fit, rotations, se3
 from r5dgs_core.scene import validation
 from r5dgs_core.stability import cases as stability_cases
 from r5dgs_core.stability import scenes as stability_scenes
@@ -213,11 +213,6 @@ def test_an_unwritable_path_is_rejected_before_the_work(monkeypatch, tmp_path, c
     monkeypatch.setattr(stability, "run", lambda *_, **__: pytest.fail("ran"))
     assert main.main(["report", "--stability", "--json", str(tmp_path / "none" / "rows.json")]) == 3
     assert "make it first" in capsys.readouterr().err
-
-
-def test_the_caption_is_true_of_drag():
-    fields = {field.name for field in dataclasses.fields(models.MotionModel)}
-    assert not any("drag" in name or "damping" in name for name in fields | set(models.KINDS))
 
 
 def test_scenes_of_the_table_are_scenes_that_a_file_may_hold():
