@@ -28,7 +28,7 @@ _HOPELESS = 30.0  # excess of plain parts above which a track is not cut
 _CUTS = 4  # breaks at which such a track is cut
 _FEWEST = 4  # poses of its parts
 _PLAIN = ("static", "translation + spin", "ballistic + spin", "drag")  # laws that decide where to cut
-_WELL = 1.3  # loss of a part, in that of the whole track, below which it is not searched again
+_WELL = 1.5  # loss of a part, in that of noise, below which it is not searched again
 _LEAST_PART = 7  # poses after a break that are searched for a law of their own
 
 
@@ -113,7 +113,7 @@ def _with_parts(whole: Selected, family: tuple[Candidate, ...], up: np.ndarray |
     for rows in (slice(0, kink.gap), slice(kink.gap, None)):
         track = whole.track.rows(rows)
         loss, free = float(whole.chosen.losses[rows].sum()), 6 * len(track) - kink.law.parameters
-        if len(track) < _LEAST_PART or loss < _WELL * whole.evidence.level * free:
+        if len(track) < _LEAST_PART or loss < _WELL * min(whole.evidence.level, 1.0) * free:
             continue
         own = tuple(replace(candidate, window=track.window) for candidate in family)
         part = select(track, own, whole.noise, breaks=len(track) >= _FEW, up=up)
@@ -123,8 +123,12 @@ def _with_parts(whole: Selected, family: tuple[Candidate, ...], up: np.ndarray |
             continue
         if rows.start:
             result = replace(part, evidence=level, first=whole.first, earlier=(*result.earlier, whole.chosen))
-        elif part.chosen.candidate.placed:
-            result = replace(result, earlier=(*part.earlier, part.chosen))
+        elif isinstance(part.chosen.candidate, kinks.Kink):
+            # The kink of the whole track assumed one law before it: search again from the earlier break on.
+            rest = whole.track.rows(slice(part.chosen.candidate.gap, None))
+            own = tuple(replace(candidate, window=rest.window) for candidate in family)
+            result = select(rest, own, whole.noise, breaks=len(rest) >= _FEW, up=up)
+            return replace(result, first=whole.first, earlier=(*part.earlier, part.chosen, *result.earlier))
     return result
 
 
