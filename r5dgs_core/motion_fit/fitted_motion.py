@@ -6,6 +6,7 @@ Notation: P parameters, S poses.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,9 @@ def to_model(solution: Solution, evidence: Evidence, radius: float, span: float)
         inertia = turn @ law.inertia @ turn.T
     slopes = slopes @ solution.law_slopes
     spread = evidence.variance * slopes @ solution.inverse @ slopes.T
-    values = {name: float(value[0]) if name in models.SCALARS else value for name, value in fields.items()}
+    values: dict[str, Any] = {
+        name: float(value[0]) if name in models.SCALARS else value for name, value in fields.items()
+    }
     labels = [[name] if name in models.SCALARS else [f"{name}.{axis}" for axis in "xyz"] for name in names]
     return models.MotionModel(
         kind=law.kind,

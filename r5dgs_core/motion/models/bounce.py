@@ -119,7 +119,7 @@ class Bounce(MotionKind):
         first = float(_flight(window.first - parts["bounce"], speed, gravity, rho)[0].reshape(-1)[0])
         last = float(_flight(-parts["bounce"], speed, gravity, rho)[0].reshape(-1)[0])
         numbers = range(int(first) + 1, int(min(last, first + 50)) + 1)
-        return [("impact", parts["bounce"] + _start(np.float64(k), speed, gravity, rho)) for k in numbers]
+        return [("impact", parts["bounce"] + _start(np.array(float(k)), speed, gravity, rho)) for k in numbers]
 
     def moves(self, model: MotionModel) -> bool:
         return bool(model.velocity.any() or model.acceleration.any() or model.angular_velocity.any())
