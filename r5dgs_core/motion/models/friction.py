@@ -15,7 +15,7 @@ _STOPS = (0.3, 0.5, 0.8, 1.1, 1.5, 2.5)  # tried times of the stop, in spans aft
 
 
 class Friction(MotionKind):
-    """R_f = exp(w s), d_f = v s, s = u - u^2 / (2 T), u = min(tau, T), with the stop time T."""
+    """R_f = exp(w s), d_f = v s, s = u - u^2 / (2 T), u = min(tau, T), with the stop time T; T = 0 for no friction."""
 
     label = "Friction"
     tooltip = "Slides or rolls ever slower until it rests"
@@ -25,10 +25,10 @@ class Friction(MotionKind):
     blocks = {"log_stop": Block(1, 2.0)}
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
-        stop = rates.stop_time
+        stop = np.where(rates.stop_time > 0, rates.stop_time, np.inf)
         within = np.minimum(span, stop)
-        share = within / np.where(stop > 0, stop, 1.0)
-        way = within * (1 - 0.5 * share) * (stop > 0)
+        share = within / stop
+        way = within * (1 - 0.5 * share)
         left = np.where(span < stop, 1 - share, 0.0)
         return rotations.rotvecs_to_quats(rates.w * way), rates.v * way, rates.w * left, rates.v * left
 
@@ -74,11 +74,8 @@ class Friction(MotionKind):
         stop = window.first + np.exp(np.clip(parts["log_stop"], -4.0, 4.0))
         return [("stop", stop)] if stop.reshape(-1)[0] < 0 else []
 
-    def moves(self, model: MotionModel) -> bool:
-        return model.stop_time > 0 and bool(model.velocity.any() or model.angular_velocity.any())
-
     def spins(self, model: MotionModel) -> bool:
-        return model.stop_time > 0 and bool(model.angular_velocity.any())
+        return bool(model.angular_velocity.any())
 
 
 KIND = Friction()

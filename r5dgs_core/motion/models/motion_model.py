@@ -72,7 +72,7 @@ class MotionModel:
         frequency: W >= 0, rad per unit of time, of kinds that may oscillate; 0 for no oscillation.
         damping: c >= 0, per unit of time: decay rate of an oscillation, or of the velocity under drag.
         precession: p, angular velocity with which the spin axis of the kind "precession" turns.
-        stop_time: T >= 0, time past t_max at which friction has stopped a body of the kind "friction".
+        stop_time: T >= 0, time past t_max at which a body of the kind "friction" rests; 0 if it never does.
         bounce_time: Time past t_max of the next impact of the kind "bounce", >= 0.
         restitution: Speed after an impact / speed before it, in [0, 1].
         second_velocity: As `velocity`, of the second oscillation of the kind "two_oscillations"; so are the others.

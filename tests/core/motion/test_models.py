@@ -262,7 +262,7 @@ def test_friction_ends_in_rest_and_stays_there():
     assert not velocities[2:].any() and not spins[2:].any()
     assert (d[2:] == d[2]).all() and (quats[2:] == quats[2]).all()
     np.testing.assert_allclose(d[2], 0.5 * 0.6 * model.velocity)
-    assert MotionModel("friction", velocity=[1, 0, 0]).is_static
+    assert models.evaluate(MotionModel("friction", velocity=[1, 0, 0]), 5.0)[1].tolist() == [5, 0, 0]
 
 
 def test_a_precessing_body_keeps_its_pivot_and_the_tilt_of_its_axis():
