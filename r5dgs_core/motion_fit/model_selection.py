@@ -23,7 +23,7 @@ from . import fitted_motion, noise, search
 from .candidates import Candidate, Noise
 from .search import Selected
 
-HELD_OUT = 0.2  # share of the last poses in tests of shadows
+HELD_OUT = search.HELD_OUT
 
 
 @dataclass(frozen=True)

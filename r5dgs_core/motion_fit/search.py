@@ -23,6 +23,10 @@ STEEP = 0.9  # cosine of the angle to the vertical below which a motion is verti
 _ROUNDS = 3  # of the noise
 _TOO_LARGE = 0.4  # variance of the residuals below which the noise is estimated again
 _EXACT = 1e-4  # gain at which the selected candidate is final
+HELD_OUT = 0.2  # share of the last poses that other laws must predict
+WITHIN = 1.5  # misses of these, relative to the least, of laws that predict them about as well
+_ARGUABLE = 60.0  # difference of scores up to which the prediction of the last poses decides
+_MOST_SQUARE = 3000.0  # limit of the square of a miss, in variances
 _POOR = 3.0  # noise level, in that of neighbouring poses, from which a track may have several breaks
 _HOPELESS = 30.0  # excess of plain parts above which a track is not cut
 _CUTS = 4  # breaks at which such a track is cut
@@ -88,7 +92,7 @@ def select(
         broken = kinks.search(track, level) if gaps_matter else [_again(s, track, level) for s in broken]
     evidence = Evidence.of((*found, *broken))
     laws = [s for s in found if _determined(s, evidence) and not _rises(s, up)] or found[:1]
-    chosen = evidences.simplest(laws, evidence)
+    chosen = _simplest(laws, evidence, track, level)
     if broken:
         best = min(broken, key=evidence.score)
         if evidence.score(best) + evidences.STRONG < min(evidence.score(s) for s in laws):
@@ -225,6 +229,31 @@ def _determined(solution: Solution, evidence: Evidence) -> bool:
         if not (0.01 < share < 0.99 and sigma < FREQUENCY_ERROR * frequency):
             return False
     return True
+
+
+def _simplest(laws: Sequence[Solution], evidence: Evidence, track: PoseTrack, level: Noise) -> Solution:
+    """Law with the fewest parameters among those that have evidence and predict the last poses about as well as any.
+
+    Evidence alone trusts small systematic errors of a track, which the last poses reveal. Among laws with equally many
+    parameters, the evidence decides.
+    """
+    best = min(evidence.score(s) for s in laws)
+    near = [s for s in laws if evidence.score(s) <= best + _ARGUABLE]
+    held = max(3, math.ceil(HELD_OUT * len(track)))
+    misses = {}
+    for s in near:
+        if len(track) < _FEW or s.parameters > 4 * (len(track) - held):
+            continue
+        earlier = families.solve(s.candidate, track.rows(slice(0, len(track) - held)), level, [s.theta], steps=8)
+        if earlier is not None:
+            late = families.residuals(s.candidate, earlier.theta[None], track.rows(slice(-held, None)), level)[0]
+            squares = np.minimum((late**2).sum(-1), _MOST_SQUARE * evidence.level)
+            misses[id(s)] = math.sqrt(float(squares.mean()))
+    if not misses:
+        return evidences.simplest(laws, evidence)
+    least = min(misses.values())
+    fit = [s for s in near if misses.get(id(s), math.inf) <= WITHIN * least]
+    return min(fit, key=lambda s: (s.parameters, evidence.score(s)))
 
 
 def _rises(solution: Solution, up: np.ndarray | None) -> bool:
