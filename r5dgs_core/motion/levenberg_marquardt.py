@@ -17,9 +17,9 @@ _DIFFERENCE = 1e-6
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-10, 1e10
 _TOLERANCE = 1e-5  # predicted gain / cost at which iteration ends
-_COARSE = 1e-2  # the same, at which the fit is close enough to tell outliers
+_COARSE = 1e-2  # the same, below which outliers are detected
 _NEGLIGIBLE_GAIN = 1e-20  # predicted gain at which iteration ends even if the cost is less
-_LEAST_OUTLIER = 1e-6  # size of an outlier
+_LEAST_OUTLIER = 1e-6  # smallest residual that can be an outlier
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ _SIZES = {"r": 3, "e": 3, "v": 3, "a": 3, "w": 3, "eps": 3, "kappa": 1, "u": 3, 
 _PRIORS = {"a": 100.0, "eps": 100.0, "kappa": 30.0, "u": 10.0, "swing": 10.0, "phase": 10.0, "pace": 5.0}
 _PACES = 25  # number of frequencies tried for an initial guess
 _STARTS = 2  # number of these that are refined
-_GAIN = 9.0  # variances; a frequency that differs from zero by three standard deviations
+_GAIN = 9.0  # required gain of an oscillation over a parabola, in residual variances (9 = three standard deviations)
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Candidate:
         return models.KINDS[self.kind].fitted(rates, p["r"], p["e"], tau, self.inertia)
 
 
-# Ordered by the number of parameters; among equals, the simpler motion first.
+# Ordered by number of parameters; with equal numbers, motions without oscillation first, then in the order of `_NAMES`.
 ALL = sorted(
     (Candidate(name, kind, fit) for kind in models.KINDS for name, fit in models.KINDS[kind].fits.items()),
     key=lambda candidate: (candidate.parameters, candidate.oscillates),
@@ -182,8 +182,7 @@ class _Sweep:
         frequencies: Tried frequencies. [F]
         rates: Position, velocity and acceleration at t_max. [F, 3, 3]
         misses: Remaining weighted sum of squares. [F]
-        gain: Excess of the parabola's sum of squares over that of the best frequency, in residual variances of the
-            latter.
+        gain: Sum of squares of the parabola minus that of the best frequency, in residual variances of the latter.
     """
 
     frequencies: np.ndarray

@@ -145,7 +145,7 @@ def _select(
     if tail:
         evidence, solutions = track.rows(slice(-tail, None)), {}
         solution = families.solve(rest_detection.STATIC, evidence, sigmas)
-        wider = math.sqrt(2.0)  # a resting body may move again: twice the variance
+        wider = math.sqrt(2.0)  # double the variance, because a resting body may move again
     else:
         if inertia is not None and any(_may_tumble(s, inertia) for s in solutions.values()):
             free = replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64))
@@ -155,7 +155,7 @@ def _select(
             # parameters.
             if held * (1.0 if "eps" in solution.candidate.blocks else WITHIN) < scores[solution.candidate.name]:
                 solution, solutions[free.name], scores[free.name] = top, top, held
-        missed = scores[solution.candidate.name]  # assume that the extrapolation errs like the held-out poses
+        missed = scores[solution.candidate.name]  # assume errors after t_max like those at the held-out poses
         wider = max(1.0, missed if math.isfinite(missed) else 1.0)
     model = fitted_motion.to_model(solution, radius, span, evidence, sigmas)
     band_tau, band = fitted_motion.band(solution, list(solutions.values()), evidence, sigmas, radius, span)
@@ -190,7 +190,7 @@ def _score(
 
 
 def _may_tumble(picked: Solution, inertia: np.ndarray) -> bool:
-    """Return True if the selected motion has a spin of changing axis that a free body of this inertia can have."""
+    """Return True if the selected motion changes its spin axis and the inertia allows free tumbling."""
     if "eps" not in picked.candidate.blocks or not models.KINDS[picked.candidate.kind].may_tumble:
         return False
     p = picked.candidate.unpack(picked.theta)

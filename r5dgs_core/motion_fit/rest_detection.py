@@ -14,7 +14,7 @@ from .candidates import Solution, Track
 STATIC = families.BY_NAME["static"]
 TAIL = 5
 SIGMA_FLOOR = 1e-7  # radii and radians; below this, noise is only rounding
-STOP_RATIO = 8.0  # least distance of the poses before a stop / scatter of those after it
+STOP_RATIO = 8.0  # smallest ratio of the distance of the poses before a stop to the scatter of the poses after it
 STOP_MOTION = 0.02  # radii; least motion before a stop
 
 
@@ -53,9 +53,9 @@ def rests(picked: Solution, track: Track, sigmas: tuple[float, float]) -> bool:
 def stopped(track: Track) -> int:
     """Number of final poses at which a body clearly stands still after moving, or 0.
 
-    It needs no noise estimate, which a stop within the window would bias. The last three to five poses must scatter
-    little about their mean, and the two poses before must lie far from it relative to that scatter, the earlier one
-    farther. The ratio is at most 2.4 for steady motion and 4.3 at the apex of a throw, so neither counts as a stop.
+    It does not use the noise estimate, because a stop within the window biases it. The last three to five poses must
+    scatter little about their mean, and the two poses before must lie far from it relative to that scatter, the earlier
+    one farther. The ratio is at most 2.4 for steady motion and 4.3 at the apex of a throw, so neither counts as a stop.
     """
     for count in (5, 4, 3):
         if len(track.tau) < count + 3:
