@@ -108,7 +108,7 @@ class Choice:
     Attributes:
         chosen: Python set by the environment, the preferences or ``r5dgs config --user``, in this order; "" to search.
         kept: Result of an earlier search, or "".
-        beside: Folders of the extension, searched first.
+        beside: Folders of the extension, beside which environments are searched.
         timeout_s: Seconds to wait for a response from the worker.
         trusted: Folders from which any .blend may load scene files.
     """

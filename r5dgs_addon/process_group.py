@@ -43,7 +43,7 @@ class ProcessGroup:
     @property
     def alive(self) -> bool:
         """True while the first process runs."""
-        if not hasattr(os, "waitid"):  # Windows, and macOS before Python 3.13
+        if not hasattr(os, "waitid"):  # no os.waitid on Windows and on macOS before Python 3.13
             return self.process.poll() is None
         # Only `end` collects the exit status: until then, the system does not reuse the process group id.
         with contextlib.suppress(ChildProcessError):

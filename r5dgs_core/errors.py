@@ -34,7 +34,7 @@ class SceneFileError(R5dgsError):
 
 
 class BackendError(R5dgsError):
-    """An optional dependency (a rasterizer, an encoder, a Blender) is required but missing."""
+    """An optional dependency (rasterizer, encoder, Blender) is missing or unusable."""
 
 
 class TrainingError(R5dgsError):

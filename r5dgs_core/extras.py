@@ -16,7 +16,7 @@ def required(user: str, extra: str, remedy: str = "", also: tuple[type[Exception
         user: Feature that needs the packages, for the message.
         extra: Extra that installs them.
         remedy: Further remedy, for the message.
-        also: Further errors of an installation that cannot be used.
+        also: Further exception types that indicate an unusable installation.
 
     Raises:
         BackendError: The block raises ImportError, or one of ``also``.

@@ -94,7 +94,7 @@ class Finding:
 
 @contextlib.contextmanager
 def coded(code: str, *, instead: bool = False) -> Iterator[None]:
-    """Set the code of errors raised in a block: of those without one, or of all with ``instead``."""
+    """Set the code of errors raised in the block if they have none; with ``instead``, replace existing codes too."""
     try:
         yield
     except errors.R5dgsError as error:

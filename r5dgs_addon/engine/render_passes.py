@@ -24,7 +24,7 @@ class Pass:
         name: Blender's name of the pass.
         channels: Channel names, one letter each.
         kind: Type of its compositor socket, COLOR or VALUE.
-        want: Array of the worker that it is made of; "" for colour.
+        want: Array of the worker from which the pass is made; "" for colour.
     """
 
     name: str

@@ -22,7 +22,7 @@ from ..ui.stepwise_operator import Outcome, Step, Steps
 from . import frame_range
 
 TOLERANCE = 1e-5  # tolerated difference between Blender and playback without keys, as a fraction of the scene's extent
-KEY_SHARE = 1.5  # share of the keys' own tolerance that is ignored in addition
+KEY_SHARE = 1.5  # further tolerance, as a share of the key tolerance
 MOST_LATER = 64  # maximum number of sampled times past t_max
 MOST_EARLIER = 16  # maximum number of sampled frames before the first observed time
 _STILL = 1e-6  # maximum deviation of a parent's linear part that counts as the identity
@@ -47,7 +47,7 @@ class Edited:
 class _Member:
     """Point cloud with its poses over time. matrices [4, 4] each; pivot [3], parent [3, 3] and points at t_max.
 
-    ``keys`` identifies the distinct states of its points over time; several if modifiers animate them.
+    ``keys``: one key per distinct state of the points over time; more than one if modifiers animate them
     """
 
     cloud: bpy.types.Object
@@ -162,7 +162,7 @@ def _refuse_sources(path: Path) -> None:
 
 
 def _later(times: timeline.Times) -> np.ndarray:
-    """Times past t_max at which Blender's F-curves are sampled: whole frames and the last one."""
+    """Times past t_max at which Blender's F-curves are sampled: whole frames, and the last key's time."""
     first, last = times.frame(times.t_max), times.frame(times.t_end)
     if last <= first + 1e-6:
         return np.zeros(0)

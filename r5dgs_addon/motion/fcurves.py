@@ -73,7 +73,7 @@ class Points:
 
 
 def _cut(name: str, curve: bpy.types.FCurve, points: Points, k: int, frame: float) -> np.ndarray:
-    """One or two segments that replace, up to a frame, the segment that starts with key k. [n, 4, 2]
+    """Split the segment that starts with key k at a frame; returns the one or two segments before it. [n, 4, 2]
 
     After the last key, a segment with the curve's extrapolation.
     """

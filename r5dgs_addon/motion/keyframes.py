@@ -22,7 +22,7 @@ from ..scene import timeline
 
 # Fraction of the scene's extent. Blender may deviate from playback by 1e-5, including its float32 evaluation.
 TOLERANCE = 3e-6
-_PER_KNOT = 4  # possible keys per knot; if more were needed, the knots themselves are fewer
+_PER_KNOT = 4  # limit of reduced keys per knot; beyond it, one key per knot takes fewer keys
 NEAREST = 0.011  # minimum distance of keys in frames; Blender merges keys closer than 0.01
 _INTERVALS = 1 << 17  # limit of key intervals of all objects, so that no file blocks Blender for minutes
 OBSERVED_KEY, EXTRAPOLATED_KEY = "KEYFRAME", "EXTREME"
@@ -86,7 +86,7 @@ def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float
 
 
 def share(objects: int) -> int:
-    """Maximum number of key intervals per object for the given number of objects, for `few`."""
+    """Maximum number of key intervals per object, passed to `few`."""
     return min(max(_INTERVALS // max(objects, 1), reduction.FEWEST_INTERVALS), reduction.MOST_INTERVALS)
 
 

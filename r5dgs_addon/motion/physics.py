@@ -114,7 +114,7 @@ def show(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
 
 
 def take(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -> None:
-    """Give an anchor the motion of another anchor without leader. Its own learned motion stays stored.
+    """Copy the motion of an anchor that follows no leader to another anchor. Its own learned motion stays stored.
 
     Args:
         source: Anchor with the motion.

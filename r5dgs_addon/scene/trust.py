@@ -78,7 +78,7 @@ def find(collection: bpy.types.Collection) -> Found:
             if place.is_file():
                 return Found(path=place)
         elif on_network(place):
-            asked = asked or place  # its existence is unknown
+            asked = asked or place  # network path: not even looked up, so it is not known if the file exists
         elif place.is_file():
             return Found(asked=asked or Path(os.path.realpath(place)))  # show the target of a link
     return Found(asked=asked)

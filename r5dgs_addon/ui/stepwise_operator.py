@@ -128,7 +128,7 @@ class Running:
                 if self._last is not None and self._last.slow:
                     break
             failed = False
-        finally:  # on error, too, the timer and progress bar must go
+        finally:  # remove the timer and progress bar after an error, too
             if failed or finished is not None:
                 self._end(context)
         return finished or {"RUNNING_MODAL"}

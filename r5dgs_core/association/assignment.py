@@ -13,7 +13,7 @@ from scipy import optimize
 from . import leave_one_out, segment_stack
 
 PASSES = 3  # most rounds of `refine`
-STAY = 1.5  # factor on the score of the previous object
+STAY = 1.5  # factor by which the score of a segment's previous object is multiplied
 LOWEST = 0.3  # smallest score, relative to the object's usual IoU
 PART = 0.6  # smallest share of a part inside its object, relative to the usual share
 
@@ -26,7 +26,7 @@ class Assignment:
         labels: Object of each segment, 0 = background, -1 = none. [S]
         scores: Leave-one-out IoU with the object, relative to its usual IoU, averaged with that of the segment's run,
             and with a bonus for keeping the object; 0 without an object. [S]
-        plain: The same without run and bonus. [S]
+        plain: Scores without the average over the tracklet and without the bonus. [S]
         margins: Score divided by the sum of it and the next best object's score; 0.5 is a tie. [S]
         agreement: Mean leave-one-out IoU per object pixel; the measure for comparing assignments.
         usual_iou: Median leave-one-out IoU of the segments with an object in the previous labels.
@@ -96,7 +96,7 @@ def assign(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, cou
 
 
 def measure(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> Assignment:
-    """Measure how well the images agree on the given labels; arguments as in `refine`."""
+    """Evaluate given labels: scores, margins and mean agreement; arguments as in `refine`."""
     ious = np.concatenate([overlap.ious for overlap in leave_one_out.overlaps(stack, labels, count)])
     own = np.flatnonzero(labels > 0)
     scores = np.zeros(len(labels))

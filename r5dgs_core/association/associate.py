@@ -46,8 +46,8 @@ class Row:
         usual_id: Outgoing id of most pixels with the same incoming id in the same view.
         pixels: Size.
         score: Leave-one-out IoU with the object, relative to the usual IoU; 0 without an object.
-        done: ``kept`` if the outgoing id is the usual one, also for lack of evidence; ``relabelled`` if an id switch
-            was found; ``unknown``.
+        done: ``kept`` for the usual id, also if there is too little evidence; ``relabelled`` if an id switch was
+            corrected; ``unknown`` if there is no id.
     """
 
     image: int
@@ -104,7 +104,8 @@ def associate(
 
     Args:
         images: Bags of each image, see `segment_stack.from_pixels`.
-        neighbours: Nearest Gaussians of each Gaussian; if None, surplus Gaussians are dropped, not grouped. [N, k]
+        neighbours: Nearest Gaussians of each Gaussian; if None, Gaussians above ``most`` are dropped at random instead
+            of being grouped. [N, k]
         paths: Positions of the Gaussians at some times; Gaussians that move apart are not grouped. [N, T, 3]
         most: Number of Gaussians above which neighbours are first grouped to patches.
     """
@@ -137,7 +138,8 @@ def _objects(stack: segment_stack.Stack, runs: np.ndarray) -> tuple[np.ndarray, 
     """Initial objects [S], 0 = background, -1 = none, and their number K."""
     of_runs = clustering.cluster(clustering.gather(stack, runs))
     labels = np.where(runs >= 0, of_runs[runs] + 1, 0)
-    # Repeat with lower weights for Gaussians that show several objects, which geometry has placed outside their object.
+    # Repeat with lower weights for Gaussians that show several objects, because errors of the geometry placed them off
+    # their object.
     cast = sparse.csc_matrix(leave_one_out.cast(stack, labels, int(labels.max())))
     total = np.asarray(cast.sum(axis=1)).ravel()
     best = sparse.csr_matrix(cast[:, 1:].max(axis=1)).toarray().ravel()
@@ -157,7 +159,7 @@ def _objects(stack: segment_stack.Stack, runs: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _incoming(stack: segment_stack.Stack) -> assignment.Assignment:
-    """Measure how well the incoming ids explain the images."""
+    """Evaluate the incoming ids as labels."""
     ids, labels = np.unique(np.where(stack.ids > 0, stack.ids, 0), return_inverse=True)
     labels = labels if ids[0] == 0 else labels + 1
     return assignment.measure(stack, labels, int(labels.max()))

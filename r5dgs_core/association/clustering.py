@@ -19,7 +19,7 @@ from . import segment_stack
 
 SAME = 0.3  # smallest affinity to join two groups, relative to the usual IoU
 SIDE_BY_SIDE = 0.08  # largest share of the shorter group's images in which both may appear separately
-PRIOR = 5.0  # prior weight of the usual IoU of all views in that of two views, in pairs of runs
+PRIOR = 5.0  # weight, in tracklet pairs, of the usual IoU over all views when the usual IoU of two views is estimated
 PART = 0.6  # smallest share of a part inside a larger group, relative to the usual share of a group in itself
 HINT = 4.0  # largest factor on the affinity for equal ids, and largest divisor for different ids
 THIN = 0.1  # share of the smaller run's pixels below which common evidence is weak
@@ -31,7 +31,7 @@ class Evidence:
 
     Attributes:
         common: Weight of Gaussians in both runs. [T, T]
-        seen: Weight of a run (row) that is visible in the other's images (column). [T, T]
+        seen: Weight of the row's tracklet that is visible in the images of the column's tracklet. [T, T]
         together: Number of images that show both. [T, T]
         lengths: Number of images of each run. [T]
         pixels: Mean segment size of each run. [T]
@@ -179,7 +179,7 @@ def _join(common: np.ndarray, expected: np.ndarray, evidence: Evidence) -> np.nd
 
 
 def _absorb(evidence: Evidence, labels: np.ndarray) -> np.ndarray:
-    """Join groups to a larger group that contains them, if the whole is seen more often without the part than with it.
+    """Join groups to a larger group that contains them if fewer than half of its images show both.
 
     This undoes splits by the tracker. Two objects that a tracker sometimes merges behave the opposite way: they are
     mostly seen apart.

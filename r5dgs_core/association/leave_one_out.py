@@ -1,7 +1,7 @@
 """Leave-one-out overlap of segments with objects, by the votes of the other images.
 
 A Gaussian votes for an object with the share of its weight in segments of that object. Segments of the evaluated image
-have no vote, and Gaussians that no other image shows are no evidence.
+have no vote, and Gaussians that appear in no other image are ignored.
 
 Notation: S segments of all images, s of one image, N Gaussians, K objects, 0 = background.
 """

@@ -48,7 +48,7 @@ class Repair:
 
     @property
     def numbering(self) -> str:
-        """Scope of the new ids, as in `mask_notes`; ids that are kept stay valid per video, as before."""
+        """Scope of the new ids, as in `mask_notes`; if all incoming ids are kept, they remain valid per video."""
         apart = self.result.fallback and len({view.mask_video for view in self.views}) > 1
         return mask_notes.VIDEO if apart else mask_notes.SCENE
 
@@ -72,7 +72,7 @@ def repair(
     """Associate the segments of the training views' masks.
 
     Args:
-        scene: A scene trained from the data set; best without masks (`none`), so that wrong masks have no influence.
+        scene: A scene trained from the data set; preferably trained with --masks none.
         dataset: The data set, with the masks.
         progress: Called with events.
 

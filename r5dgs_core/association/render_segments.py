@@ -35,8 +35,7 @@ def draw(
         progress: Called with the number of finished views.
 
     Returns:
-        Bags of the views, in their order. Images share ``view`` if they belong to one video and were numbered
-        together.
+        Bags of the views, in their order. ``view`` is equal for images of one video with a common numbering.
     """
     video_of = {view.name: (video.name, view.mask_video) for video in videos.of(views) for view in video.views}
     number = {which: k for k, which in enumerate(dict.fromkeys(video_of.values()))}

@@ -42,7 +42,7 @@ def mend(
             yield mending.relabel(mask, images[image].ids, found.ids[image])
             continue
         posed = scene_renderer.PosedGaussians(scene_renderer.pose_frame(scene, scene_player.frame(scene, view.t)))
-        # Gaussians that the image does not show occlude nothing.
+        # Gaussians outside the image's bag cannot occlude.
         drawn = rasterize_splats(
             posed.means[seen],
             posed.quats[seen],

@@ -39,7 +39,7 @@ class ImageBags:
 def from_pixels(
     mask: np.ndarray, indices: np.ndarray, weights: np.ndarray, count: int, *, view: int, time: float
 ) -> ImageBags:
-    """Sum the Gaussians of an image's pixels to one bag per segment.
+    """Sum the blending weights of Gaussians over the pixels of each segment: one bag per segment.
 
     Args:
         mask: Incoming ids, 0 = background; pixels that are `masks.UNKNOWN` are ignored. [H, W] or [P]
@@ -56,7 +56,7 @@ def from_pixels(
     known = ids != masks.UNKNOWN
     used = (indices >= 0) & (weights > 0) & known[segment][:, None]
     rows = np.broadcast_to(segment[:, None], indices.shape)[used]
-    # By Gaussian first: each is in few segments, so duplicates are summed in short rows.
+    # Rows by Gaussian first: a Gaussian is in few segments, so duplicates are summed quickly.
     by_gaussian = sparse.coo_matrix((weights[used].astype(np.float32), (indices[used], rows)), (count, len(ids)))
     bags = by_gaussian.tocsr().T.tocsr()[np.flatnonzero(known)]
     return ImageBags(ids[known].astype(np.int32), pixels[known], bags, view, time)

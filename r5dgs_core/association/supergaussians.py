@@ -13,7 +13,7 @@ ROUNDS = 12  # most rounds of seeding
 
 
 def group(count: int, neighbours: np.ndarray | None, paths: np.ndarray | None, most: int) -> np.ndarray:
-    """Group neighbours to patches, each at most a Gaussian and its neighbours.
+    """Group neighbouring Gaussians into patches; a patch is a Gaussian and at most all of its neighbours.
 
     Args:
         count: Number of Gaussians, N.

@@ -1,7 +1,7 @@
 """Runs of segments (tracklets) on which tracker and geometry agree.
 
-Within a view, an incoming id is followed from image to image as long as the Gaussians agree. Otherwise the run ends and
-a new one begins, so an id switch costs a cut instead of a wrong run.
+Within a view, an incoming id is followed from image to image as long as the Gaussians agree. Otherwise a new tracklet
+begins. An id switch therefore splits a tracklet, but never mixes two objects.
 
 Notation: S segments, T runs (tracklets), I images.
 """
@@ -19,7 +19,7 @@ def link(stack: segment_stack.Stack) -> np.ndarray:
     """Number the runs.
 
     A segment continues the last segment with its id in its view if both are mutual best matches among the objects of
-    the two images. Images between them may lack the id.
+    the two images. The id may be missing in images between them.
 
     Returns:
         Run of each segment, -1 for background. [S]

@@ -1,4 +1,4 @@
-"""Data that the stages of baking pass on: the context of a run, and a draft of its scene.
+"""Data passed between the stages of baking: the context of a run, and a draft of its scene.
 
 A stage is a module with ``apply(draft, context) -> draft``. It leaves the arrays of its arguments unchanged.
 """
@@ -92,7 +92,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Observed:
-    """Content of a checkpoint without what the user switched off.
+    """Content of a checkpoint without the features that the user disabled.
 
     Attributes:
         cloud: The Gaussians in the canonical state.

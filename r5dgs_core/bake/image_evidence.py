@@ -40,7 +40,7 @@ STEP = 0.02  # change of the poses for finite differences of the images, rad or 
 
 @dataclass(frozen=True)
 class Support:
-    """Support of the images for a change from one motion of a group to a simpler one.
+    """Statistics of how the images change if a group's motion is simplified.
 
     Attributes:
         sigmas: Distance of the simpler motion from the best fit to the images, in standard deviations; negative if it
@@ -83,7 +83,7 @@ class ImageEvidence:
     def support(
         self, group: int, before: np.ndarray, after: np.ndarray, size: float, rows: Sequence[int] | None = None
     ) -> Support:
-        """Return the significance of a change of shape and place; both motions have the colours of ``after``.
+        """Return the significance of a change of shape and place; both are drawn with the colours of ``after``.
 
         Args:
             group: The group.

@@ -35,7 +35,7 @@ from . import bind_state, falling_bodies, image_evidence, needs, track_checks
 from .draft import Context, Draft, Need
 from .image_evidence import ImageEvidence
 
-LEVEL = 0.01  # probability with which noise alone passes for motion
+LEVEL = 0.01  # significance level: probability that noise is taken for motion
 LOSS = 0.03  # largest loss of PSNR on the training views by all simplifications together, dB
 SHAPE = 0.5  # share of shape in a turn's effect on the images, below which the turn serves colours (passing shadows)
 CLEARLY = 3.0  # change / allowed change above which one view per cluster decides

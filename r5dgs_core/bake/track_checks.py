@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 
 def sound(group: GroupTrack, name: str) -> GroupTrack:
-    """Return the group, or the group at rest, with a warning, if its track is not finite.
+    """Return the group; if its track is not finite, warn and return it at rest.
 
     Args:
         group: A motion group.

@@ -78,7 +78,7 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
 
 
 def run_case(plan: Plan, case: Case, remeasure: bool, progress: Progress) -> list[dict[str, Any]]:
-    """Train and measure a case as far as not done yet; returns its records, one per mode."""
+    """Train and measure what is missing of a case; returns its records, one per mode."""
     if not cases.is_finished(case):
         _train(plan, case, progress)
     record = cases.read_record(case)
@@ -113,7 +113,7 @@ def _train(plan: Plan, case: Case, progress: Progress) -> None:
         arguments += ["--config", str(plan.config_path)] if plan.config_path else []
         arguments += [text for override in case.overrides for text in ("--set", override)]
     before = record["sittings"]
-    # If this process is killed, the record holds a sitting of unknown cost.
+    # Write a session of unknown cost first, so that a kill is recorded.
     cases.write_record(case, {"sittings": [*before, {"status": None}]})
     log_path = case.beside(".log")
 

@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _explain(error: BaseException, args: argparse.Namespace) -> ExitStatus:
     """Print the error for the user; returns the exit status."""
     status = exit_status.of(error)
-    if isinstance(error, BrokenPipeError):  # the reader of our output is gone; discard the rest
+    if isinstance(error, BrokenPipeError):  # stdout was closed (for example by `head`); discard further output
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     elif status == ExitStatus.DEFECT:
         traceback.print_exception(error)

@@ -48,7 +48,7 @@ def apply(scene: Scene, captions: dict[str, Any], place: str) -> Scene:
 
 
 def find(scene: Scene, which: str, place: str) -> SceneObject:
-    """Return the object with an id, or else with a name; ids win because a name may be the number of another object."""
+    """Return the object with this id or name. Ids are tried first, because a name may equal another object's id."""
     for known in ({str(item.id): item for item in scene.objects}, {item.name: item for item in scene.objects}):
         if which in known:
             return known[which]

@@ -36,7 +36,7 @@ def chosen(args: argparse.Namespace) -> dict[str, Any]:
 def check(
     option: str, path: Path | None, camera: str | None = None, t: float | None = None, size: int | None = None
 ) -> None:
-    """Raise UsageError or ConfigError for options that no picture can be written with, before any work."""
+    """Raise UsageError or ConfigError if no picture can be written with these options, before any work."""
     if path is None:
         given = {"--camera": camera, "--time": t, "--size": size}
         lone = next((name for name, value in given.items() if value is not None), None)
@@ -67,7 +67,7 @@ def draw(
         scene: The scene.
         object_ids: Ids of the objects, at least one.
         out: PNG file.
-        camera: Name or number of the camera; the one that sees the objects best if None.
+        camera: Name or number of the camera; the camera that shows the objects best if None.
         t: Scene time, may exceed t_max; if None, the best of the first, middle and last observed time.
         mode: Playback mode past t_max.
         size: Pixels along the longer side; those of the camera if None.
@@ -97,7 +97,7 @@ def draw(
 def best_standpoint(
     scene: Scene, object_ids: Collection[int], camera: str | None, t: float | None, mode: str
 ) -> Standpoint:
-    """Return the camera and the time that see the objects best, of those given if any."""
+    """Return the camera and the time that see the objects best; a given camera or time is kept."""
     from ..render import viewpoints
 
     return viewpoints.best(scene, viewpoints.candidates(scene, camera, t), object_ids, mode)

@@ -49,7 +49,7 @@ class Inverse:
     reach: float
 
     def scene_linear(self, display: np.ndarray) -> np.ndarray:
-        """Scene-linear colours that are displayed as the given ones, or as near as the view can.
+        """Scene-linear colours whose display equals the given colours, or the nearest displayable ones.
 
         Args:
             display: Display colours, clamped to [0, 1] here. [..., 3]

@@ -1,1 +1,1 @@
-"""Configuration: sections, presets, TOML files, overrides and the user's settings."""
+"""Configuration: sections, presets, TOML files and overrides."""

@@ -141,7 +141,7 @@ def read(
     """Read and check a data set; images and masks are inspected but not loaded.
 
     Args:
-        root: Folder with ``transforms_train.json``, or with images and a COLMAP reconstruction (`colmap`).
+        root: Folder with ``transforms_train.json``, or with images and a COLMAP reconstruction (`layouts.colmap`).
         train_masks: Folder of the training views' masks, relative to ``root`` or absolute; ``none`` ignores masks.
             The other splits keep the data set's masks, as they serve evaluation. An ``objects.json`` in the folder
             marks its ids as its own; the true poses, which use the data set's ids, are then ignored.

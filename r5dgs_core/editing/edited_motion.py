@@ -190,7 +190,8 @@ def _go_on(
         scene: The original scene.
         cluster: The cluster.
         course: Its motion in the observed time.
-        leaders: New versions of the group that its own follows: course, new group, True if that moves as before.
+        leaders: New versions of the group that its own follows: course, new group, True if that group's motion is
+            unchanged.
         later: Times since t_max. [L]
         notes: List to which losses are appended.
 

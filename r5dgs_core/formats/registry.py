@@ -1,4 +1,4 @@
-"""Export formats, shared by ``r5dgs export`` and Blender: what each keeps of a scene, and what it loses."""
+"""Export formats, shared by ``r5dgs export`` and Blender, with the parts of a scene that each keeps and loses."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Format:
         return f"Keeps: {self.keeps}. Not kept: {self.loses}"
 
     def obstacle(self) -> str | None:
-        """Return why this Python cannot write the format and the remedy, or None if it can."""
+        """Return the reason and the remedy if this Python cannot write the format, else None."""
         missing = [name for name in self.packages if importlib.util.find_spec(name) is None]
         if not missing:
             return None

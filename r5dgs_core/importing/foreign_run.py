@@ -14,7 +14,7 @@ from ..scene.splats import Splats
 from .networks import DeformNetwork
 
 SPLATTING_NEAR = 0.2  # near plane of the 3DGS rasterizer, depth
-TRACE_NEAR = 0.8  # near plane of TRACE and FreeGave, which cull nearer Gaussians first
+TRACE_NEAR = 0.8  # near plane of TRACE and FreeGave: they cull Gaussians nearer than this before 3DGS's own near plane
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ class Options:
         iteration: Iteration to read; None for the last.
         data: Data set that the run was trained on; gives cameras, times and world axes.
         knots: Number of times at which the deformation is sampled; None for the data set's times, or
-            `datasets.FRAMES_PER_UNIT` per unit of time.
+            `data.dataset.FRAMES_PER_UNIT` per unit of time.
         t_max: Last time of the deformation; None for that of the run, else of the data set, else 1.
         world: Axes of the world, a key of `cameras.WORLD_TO_BLENDER`.
         still: Motion that is dropped, as a share of the scene's extent.

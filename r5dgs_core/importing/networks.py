@@ -249,7 +249,8 @@ def chain(layers: Sequence[Linear], x: Tensor, activation: Callable[[Tensor], Te
 def screw(w: Tensor, v: Tensor) -> Tensor:
     """Map of a screw as in Deformable-3DGS with 6 degrees of freedom. [N, 3], [N, 3] -> [N, 3, 4]
 
-    The axis is w / |w| + 1e-5, as in training, so neither is it exactly a unit vector nor the map exactly rigid.
+    The axis is w / |w| + 1e-5, as in training, so the axis is not exactly a unit vector and the map is not exactly
+    rigid.
     """
     theta = torch.linalg.norm(w, dim=-1, keepdim=True)
     w, v = w / theta + 1e-5, v / theta + 1e-5

@@ -18,9 +18,9 @@ import numpy as np
 
 from . import common_nouns
 
-FALSE_ALARMS = 0.1  # accepted share of prompts for absent things that match something
+FALSE_ALARMS = 0.1  # accepted share of prompts for missing objects that still match an object
 _MOST_EACH = 0.02  # the same for a single object
-_LIKELY_TRUE = 0.03  # share of the nouns that may be true for an object without a known name
+_LIKELY_TRUE = 0.03  # assumed share of nouns that describe an object whose name is not a noun of the list
 _MARGIN = 2.0  # distance of further matches below the best cosine, in standard deviations; 1.5 to 2.5 work as well
 
 

@@ -21,7 +21,7 @@ class TrackSettings:
 
     Attributes:
         key_frames: Number of images in which all objects are segmented.
-        overlap: IoU from which a segment of a key frame is the same as an object tracked into it.
+        overlap: IoU from which a segment of a key frame is taken for an already tracked object.
         objects: Most objects per video.
         together: Objects tracked at once; bounds the memory.
         gap: Longest gap in an object's track, in images, whose likely pixels are marked unknown instead of background.

@@ -44,7 +44,7 @@ def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
 
 
 def in_chunks(function: Callable[[Tensor], Tensor], rows: Tensor, chunk: int) -> Tensor:
-    """Apply ``function`` to the rows in chunks, so that intermediate values of one chunk are in memory.
+    """Apply ``function`` to the rows in chunks, so that only the intermediate values of one chunk are in memory.
 
     With gradients, several chunks are recomputed in the backward pass (checkpointing).
     """

@@ -1,4 +1,4 @@
-"""Trainable Gaussians: raw parameters by name, with labels that are kept in step.
+"""Trainable Gaussians: raw parameters by name, with labels that are updated together with them.
 
 Notation: N Gaussians, K spherical harmonics bases.
 """
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 # ``sh`` [N, 1, 3] is the constant colour and ``sh_rest`` [N, K - 1, 3] the view-dependent part, as they have different
-# learning rates. ``shading`` is the vector g of `posing.py`.
+# learning rates. ``shading`` is the vector g of `train.representations.fused_posing`.
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh", "sh_rest", "shading")
 # Parameters of some runs only: identity encodings.
 OPTIONAL = ("identities",)

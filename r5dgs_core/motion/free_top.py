@@ -18,7 +18,7 @@ import numpy as np
 from . import rotations
 
 DISTINCT = 0.1  # least relative difference of moments that makes a visible tumble
-LINE = 1e-3  # smallest / largest moment; a line, which has no spin about itself, is below
+LINE = 1e-3  # smallest ratio of the smallest to the largest moment; collinear bodies are below it
 _GAP = 1e-9  # least relative gap between moments; Euler's solution divides by their differences
 _SAMPLES = 256  # per period; the Fourier series converges like exp(-n), more slowly near a separatrix
 _LEAST = 1e-300

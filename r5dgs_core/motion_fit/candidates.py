@@ -116,7 +116,7 @@ class Candidate:
         return models.KINDS[self.kind].events(self.parts(theta), self.window)
 
 
-# Ordered by the number of parameters; among equals, the simpler motion first.
+# Ordered by number of parameters; with equal numbers, motions without oscillation first, then in the order of `_NAMES`.
 ALL = sorted(
     (Candidate(name, kind, fit) for kind in models.KINDS for name, fit in models.KINDS[kind].fits.items()),
     key=lambda candidate: (candidate.parameters, candidate.oscillates),

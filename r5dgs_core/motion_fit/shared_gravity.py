@@ -14,7 +14,7 @@ import numpy as np
 
 from . import model_selection, noise
 
-# Candidates with a free acceleration -> the same without it.
+# Each candidate with a free acceleration, and the candidate without it.
 FALLING = {"translation, quadratic": "translation", "ballistic + spin": "translation + spin"}
 AGREE = 11.34  # largest squared Mahalanobis distance: 99 % quantile of chi2 with three degrees of freedom
 

@@ -1,6 +1,7 @@
 """Gaussians transformed by an affine map, with shapes, harmonics and shading applied.
 
-The result suits renderers that know nothing of our scenes: no rotation, tint or shading is left to apply.
+The result can be drawn by renderers without support for rotation, tint or shading: no rotation, tint or shading is left
+to apply.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ class OwnMotion:
 
     Args:
         scene: The scene, with `point_dynamics`.
-        rows: Rows that do so, or None for all.
+        rows: These Gaussians; None for all.
     """
 
     def __init__(self, scene: Scene, rows: np.ndarray | None = None):
@@ -137,7 +137,8 @@ class Literal:
 
     Args:
         scene: The scene, with `point_dynamics` and `canonical_means`.
-        anchored: True to give Gaussians outside bodies a representative too, as in the paper's text; else they stay.
+        anchored: True to give Gaussians outside bodies a representative too, as in the paper's text; otherwise they
+            stay in place.
     """
 
     def __init__(self, scene: Scene, anchored: bool = False):

@@ -83,7 +83,8 @@ class RenderRequest:
 
         Args:
             request: The request.
-            numbers: Scene number of each loaded path; the request counts paths, the result scenes.
+            numbers: Scene number of each loaded path; scene indices of the request refer to paths, those of the result
+            to loaded scenes.
 
         Raises:
             ConfigError: A field is invalid; the message names it.

@@ -34,7 +34,7 @@ def seen_colors(
 
     Args:
         means: Centres. [N, 3]
-        sh: Coefficients in the order of `sh_color.basis`; only those of degree 0 if ``rest`` is given.
+        sh: Coefficients in the order of `spherical_harmonics.basis`; only those of degree 0 if ``rest`` is given.
         eyes: Eye of each pose in the frame of ``means``, or one for all. [P, 3] or [3]
         rest: Coefficients of degree 1 and higher. [N, K - 1, 3]
         view_maps: Linear map of each pose from directions to the frame of the coefficients; the result is normalised.

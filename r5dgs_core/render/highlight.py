@@ -1,6 +1,6 @@
 """Pictures of selected objects: isolated on transparency, or highlighted in the dimmed scene.
 
-Selection goes by object id. An isolated object also shows the parts that other objects occlude.
+Objects are selected by id. An isolated object also shows the parts that other objects occlude.
 """
 
 from __future__ import annotations

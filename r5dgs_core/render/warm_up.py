@@ -19,7 +19,7 @@ _SH = 4  # coefficients: degree 1, the least that has kernels
 def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = None) -> float:
     """Compile or load all kernels of the fastest backend on the CPU.
 
-    The first call after installation takes ten to fifteen seconds; later processes take well below one.
+    The first call after installation takes 10 to 30 s; in later processes it takes less than 1 s.
 
     Args:
         gradients: True to include the kernels that only training needs.

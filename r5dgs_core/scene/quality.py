@@ -11,7 +11,7 @@ import numpy as np
 from .. import errors, strict_json
 from .scene import Scene
 
-MODE = "rigid"  # Blender's playback mode, see `playback.MODES`
+MODE = "rigid"  # Blender's playback mode, see `playback.modes.MODES`
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def of(scene: Scene, path: Path | None = None) -> Quality:
 
 
 def _evaluation(scene: Scene, path: Path | None) -> dict[str, Any]:
-    """Splits of the evaluation beside a scene file; empty if there is none for this scene."""
+    """Splits of the evaluation beside a scene file; empty if no evaluation of this scene exists."""
     if path is None:
         return {}
     for place in (path.with_suffix(".evaluation.json"), path.with_name("evaluation.json")):

@@ -1,4 +1,4 @@
-"""The `Splats` dataclass, Gaussians as most programs know them, and their opacities."""
+"""The `Splats` dataclass, static Gaussians without objects, as in 3DGS PLY files, and their opacities."""
 
 from __future__ import annotations
 

@@ -236,7 +236,7 @@ def _fulfil(
         return named
     known = {label.object_id: label for label in labels}
     meant = [one for one in stored.ask(meanings, query) if one.object_id in known and one.object_id >= 0]
-    if row is not None:  # a known word is neither a typo nor a prefix of another: "car" is not "cart"
+    if row is not None:  # a word with a stored embedding is not matched as a typo or prefix of another word
         fitting = {one.object_id for one in meant if one.score >= stored.PASS}
         named = [m for m in named if m.object_id in fitting or _ends_with(known[m.object_id], wish[-1])]
     word = said if row is None else meanings.vocabulary[row]

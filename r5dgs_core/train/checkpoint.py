@@ -44,7 +44,7 @@ class Run:
         digest: Hash of the data set's content.
         config: Configuration of the run.
         versions: Versions of Python and packages.
-        platform: Hardware that timings depend on, as from `machine`; empty if unknown.
+        platform: Hardware that timings depend on, as from `render.machine.describe`; empty if unknown.
     """
 
     folder: Path

@@ -3,7 +3,7 @@
 Once all times have entered and the tracks have settled, training continues for some steps with a residual field on all
 bodies. Then the residuals of each body are left out in turn, and the increase of the error on that body is measured on
 views that these steps did not use. The run then returns to its state before the trial, and only bodies with an increase
-above a threshold keep their residuals. If no body does, the run continues with the same bits as one without a trial.
+above a threshold keep their residuals. If no body does, the run continues exactly as without a trial, bit for bit.
 """
 
 from __future__ import annotations

@@ -7,10 +7,10 @@ of the arrays that the line announces, in order:
     <- {"id": 1, "ok": true, "result": {...}, "arrays": [{"name": "color", "dtype": "<f4", "shape": [H, W, 3]}]} + bytes
     <- {"id": 1, "ok": false, "error": {"kind": "SceneFileError", "message": "..."}}
 
-The scenes of the last ``load`` stay in memory. The worker exits at the end of its input. Torch and the rasterizer are
-imported lazily, after the first response, so that ``hello`` can report missing packages. Kernels are then loaded in a
-background thread; render requests block until it finishes. If kernels have to be compiled, events without an id are
-sent between responses:
+The scenes of the last ``load`` stay in memory. The worker exits at the end of its input. The rasterizer is imported
+after the first response, so that ``hello`` can report missing packages, and torch only for encoders. Kernels are then
+loaded in a background thread; render requests block until it finishes. If kernels have to be compiled, events without
+an id are sent between responses:
 
     <- {"event": "compiling", "text": "rasterizer: compiling ...", "arrays": []}
     <- {"event": "ready", "seconds": 7.9, "arrays": []}

@@ -46,7 +46,7 @@ class Warming:
         try:
             with compilation.telling(lambda text: self._tell({"event": "compiling", "text": text})):
                 over = {"event": "ready", "seconds": round(warm_up.warm_up(gradients=False), 2)}
-        except Exception as error:  # the next render request meets it again; the traceback goes to the log
+        except Exception as error:  # the next render request raises the same error; the traceback goes to the log
             traceback.print_exc()
             over = {"event": "failed", "text": f"{type(error).__name__}: {error}"}
         if compilation.compiled():  # every "compiling" event is followed by "ready" or "failed"

@@ -12,7 +12,7 @@ from .. import inputs, options
 if TYPE_CHECKING:
     from ...association.mask_repair import Repair
 
-SHOWN = 12  # printed changes
+SHOWN = 12  # largest number of changes to print
 
 
 NAME = "associate"

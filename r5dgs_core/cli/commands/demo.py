@@ -22,7 +22,7 @@ NAME = "demo"
 SHORT = "train, bake and evaluate the bundled data set"
 LONG = (
     "Train the bundled data set, bake a scene file, evaluate it on held-out views and draw a contact sheet.\n"
-    "Takes about two minutes on two cores."
+    "Takes two to four minutes on two cores."
 )
 EXAMPLE = "--out demo"
 PAGE = "user/training.md"

@@ -116,7 +116,7 @@ def _check_arguments(chosen: registry.Format, out: Path, t: float | None, words:
 
 
 def _selection(scene: Scene, t: float | None, frames: tuple[int, int] | None, words: str | None) -> registry.Options:
-    """Return the part of the scene that the arguments of `run_export` choose."""
+    """Return the selected part of the scene (frames and objects)."""
     numbers = None if frames is None else tuple(range(frames[0], frames[1] + 1))
     times = (scene.t_max if t is None else t,)
     if numbers is not None:

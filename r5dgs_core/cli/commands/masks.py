@@ -170,7 +170,7 @@ def _make(views: Sequence[View], maker: Any, folder: Path, in_place: bool, overw
 
 
 def _check_unknown(unknown: int | None, folder: Path) -> None:
-    """Raise ConfigError for a value of unknown pixels that the notes of the checked masks do not have."""
+    """Raise ConfigError if --unknown differs from the value in the masks' notes (masks.json)."""
     from ...data import mask_notes
 
     if unknown is not None and unknown != mask_notes.read(folder).unknown:

@@ -68,8 +68,9 @@ def run_query(
     Args:
         path: The scene file.
         text: One or more things to find.
-        encoder: Folder of the encoder that made the scene's lookup table, or "text". It embeds phrases that neither
-            names nor stored words answer. Another encoder is refused even if no phrase is left. If None, the encoder
+        encoder: Folder of the encoder that made the scene's lookup table, or "text". It embeds phrases that match
+        neither a name nor a stored word. An encoder other than the table's is refused, even if no phrase needs an
+        encoder. If None, the encoder
             of the user's settings is used if it made the table.
         threshold: Minimum score of a match; the default threshold if None.
         as_json: Print JSON instead of a table.

@@ -76,7 +76,7 @@ def run_report(
 
     Args:
         target: Run folder or ``.r5dgs`` file.
-        data: Data set; if None, the one that a run was trained on, and none for a file.
+        data: Data set; if None, that of the run; a scene file is then measured without data.
         out: Folder of ``report.json``, ``.csv``, ``.md`` and ``.png``.
         tasks: Tasks to measure; all if None.
         splits: Splits whose images are compared; "test" if None.

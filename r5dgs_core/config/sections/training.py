@@ -24,7 +24,7 @@ class TrainSection:
         sh_degree: Degree of the spherical harmonics of view-dependent colour, 0 to 3.
         sh_every: Steps between raising the trained degree by one, up to ``sh_degree`` (1000 in 3DGS). 0 trains all
             degrees from the start.
-        threads: CPU threads of torch. More than one does not make training faster, as its arrays are small.
+        threads: CPU threads of torch. More threads do not make training faster, because the tensors are small.
         checkpoint_every: Steps between checkpoints.
         log_every: Steps between lines of the log.
         probe_every: Steps between measurements of the PSNR on held-out views (split ``val``). 0 turns them off.

@@ -132,7 +132,7 @@ class MotionKind:
             t_max (r, e).
         blocks: Sizes and priors of blocks of `fits` that no other kind has; `BLOCKS` has the common ones.
         fits_by_default: False if a caller must choose these candidates by name.
-        may_tumble: True if the fit of a body that tumbles freely may be of this kind.
+        may_tumble: True if a freely tumbling body may be fitted by this kind, so that the free top is tried.
         drawn_fits: Sets of free rates with which `fit_drawn_curve` tries this kind.
     """
 
@@ -156,7 +156,7 @@ class MotionKind:
         raise NotImplementedError
 
     def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:
-        """Poses of `motion`; defined only if they cost less than the derivatives."""
+        """Poses without derivatives; override if this is cheaper than `motion`."""
         return self.motion(rates, span)[:2]
 
     def curve(self, model: MotionModel, tau: np.ndarray, most_steps: int | None) -> Curve:

@@ -12,7 +12,7 @@ from .twist import Twist
 
 _STEP_TOLERANCE = 1e-9  # allowed Magnus-4 error, in radii
 _MOST_STEPS = 1 << 20  # Magnus steps to one time
-_FIT_STEPS = 16  # Magnus steps to each time that are accurate enough to compare candidates
+_FIT_STEPS = 16  # number of Magnus steps per time when candidates are compared
 
 
 class WorldTwist(Twist):
@@ -61,7 +61,7 @@ KIND = WorldTwist()
 def _poses(model: MotionModel, tau: np.ndarray, most_steps: int | None) -> se3.Pose:
     """Magnus-4 poses, each time with its own number of steps rounded up to a power of two.
 
-    Poses are NaN at times that no number of steps reaches within the tolerance.
+    Poses are NaN at times for which no number of steps meets the tolerance.
     """
     v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
     flat = tau.reshape(-1)

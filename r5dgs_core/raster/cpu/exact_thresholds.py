@@ -1,8 +1,8 @@
 """Float64 decisions at the thresholds, for the few pixels that float32 cannot decide.
 
-A contribution near ``alpha_min``, or a pixel near ``transmittance_min``, is kept or dropped as a whole, so rounding at
-the threshold changes the pixel by far more than rounding. The blending kernels therefore call these helpers for such
-pixels. See `batches` for blocks, lanes and tiles.
+A contribution near ``alpha_min``, or a pixel near ``transmittance_min``, is kept or dropped as a whole, so a rounding
+error at the threshold changes the pixel by much more than a rounding error elsewhere. The blending kernels therefore
+call these helpers for such pixels. See `batches` for blocks, lanes and tiles.
 """
 
 from __future__ import annotations

@@ -152,7 +152,7 @@ class MCMC:
         return rows.clamp(max=int(torch.nonzero(weights).max()))
 
     def _divide(self, gaussians: Gaussians, source: Tensor) -> None:
-        """Set opacity and size of each drawn Gaussian so that it and the copies drawn from it look like it did."""
+        """Set opacity and size of each drawn Gaussian so that it and its copies together look like the original."""
         opacities = torch.sigmoid(gaussians.params["opacity_logits"])
         rows, times = source.unique(return_counts=True)
         each, factor = divided(opacities[rows].clamp(max=1 - 1e-6), (times + 1).clamp(max=MOST))

@@ -50,7 +50,7 @@ class Changes:
 
     Attributes:
         neighbours: Changed by the spatial neighbours.
-        motion: Changed by the motion group, where the neighbours alone would not have changed it.
+        motion: Changed because of the motion group; the neighbours alone would not have changed the label.
         outliers: Changed because they lie apart from their object and have few votes for it.
         gaussians: Number of Gaussians in total.
     """

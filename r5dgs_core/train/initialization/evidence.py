@@ -131,8 +131,8 @@ def absent(views: Sequence[TrainView], places: Places, times: np.ndarray) -> np.
         times: The observed times. [S]
 
     Returns:
-        True if absent. Times without evidence are filled from the nearest time of the same gap between masks that has
-        evidence. [M, S] bool
+        True if absent. Times without evidence take the value of the nearest time with evidence in the same gap between
+        masks. [M, S] bool
     """
     votes = np.zeros(places.measured.shape)
     asked = np.zeros(places.measured.shape)

@@ -135,7 +135,7 @@ def regroup(path: np.ndarray, ids: np.ndarray, opacities: np.ndarray, groups: Se
     Returns:
         Groups. [R] int64
 
-    Source: the rule of our study of a prototype on one scene, with lengths as shares of a radius. On ten fields of five
+    Source: own rule, with lengths as shares of a radius (docs/results/field.md). On ten fields of five
         scenes, halving or doubling any threshold but `NEAR` changes less than 0.1 dB; a sixth of this `NEAR` loses up
         to 0.9 dB.
     """

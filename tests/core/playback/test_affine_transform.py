@@ -166,6 +166,16 @@ def test_joining_keeps_order_and_fills_lower_degrees_with_nothing():
     assert affine_transform.join([]).means.shape == (0, 3)
 
 
+def test_the_nearest_rotation_of_a_stretched_turn_is_the_turn():
+    random = np.random.default_rng(2)
+    turns = rotations.quats_to_rotmats(rotations.normalize(random.normal(size=(5, 4))))
+    roots = random.normal(size=(5, 3, 3))
+    stretched = turns @ (roots @ np.swapaxes(roots, -1, -2) + 0.1 * np.eye(3))
+    np.testing.assert_allclose(affine_transform.nearest_rotation(stretched), turns, atol=1e-9)
+    np.testing.assert_allclose(affine_transform.nearest_rotation(stretched * [-1, 1, 1]), turns, atol=1e-9)
+    np.testing.assert_allclose(affine_transform.nearest_rotation(stretched[0]), turns[0], atol=1e-9)
+
+
 def test_a_map_that_flattens_space_is_refused():
     splats = affine_transform.bind_state(make_scene(n=10, objects=0, unassigned=0), slice(None))
     for bad in (matrix_of(np.diag([1.0, 0, 1])), np.full((4, 4), np.nan), np.eye(3)):

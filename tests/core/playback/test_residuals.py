@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.motion import rotations, se3
+from r5dgs_core.motion import cubic_curves, rotations, se3
 from r5dgs_core.playback import group_dynamics, residuals, scene_info, scene_player
 from r5dgs_core.scene import row_runs, scene_file
 from r5dgs_core.scene.scene import Scene
@@ -41,6 +43,36 @@ def twisting(scene: Scene) -> Scene:
         tile = np.ones((len(rows), 1))
         dynamics[rows] = np.concatenate([v, tile * w, a, tile * e], -1)
     return scene.with_arrays(dynamics=dynamics, canonical_means=scene.gaussians.means.copy())
+
+
+@pytest.mark.parametrize("knots", [len(TIMES), 2])
+def test_residuals_are_the_curves_of_their_knots(knots):
+    rng, rows = np.random.default_rng(3), np.array([5, 9, 40, 41], np.int32)
+    times = TIMES[-knots:]
+    offsets, growths = rng.normal(size=(2, len(rows), knots, 3)).astype(np.float32)
+    quats = rotations.normalize(rng.normal(size=(len(rows), knots, 4))).astype(np.float32)  # large turns, any signs
+    base = make_scene(60)
+    scene = base.with_arrays(
+        track_times=times,
+        track_poses=base.tracks.poses[:, -knots:],
+        residual_rows=rows,
+        residual_offsets=offsets,
+        residual_quats=quats,
+        residual_log_scales=growths,
+    )
+    player = residuals.Residuals(scene)
+    signed = np.moveaxis(rotations.make_continuous(np.moveaxis(quats.astype(np.float64), 1, 0)), 0, 1)
+    for t in (times[0] - 1, *np.linspace(times[0], times[-1], 60)[:-1], np.nextafter(T_MAX, 0.0), *times[:-1]):
+        for found, values, unit in zip(player.at(t), (offsets, signed, growths), (False, True, False), strict=True):
+            values = values.astype(np.float64)
+            slopes = cubic_curves.slopes(times, values)
+            wanted = [
+                cubic_curves.evaluate(cubic_curves.Keys(times, v, r, r), np.array(t), unit=unit)
+                for v, r in zip(values, slopes, strict=True)
+            ]
+            sign = np.sign((found.T * wanted).sum(-1, keepdims=True)) if unit else 1
+            np.testing.assert_allclose(found.T * sign, wanted, atol=1e-9)
+    assert player.at(T_MAX) is None
 
 
 @pytest.mark.parametrize("k", [0, 3, 7])
@@ -159,7 +191,7 @@ def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, v
     rigid, own = scene_player.frame(scene, 1.1, f"rigid{variant}"), scene_player.frame(scene, 1.1, "standard")
     everyone = np.arange(len(scene.gaussians.means), dtype=np.int32)
     some = np.flatnonzero(scene.gaussians.motion_ids == 1)[::3].astype(np.int32)
-    for rows, size in ((None, 0.0), (everyone, 1e-3), (some, 0.5), (everyone, 0.5)):
+    for rows, size in ((None, 0.0), (everyone, 1e-3), (some[:1], 0.5), (some, 0.5), (everyone, 0.5)):
         changed = scene if rows is None else loose(scene, rows, size)
         frame = scene_player.frame(changed, 1.1, f"hybrid{variant}")
         free = np.zeros(len(scene.gaussians.means), bool)
@@ -195,6 +227,16 @@ def test_an_anchored_background_goes_with_its_representative(twisted):
     np.testing.assert_allclose(anchored.means[still], scene.gaussians.means[still] + moved, atol=1e-6)
     body = scene.gaussians.motion_ids == 1
     np.testing.assert_array_equal(anchored.means[body], pinned.means[body])
+
+
+def test_the_first_gaussian_of_a_scene_can_represent_a_body_in_the_literal_form(twisted):
+    groups = tuple(dataclasses.replace(g, anchor_index=0) if g.id == 1 else g for g in twisted.groups)
+    dynamics = twisted.dynamics.rates.copy()
+    dynamics[0] = [0.3, 0.0, -0.1] + [0] * 9
+    scene = dataclasses.replace(twisted.with_arrays(dynamics=dynamics), groups=groups)
+    body = scene.gaussians.motion_ids == 1
+    moved = scene_player.frame(scene, T_MAX + 0.5, "rigid_paper").means[body] - scene.gaussians.means[body]
+    np.testing.assert_allclose(moved, np.broadcast_to([0.15, 0.0, -0.05], moved.shape), atol=1e-6)
 
 
 def test_modes_without_canonical_places_lack_the_literal_form():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import cubic_curves, models, rotations
-from r5dgs_core.playback import scene_player
+from r5dgs_core.playback import posing, scene_player
 from r5dgs_core.scene import cameras, row_runs, validation
 from tests.support.scenes import T_MAX, make_scene
 
@@ -129,6 +129,24 @@ def test_shading_follows_the_light_in_the_objects_frame(scene):
     dark = scene.with_arrays(shading=scene.shading.vectors * 1e4)
     assert scene_player.frame(dark, 1.1).shading_factor.min() == 0
     assert scene_player.frame(make_scene(shading=False), 1.1).shading_factor is None
+
+
+def test_one_turn_lights_gaussians_as_the_same_turn_for_each(scene):
+    turns = rotations.quats_to_rotmats(rotations.normalize(np.random.default_rng(4).normal(size=(30, 4))))
+    rest, vectors, light = posing.rest_factors(scene)[:30], scene.shading.vectors[:30], scene.shading.light
+    wanted = [max(r + (turn.T @ light - light) @ v, 0) for r, v, turn in zip(rest, vectors, turns, strict=True)]
+    np.testing.assert_allclose(posing.lit(rest, vectors, light, turns), wanted, atol=1e-6)
+    for k in range(30):
+        one = posing.lit(rest[k : k + 1], vectors[k : k + 1], light, turns[k])
+        assert one == pytest.approx(wanted[k], abs=1e-6)
+
+
+@pytest.mark.parametrize("t", [0.2, T_MAX, 1.1])
+def test_posing_groups_as_playback_does_gives_its_frame(scene, t):
+    played = scene_player.frame(scene, t)
+    posed = scene_player.pose(scene, played.group_quats, played.group_displacements, t)
+    for one, other in zip(dataclasses.astuple(posed), dataclasses.astuple(played), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_sh_rotations_bring_directions_into_the_bind_frame(scene):

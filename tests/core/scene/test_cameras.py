@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -108,3 +110,41 @@ def test_a_part_of_a_picture_and_another_size_see_the_same_rays(camera):
     one, _ = cameras.project(camera, points)
     other, _ = cameras.project(small, points)
     np.testing.assert_allclose(other, one * [80 / 160, 30 / 90], atol=1e-9)
+
+
+def test_a_moved_camera_sees_a_moved_world(camera):
+    shift, points = np.array([3.0, -1.0, 0.5]), camera.center + cameras.pixel_rays(camera)[::30, ::40].reshape(-1, 3)
+    for found, expected in zip(
+        cameras.project(cameras.moved(camera, shift), points + shift), cameras.project(camera, points), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert cameras.moved(camera, np.zeros(3)) is camera
+
+
+def changed(matrix, at, value):
+    matrix = matrix.copy()
+    matrix[at] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (lambda c: {"width": 32.0}, TypeError, "whole numbers of pixels"),
+        (lambda c: {"height": 0}, ValueError, "width and height of 1 to"),
+        (lambda c: {"width": cameras.MOST_PIXELS + 1}, ValueError, "width and height of 1 to"),
+        (lambda c: {"intrinsics": c.intrinsics.tolist()}, TypeError, "intrinsics: expected an array"),
+        (lambda c: {"T_cam_world": c.T_cam_world[:3]}, ValueError, r"T_cam_world: expected shape \(4, 4\)"),
+        (lambda c: {"T_cam_world": changed(c.T_cam_world, (1, 3), np.nan)}, ValueError, r"nan at index \(1, 3\)"),
+        (lambda c: {"T_cam_world": changed(c.T_cam_world, (0, 3), 1e300)}, ValueError, r"1e\+300 at index \(0, 3\)"),
+        (lambda c: {"intrinsics": changed(c.intrinsics, (2, 2), 2.0)}, ValueError, "as the last row"),
+        (lambda c: {"T_cam_world": c.T_cam_world @ np.diag([2.0, 2, 2, 1])}, ValueError, "expected a rotation"),
+        (lambda c: {"T_cam_world": np.diag([1.0, 1, -1, 1])}, ValueError, "expected a rotation"),
+        (lambda c: {"intrinsics": changed(c.intrinsics, (1, 0), 0.1)}, ValueError, r"expected 0 at index \(1, 0\)"),
+        (lambda c: {"intrinsics": changed(c.intrinsics, (1, 1), 0.0)}, ValueError, "focal lengths above 0"),
+    ],
+)
+def test_unusable_cameras_are_refused_by_the_name_of_the_entry(camera, change, error, message):
+    cameras.check(camera)
+    with pytest.raises(error, match=f"camera {camera.name!r}: .*{message}" if camera.name else message):
+        cameras.check(dataclasses.replace(camera, **change(camera)))
