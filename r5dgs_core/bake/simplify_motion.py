@@ -28,6 +28,7 @@ from scipy import stats
 from ..config.sections.needs import NeedsSection
 from ..motion import free_top, rotations
 from ..motion_fit import model_selection, shared_gravity
+from ..motion_fit import noise as noises
 from ..playback import visibility
 from ..scene.scene import Scene
 from ..scene.splats import to_opacities
@@ -279,7 +280,7 @@ def _fit(
         radius=scene.groups[group].model.radius,
         weights=track.weights,
         inertia=body,
-        least_noise=(noise.get(False, 0.0), noise.get(True, 0.0)),
+        least_noise=noises.of_images(scene.groups[group].model.radius, noise.get(False, 0.0), noise.get(True, 0.0)),
         up=falling_bodies.UP.get(scene.world_convention),
     )
     return track, fit

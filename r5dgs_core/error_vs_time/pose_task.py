@@ -12,7 +12,7 @@ from .. import timing
 from ..data.dataset import GroundTruth
 from ..evaluation import ground_truth_poses, metrics
 from ..motion import free_top, models, rigid_fit
-from ..motion_fit import candidates, model_selection
+from ..motion_fit import candidates, model_selection, noise
 from ..playback import group_dynamics, scene_player
 from ..scene.scene import MotionGroup, Scene
 from .report_rows import Row, spread
@@ -154,6 +154,7 @@ def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -
         weights=seen.astype(np.float64),
         candidates=names,
         inertia=shape,
+        least_noise=noise.of_images(group.model.radius),
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from ..motion import rotations, se3
 from ..motion.history import MOST_KNOTS, Band
 from ..motion.pose_track import PoseTrack
-from . import candidates as families
+from . import rolling
 from .candidates import Noise, Solution
 from .evidence import Evidence
 from .fitted_motion import FADE_PER_SPAN
@@ -25,8 +25,7 @@ WIDE = 0.33  # half width from which a motion is not predictable, in radii
 _MULTIPLE = 1.65  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
 _SOFT = 4.0  # difference of scores that reduces a candidate's weight by e
 _FARTHEST = 8.0  # radii; largest counted distance of another candidate
-_FEWEST = 8  # poses of a track that can be refitted to fewer
-_MOST_SQUARE, _MOST_SCALE = 600.0, 36.0  # limits of the misses of rolling origins
+_MOST_SCALE = 36.0  # limit of the misses of earlier predictions, which scale the covariance
 
 
 def of(
@@ -42,7 +41,7 @@ def of(
     place2, turn2 = _spread(chosen, all_solutions, evidence, tau)
     fading = np.exp(-2 * tau / FADE_PER_SPAN)  # of the bind state, which is a noisy pose
     last = evidence.level * fading
-    scale = _rolling(chosen, track, noise, evidence)
+    scale = min(max(rolling.misses(chosen, track, noise, evidence), 1.0), _MOST_SCALE)
     turn = scale * turn + turn2 + 3 * noise.turn**2 * last
     width = _MULTIPLE * np.sqrt(scale * place + place2 + 3 * noise.place**2 * last + 2 / 3 * turn)
     wide = np.flatnonzero(width > WIDE)
@@ -122,29 +121,3 @@ def _spread(
         place += weight * np.minimum(((other_d - d) ** 2).sum(-1), _FARTHEST**2)
         turn += weight * angle**2
     return place, turn
-
-
-def _rolling(chosen: Solution, track: PoseTrack, noise: Noise, evidence: Evidence) -> float:
-    """Mean square of the chosen law's misses when it is refitted to earlier poses, over that expected; 1 to 36.
-
-    The expected square of a miss is that of the noise plus the variance of the refitted prediction.
-    """
-    count = len(track)
-    if count < _FEWEST:
-        return 1.0
-    shares = []
-    most = count - chosen.candidate.last_choice  # poses that may be left out
-    for held in sorted({1, max(3, math.ceil(0.2 * count)), count // 3}):
-        if chosen.parameters > 4 * (count - held) or held > most:
-            continue
-        earlier = families.solve(chosen.candidate, track.rows(slice(0, count - held)), noise, [chosen.theta], steps=8)
-        if earlier is None:
-            return _MOST_SCALE
-        step = 1e-6
-        nearby = earlier.theta + step * np.eye(len(earlier.theta) + 1, len(earlier.theta), -1)
-        late = families.residuals(chosen.candidate, nearby, track.rows(slice(count - held, None)), noise)
-        slopes = (late[1:] - late[0]) / step  # [P, H, 6]
-        expected = 6 + np.einsum("phc,pq,qhc->h", slopes, earlier.inverse, slopes)
-        squares = np.minimum((late[0] ** 2).sum(-1), _MOST_SQUARE * evidence.variance)
-        shares.append(squares / np.maximum(expected, 6.0) / evidence.variance)
-    return min(max(float(np.concatenate(shares).mean()), 1.0), _MOST_SCALE) if shares else 1.0

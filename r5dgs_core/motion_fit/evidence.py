@@ -15,7 +15,8 @@ import numpy as np
 
 from .candidates import Solution
 
-STRONG = 10.0  # difference of scores that a break needs, and within which the simplest law is taken
+STRONG = 10.0  # difference of scores that a break needs
+NEAR = 6.0  # difference of scores within which the simplest law is taken
 _LEAST_LEVEL = 0.05
 _MOST_LAG = 0.8
 
@@ -35,20 +36,20 @@ class Evidence:
     inflation: float
 
     @staticmethod
-    def of(solutions: Sequence[Solution]) -> Evidence:
-        """Noise level from solutions, of which one must be close to the truth."""
+    def of(solutions: Sequence[Solution], least: float = 0.0) -> Evidence:
+        """Noise level from solutions, of which one must be close to the truth, and at least ``least``."""
         count = len(solutions[0].weights)
         numbers = 6 * count
-        level = max(_LEAST_LEVEL, min(s.loss / max(numbers - s.parameters, 1) for s in solutions))
+        level = max(_LEAST_LEVEL, least, min(s.loss / max(numbers - s.parameters, 1) for s in solutions))
         best = min(solutions, key=lambda s: s.loss / level + s.parameters * math.log(numbers))
         return Evidence(count, level, _inflation([best], count, best.parameters))
 
     @staticmethod
-    def of_parts(parts: Sequence[Solution]) -> Evidence:
-        """Noise level from solutions of successive parts of a track."""
+    def of_parts(parts: Sequence[Solution], least: float) -> Evidence:
+        """Noise level, at least ``least``, from solutions of successive parts of a track."""
         count, parameters = sum(len(s.weights) for s in parts), sum(s.parameters for s in parts)
         level = sum(s.loss for s in parts) / max(6 * count - parameters, 1)
-        return Evidence(count, max(_LEAST_LEVEL, level), _inflation(parts, count, parameters))
+        return Evidence(count, max(_LEAST_LEVEL, least, level), _inflation(parts, count, parameters))
 
     @property
     def variance(self) -> float:
@@ -75,10 +76,3 @@ def _inflation(parts: Sequence[Solution], count: int, parameters: int) -> float:
     lag = product / energy if energy > 0 else 0.0
     rho = min(max(lag + (parameters / 6 + 1) / count, 0.0), _MOST_LAG)
     return (1 + rho) / (1 - rho)
-
-
-def simplest(solutions: Sequence[Solution], evidence: Evidence) -> Solution:
-    """Solution with the fewest parameters among those with scores near the best; among equals, that of the best."""
-    best = min(evidence.score(s) for s in solutions)
-    near = [s for s in solutions if evidence.score(s) <= best + STRONG]
-    return min(near, key=lambda s: (s.parameters, evidence.score(s)))

@@ -70,13 +70,21 @@ def _fields(law: Candidate, theta: np.ndarray, radius: float, span: float) -> di
 
 
 def events(solution: Solution, evidence: Evidence, t_max: float, span: float) -> tuple[Event, ...]:
-    """Events of a solution in the observed window, in order."""
-    found = solution.candidate.events(solution.theta)
+    """Events of a solution in the observed window, in order; of those within a gap between poses, the first."""
+    gap = -solution.candidate.window.first / len(solution.weights)
+    found: list[tuple[str, np.ndarray]] = []
+    rows: list[int] = []
+    for row, (kind, time) in enumerate(solution.candidate.events(solution.theta)):
+        if not found or float(time[0]) - float(found[-1][1][0]) > gap:
+            found.append((kind, time))
+            rows.append(row)
     step = 1e-6
     slopes = np.zeros((len(found), len(solution.theta)))
     for k, direction in enumerate(np.eye(len(solution.theta))):
-        for i, (_, time) in enumerate(solution.candidate.events(solution.theta + step * direction)[: len(found)]):
-            slopes[i, k] = (float(time[0]) - float(found[i][1][0])) / step
+        moved = solution.candidate.events(solution.theta + step * direction)
+        for i, row in enumerate(rows):
+            if row < len(moved):
+                slopes[i, k] = (float(moved[row][1][0]) - float(found[i][1][0])) / step
     variances = evidence.variance * np.einsum("ip,pq,iq->i", slopes, solution.inverse, slopes)
     return tuple(
         Event(t_max + span * float(time[0]), kind, span * float(np.sqrt(max(variance, 0.0))))

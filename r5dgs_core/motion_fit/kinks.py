@@ -120,6 +120,18 @@ class Kink(Candidate):
         shape = np.broadcast_shapes(quats.shape[:-1], d.shape[:-1])
         return np.broadcast_to(quats, (*shape, 4)), d
 
+    def jump(self, theta: np.ndarray) -> float:
+        """Change of the rates by the break until t_max, relative to the largest rates on either side. [P]"""
+        if self.broken.event in ("start", "stop"):
+            return 1.0
+        p = self.parts(theta)
+        left, none = -float(self.time(p)[0]), np.zeros(3)
+        change = p.get("dv", none) - left * p.get("a", none), p.get("dw", none)
+        after = p["v"], p["w"]
+        before = [x + dx for x, dx in zip(after, change, strict=True)]
+        sizes = [float(np.linalg.norm(np.concatenate(rates))) for rates in (change, after, before)]
+        return sizes[0] / max(*sizes[1:], 1e-12)
+
     @property
     def law(self) -> Candidate:
         return replace(families.BY_NAME[self.broken.law], window=self.window)

@@ -23,8 +23,6 @@ from . import fitted_motion, noise, search
 from .candidates import Candidate, Noise
 from .search import Selected
 
-HELD_OUT = search.HELD_OUT
-
 
 @dataclass(frozen=True)
 class Score:

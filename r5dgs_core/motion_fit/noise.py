@@ -7,6 +7,7 @@ import numpy as np
 from ..motion.pose_track import PoseTrack
 from .candidates import Noise
 
+IMAGES = (0.001, 0.002)  # share of the diameter and rad; tracks from images drift by this much without scatter
 FLOOR = 1e-7  # radii and radians; below this, noise is only rounding
 _MEDIAN = 1.538  # median length of three numbers with unit variance
 
@@ -26,3 +27,8 @@ def contrasts(track: PoseTrack) -> Noise:
             found.append(np.linalg.norm(direction @ path[i : i + 4]))
         levels.append(max(float(np.median(found)) / _MEDIAN, FLOOR))
     return Noise(*levels)
+
+
+def of_images(radius: float, place: float = 0.0, turn: float = 0.0) -> tuple[float, float]:
+    """Least noise of a track from images, for `model_selection.fit`, if it is known to be at least (place, turn)."""
+    return max(place, 2 * radius * IMAGES[0]), max(turn, IMAGES[1])

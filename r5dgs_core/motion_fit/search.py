@@ -11,7 +11,7 @@ import numpy as np
 from ..motion.pose_track import PoseTrack
 from . import candidates as families
 from . import evidence as evidences
-from . import kinks, noise
+from . import kinks, noise, rolling
 from .candidates import Candidate, Noise, Solution
 from .evidence import Evidence
 
@@ -21,12 +21,12 @@ _FEW = 8  # poses below which breaks are not searched, and large candidates not 
 _PER_POSE = 3  # parameters per pose of the largest candidate for few poses
 STEEP = 0.9  # cosine of the angle to the vertical below which a motion is vertical
 _ROUNDS = 3  # of the noise
+_MEDIAN_SQUARE = 0.455  # of a number with unit variance
+_NOTHING_FITS = 9.0  # squared misfit of the best candidate above which the noise is taken for larger
 _TOO_LARGE = 0.4  # variance of the residuals below which the noise is estimated again
 _EXACT = 1e-4  # gain at which the selected candidate is final
-HELD_OUT = 0.2  # share of the last poses that other laws must predict
-WITHIN = 1.5  # misses of these, relative to the least, of laws that predict them about as well
-_ARGUABLE = 60.0  # difference of scores up to which the prediction of the last poses decides
-_MOST_SQUARE = 3000.0  # limit of the square of a miss, in variances
+_CONTRADICTED = 3.0  # squared miss of later poses, in that of the best law, above which a law is not taken
+_SMALL_JUMP = 0.15  # relative change of the rates below which a break needs stronger evidence
 _POOR = 3.0  # noise level, in that of neighbouring poses, from which a track may have several breaks
 _HOPELESS = 30.0  # excess of plain parts above which a track is not cut
 _CUTS = 4  # breaks at which such a track is cut
@@ -75,9 +75,11 @@ def select(
     level = Noise(max(level.place, least.place), max(level.turn, least.turn))
     most = 6 * len(track) - 6 if len(track) >= _FEW else _PER_POSE * len(track)
     tried = [c for c in family if c.parameters <= most] or [min(family, key=lambda c: c.parameters)]
-    found = [s for c in tried if (s := families.solve(c, track, level)) is not None]
-    found = found or [s for s in [families.solve(families.STATIC, track, level)] if s is not None]
-    broken = kinks.search(track, level) if breaks and len(track) >= _FEW else []
+    found, broken = _try_all(tried, track, level, breaks)
+    coarser = _misfit((*found, *broken))
+    if max(coarser) > _NOTHING_FITS:  # at the level of the noise, all losses are nearly equal
+        level = level.scaled(*(math.sqrt(max(ratio, 1.0)) for ratio in coarser))
+        found, broken = _try_all(tried, track, level, breaks)
     for _ in range(_ROUNDS):
         shares = _shares((*found, *broken))
         if min(shares) > _TOO_LARGE:
@@ -90,19 +92,46 @@ def select(
         gaps_matter = _best(found, broken).candidate.placed
         found = [_again(s, track, level) for s in found]
         broken = kinks.search(track, level) if gaps_matter else [_again(s, track, level) for s in broken]
-    evidence = Evidence.of((*found, *broken))
+    evidence = Evidence.of((*found, *broken), _floor(level, least))
     laws = [s for s in found if _determined(s, evidence) and not _rises(s, up)] or found[:1]
     chosen = _simplest(laws, evidence, track, level)
     if broken:
         best = min(broken, key=evidence.score)
-        if evidence.score(best) + evidences.STRONG < min(evidence.score(s) for s in laws):
+        if evidence.score(best) + _margin(best) < min(evidence.score(s) for s in laws):
             chosen = best
     solutions = (*laws, *broken)
     final = _again(chosen, track, level, _EXACT)
     solutions = tuple(final if s is chosen else s for s in solutions)
     whole = Selected(final, solutions, evidence, track, level, float(track.tau[0]))
-    cut = _cut(whole, broken, family, up) if broken and evidence.variance > _POOR else None
+    cut = _cut(whole, broken, family, up, _floor(level, least)) if broken and evidence.variance > _POOR else None
     return cut or _with_parts(whole, family, up)
+
+
+def _try_all(
+    tried: Sequence[Candidate], track: PoseTrack, level: Noise, breaks: bool
+) -> tuple[list[Solution], list[Solution]]:
+    """Fits of all laws, and of all kinds of breaks."""
+    found = [s for c in tried if (s := families.solve(c, track, level)) is not None]
+    found = found or [s for s in [families.solve(families.STATIC, track, level)] if s is not None]
+    return found, kinks.search(track, level) if breaks and len(track) >= _FEW else []
+
+
+def _misfit(solutions: Sequence[Solution]) -> tuple[float, float]:
+    """Median squares of the place and turn residuals of the solution with the least ones, per component."""
+    medians = [np.median(s.residuals.reshape(-1, 2, 3) ** 2, 0).mean(-1) / _MEDIAN_SQUARE for s in solutions]
+    place, turn = min(medians, key=lambda pair: float(np.prod(np.maximum(pair, 1.0))))
+    return float(place), float(turn)
+
+
+def _margin(kink: Solution) -> float:
+    """Evidence that a break needs; small jumps need more, since drifting tracks imitate them."""
+    assert isinstance(kink.candidate, kinks.Kink)
+    return evidences.STRONG * max(1.0, _SMALL_JUMP / max(kink.candidate.jump(kink.theta), 1e-3)) ** 2
+
+
+def _floor(level: Noise, least: Noise) -> float:
+    """Least variance of residuals in units of the noise, if the noise has a lower bound."""
+    return min(least.place / level.place, least.turn / level.turn) ** 2
 
 
 def _with_parts(whole: Selected, family: tuple[Candidate, ...], up: np.ndarray | None) -> Selected:
@@ -137,9 +166,16 @@ def _with_parts(whole: Selected, family: tuple[Candidate, ...], up: np.ndarray |
 
 
 def _cut(
-    whole: Selected, broken: Sequence[Solution], family: tuple[Candidate, ...], up: np.ndarray | None
+    whole: Selected, broken: Sequence[Solution], family: tuple[Candidate, ...], up: np.ndarray | None, least: float
 ) -> Selected | None:
     """Search the parts before and after the best break independently, for tracks that no candidate explains.
+
+    Args:
+        whole: Result of the whole track.
+        broken: Breaks that were tried in it.
+        family: Laws to try.
+        up: See `model_selection.fit`.
+        least: Least variance of the residuals.
 
     Returns:
         None if this is not clearly better than the best single candidate.
@@ -157,7 +193,7 @@ def _cut(
         return None
     _, _, kink, sides, plain = min(found, key=lambda entry: entry[:2])
     best = min(whole.solutions, key=whole.evidence.score)
-    if _excess(plain, best) > _HOPELESS:
+    if _excess(plain, best, least) > _HOPELESS:
         return None
     parts = []
     for side in sides:
@@ -165,9 +201,9 @@ def _cut(
         parts.append(select(side, own, whole.noise, breaks=len(side) >= _FEW, up=up))
     before, after = parts
     pieces = (before.chosen, after.chosen)
-    if _excess(pieces, best) > -evidences.STRONG:
+    if _excess(pieces, best, least) > -evidences.STRONG:
         return None
-    evidence = Evidence.of_parts(pieces)
+    evidence = Evidence.of_parts(pieces, least)
     earlier = (*before.earlier, *([before.chosen] if before.chosen.candidate.placed else []), kink, *after.earlier)
     return replace(after, evidence=replace(evidence, count=len(after.track)), first=whole.first, earlier=earlier)
 
@@ -179,9 +215,9 @@ def _plain(track: PoseTrack, level: Noise) -> Solution:
     return min(found, key=lambda s: s.loss + s.parameters)
 
 
-def _excess(parts: Sequence[Solution], single: Solution) -> float:
+def _excess(parts: Sequence[Solution], single: Solution, least: float) -> float:
     """Score of two parts of a track minus that of a single candidate, by the noise level of the parts."""
-    evidence = Evidence.of_parts(parts)
+    evidence = Evidence.of_parts(parts, least)
     placed = 1 + sum(part.candidate.placed for part in parts)
     loss, parameters = sum(part.loss for part in parts), sum(part.parameters for part in parts)
     return evidence.of_sums(loss, parameters, placed) - evidence.score(single)
@@ -211,11 +247,14 @@ def _shares(solutions: Sequence[Solution]) -> tuple[float, float]:
 def _determined(solution: Solution, evidence: Evidence) -> bool:
     """Return True if the frequencies are inside their range and known to `FREQUENCY_ERROR`, or if none is free.
 
-    Of a sum of oscillations, nearly a full period of each must be seen, since slower ones can imitate any curve.
+    Of bounces, at least one flight between two of them must be longer than two gaps between poses. Of a sum of oscillations, nearly a full period of each must be seen, since slower ones can imitate any curve.
     """
     candidate = solution.candidate
     rows = candidate.parts(np.arange(candidate.parameters))
     window = candidate.window
+    if "bounce" in rows:
+        times = [float(time.reshape(-1)[0]) for _, time in candidate.events(solution.theta)]
+        return len(times) < 2 or max(np.diff(times)) > 2 * -window.first / (evidence.count - 1)
     for block in ("pace", "pace2"):
         if block not in rows:
             continue
@@ -232,27 +271,16 @@ def _determined(solution: Solution, evidence: Evidence) -> bool:
 
 
 def _simplest(laws: Sequence[Solution], evidence: Evidence, track: PoseTrack, level: Noise) -> Solution:
-    """Law with the fewest parameters among those that have evidence and predict the last poses about as well as any.
+    """Law with the fewest parameters among those near the best whose refits to earlier poses predict the later ones.
 
-    Evidence alone trusts small systematic errors of a track, which the last poses reveal. Among laws with equally many
+    Evidence alone trusts small systematic errors of a track, which the later poses reveal. Among laws with equally many
     parameters, the evidence decides.
     """
     best = min(evidence.score(s) for s in laws)
-    near = [s for s in laws if evidence.score(s) <= best + _ARGUABLE]
-    held = max(3, math.ceil(HELD_OUT * len(track)))
-    misses = {}
-    for s in near:
-        if len(track) < _FEW or s.parameters > 4 * (len(track) - held):
-            continue
-        earlier = families.solve(s.candidate, track.rows(slice(0, len(track) - held)), level, [s.theta], steps=8)
-        if earlier is not None:
-            late = families.residuals(s.candidate, earlier.theta[None], track.rows(slice(-held, None)), level)[0]
-            squares = np.minimum((late**2).sum(-1), _MOST_SQUARE * evidence.level)
-            misses[id(s)] = math.sqrt(float(squares.mean()))
-    if not misses:
-        return evidences.simplest(laws, evidence)
-    least = min(misses.values())
-    fit = [s for s in near if misses.get(id(s), math.inf) <= WITHIN * least]
+    near = [s for s in laws if evidence.score(s) <= best + evidences.NEAR]
+    misses = [rolling.misses(s, track, level, evidence) for s in near]
+    limit = _CONTRADICTED * max(min(misses), 1.0)
+    fit = [s for s, miss in zip(near, misses, strict=True) if miss <= limit]
     return min(fit, key=lambda s: (s.parameters, evidence.score(s)))
 
 

@@ -3,6 +3,7 @@ import pytest
 
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.motion_fit import kinks, model_selection
+from tests.support import problems
 from tests.support.problems import RADIUS, SIZE, T_MAX
 
 TIMES = np.linspace(0, T_MAX, 15)
@@ -178,3 +179,26 @@ def test_each_kind_of_break_is_tried_in_each_gap():
     rng = np.random.default_rng(3)
     fit = model_selection.fit(TIMES, rotations.identity(15), rng.normal(size=(15, 3)), radius=RADIUS)
     assert {score.name for score in fit.scores} >= set(kinks.BREAKS)
+
+
+def test_a_small_change_of_the_rates_needs_more_evidence_than_a_large_one():
+    still = np.zeros((2, 3))
+    for change, count in ((0.1, 0), (0.5, 1)):
+        path = broken(0.4, v=np.array([[3.0, 0, 0], [3.0, change, 0]]), w=still)
+        fit, _ = observed(path, np.random.default_rng(1), (7e-4 * SIZE, 7e-4))
+        assert len(fit.history.events) == count
+
+
+def test_bounces_that_no_pose_separates_are_one_event():
+    path = broken(0.4, v=np.array([[3.0, 0, 0], [3.0, 0.15, 0]]), w=np.zeros((2, 3)))
+    fit, _ = observed(path, np.random.default_rng(2), (0.002 * SIZE, 0.002))
+    assert fit.model.kind == "bounce"  # a ball that lands
+    assert 1 <= len(fit.history.events) <= 2
+
+
+def test_motion_that_no_law_describes_is_not_taken_for_rest():
+    truth = problems.MOTIONS["free axis"][0]
+    quats, d, *_ = problems.observe(truth, TIMES, np.random.default_rng(0), 1e-7 * SIZE, 1e-7)
+    names = ["static", "ballistic + spin, accelerating"]
+    fit = model_selection.fit(TIMES, quats, d, radius=RADIUS, candidates=names)
+    assert fit.chosen == names[1]

@@ -30,7 +30,7 @@ def test_each_motion_is_recovered_without_noise(name):
 @pytest.mark.parametrize("name", ["uniform", "hinge", "ballistic, spinning"])
 def test_uneven_times_and_a_gap_are_no_obstacle(name):
     times = np.concatenate([UNEVEN[UNEVEN < 0.3], UNEVEN[UNEVEN > 0.45]])
-    fit, error = fitted(name, np.random.default_rng(1), 1e-7 * SIZE, 1e-7, times)
+    fit, error = fitted(name, np.random.default_rng(1), 1e-6 * SIZE, 1e-6, times)
     assert fit.chosen in MOTIONS[name][1]
     assert error.max() < 0.1
 

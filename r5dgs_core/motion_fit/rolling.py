@@ -1,0 +1,42 @@
+"""Predictions of the last observed poses from earlier ones, as a test of a motion law."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..motion.pose_track import PoseTrack
+from . import candidates as families
+from .candidates import Noise, Solution
+from .evidence import Evidence
+
+HELD_OUT = 0.2  # share of the last poses that are predicted
+_FEWEST = 8  # poses of a track that can be refitted to fewer
+_MOST_SQUARE = 600.0  # limit of the square of a miss, in variances
+
+
+def misses(chosen: Solution, track: PoseTrack, noise: Noise, evidence: Evidence) -> float:
+    """Mean square of the misses of a law that is refitted to earlier poses, over that expected; 1 for short tracks.
+
+    The expected square of a miss is that of the noise plus the variance of the refitted prediction.
+    """
+    count = len(track)
+    if count < _FEWEST:
+        return 1.0
+    shares = []
+    most = count - chosen.candidate.last_choice  # poses that may be left out
+    for held in sorted({1, max(3, math.ceil(HELD_OUT * count)), count // 3}):
+        if chosen.parameters > 4 * (count - held) or held > most:
+            continue
+        earlier = families.solve(chosen.candidate, track.rows(slice(0, count - held)), noise, [chosen.theta], steps=8)
+        if earlier is None:
+            return _MOST_SQUARE
+        step = 1e-6
+        nearby = earlier.theta + step * np.eye(len(earlier.theta) + 1, len(earlier.theta), -1)
+        late = families.residuals(chosen.candidate, nearby, track.rows(slice(count - held, None)), noise)
+        slopes = (late[1:] - late[0]) / step  # [P, H, 6]
+        expected = 6 + np.einsum("phc,pq,qhc->h", slopes, earlier.inverse, slopes)
+        squares = np.minimum((late[0] ** 2).sum(-1), _MOST_SQUARE * evidence.variance)
+        shares.append(squares / np.maximum(expected, 6.0) / evidence.variance)
+    return float(np.concatenate(shares).mean()) if shares else 1.0
