@@ -247,7 +247,8 @@ def _shares(solutions: Sequence[Solution]) -> tuple[float, float]:
 def _determined(solution: Solution, evidence: Evidence) -> bool:
     """Return True if the frequencies are inside their range and known to `FREQUENCY_ERROR`, or if none is free.
 
-    Of bounces, at least one flight between two of them must be longer than two gaps between poses. Of a sum of oscillations, nearly a full period of each must be seen, since slower ones can imitate any curve.
+    Of bounces, at least one flight between two of them must be longer than two gaps between poses. Of a sum of
+    oscillations, nearly a full period of each must be seen, since slower ones can imitate any curve.
     """
     candidate = solution.candidate
     rows = candidate.parts(np.arange(candidate.parameters))
