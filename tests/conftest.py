@@ -6,9 +6,16 @@ import importlib.metadata
 import importlib.util
 import os
 import sys
+from pathlib import Path
 
 import hypothesis
 import pytest
+
+if sys.dont_write_bytecode:  # otherwise every process that a test starts compiles all modules again
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "bytecode")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ.setdefault("PYTHONPYCACHEPREFIX", sys.pycache_prefix)
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # one process per core, so each gets one thread
     for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -16,7 +23,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one process per core, so each gets on
 
 BPY_PYTHON = (3, 11)
 STATUS = pytest.StashKey[int]()
-NOT_QUICK = ("blender", "slow", "gpu", "browser", "cluster")
+NOT_QUICK = ("blender", "heavy", "slow", "gpu", "browser", "cluster")
 
 hypothesis.settings.register_profile("r5dgs", deadline=None, max_examples=50)
 hypothesis.settings.load_profile("r5dgs")

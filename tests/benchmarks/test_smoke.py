@@ -8,6 +8,8 @@ import pytest
 
 from tests.support import benchmark_modules, encoder_folders, tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 ONCE = ("--threads", "1", "--repeats", "1")
 SHORT = tuple(word for text in (*tiny_datasets.SETTINGS, "identity.iterations=5") for word in ("--set", text))
 # Arguments by program; {data} and {run} are the tiny data set and a finished run on it, {encoder} a sentence model.

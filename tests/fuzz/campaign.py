@@ -6,6 +6,7 @@ Seed, reader and index determine an input, so that each one is reproducible.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import logging
 import os
 import resource
@@ -91,6 +92,7 @@ def run(reader: Reader, indices: range, seed: int, save: Path | None = None) -> 
         seed: Of the random numbers.
         save: Folder for inputs that went wrong, one folder each with the traceback; None keeps none.
     """
+    importlib.import_module("torch._dynamo")  # torch imports it late, which takes longer than an input may
     tally = Tally(reader.name)
     started, floor = time.process_time(), _memory()
     memory_files = Path("/dev/shm")

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch._dynamo  # noqa: F401  the first picture imports it, which takes longer than an input may
 
 from r5dgs_core import errors
 from r5dgs_core.config import config

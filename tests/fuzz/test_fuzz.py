@@ -9,6 +9,8 @@ import pytest
 from r5dgs_core import errors
 from tests.fuzz import campaign, mutations, readers
 
+pytestmark = pytest.mark.heavy
+
 INPUTS = 1000
 
 

@@ -17,6 +17,8 @@ from r5dgs_core.data import mask_notes, masks, view_masks
 from r5dgs_core.scene import scene_file
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 
 def rewrite(root, folder, change):
     """Write the training masks into a folder, each through ``change(view, ids)``."""

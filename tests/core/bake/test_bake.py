@@ -19,6 +19,8 @@ from r5dgs_core.train import checkpoint, finish, normalization, run
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 
 def train_briefly(data, folder, *overrides):
     settings = tiny_datasets.settings("train.iterations=40", "identity.iterations=0", *overrides)

@@ -17,6 +17,8 @@ from r5dgs_core.train import checkpoint, observed_motion, run
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 RADIUS = 0.4
 
 

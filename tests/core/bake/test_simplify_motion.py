@@ -14,6 +14,8 @@ from r5dgs_core.playback import scene_player
 from r5dgs_core.train import checkpoint, checkpoint_content
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 BRICK, BALL = tiny_datasets.BRICK, tiny_datasets.BALL
 TIMES = tiny_datasets.OBSERVED
 TAU = TIMES - TIMES[-1]

@@ -22,6 +22,8 @@ from r5dgs_core.scene import scene_file
 from r5dgs_core.train import checkpoint
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 OVERRIDES = (*tiny_datasets.SETTINGS, "train.iterations=20", "identity.iterations=5")
 
 

@@ -31,6 +31,8 @@ from r5dgs_core.train import checkpoint
 from tests.support import pages, tiny_datasets
 from tests.support.command_line import complaint
 
+pytestmark = pytest.mark.heavy
+
 OPTIONS = [
     text
     for override in (*tiny_datasets.SETTINGS, "train.iterations=20", "identity.iterations=5")

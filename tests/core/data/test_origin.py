@@ -19,6 +19,8 @@ from r5dgs_core.scene import cameras, scene_file
 from r5dgs_core.train import checkpoint, run
 from tests.support import colmap_files, scenes, tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 FAR = np.array([5e6, -3.5e6, 1.5e6])
 RING = 4.0 * np.stack([np.cos(np.arange(8.0)), np.sin(np.arange(8.0)), np.full(8, 0.3)], axis=1)
 HERE = np.zeros(3)

@@ -30,6 +30,8 @@ from r5dgs_core.scene import scene_file
 from tests.support import pictures, scenes
 from tests.support.command_line import complaint
 
+pytestmark = pytest.mark.heavy
+
 BACKEND = pictures.BACKEND
 
 

@@ -15,6 +15,8 @@ from r5dgs_core.masks import make_masks, sam2_masks, sam2_model, sam2_segments, 
 from tests.support import sam2 as tiny_sam2
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 # The network is random: it foretells a quality of about a half, and its masks are noise.
 EVERYTHING = sam2_segments.SegmentSettings(points=3, score=0.0, stability=0.0, max_area=1.0)
 FEW = sam2_masks.TrackSettings(objects=5, together=2)

@@ -6,6 +6,8 @@ from r5dgs_core.motion_fit import candidates, evidence, kinks, model_selection
 from tests.support import problems
 from tests.support.problems import MOTIONS, RADIUS, SIZE, T_MAX
 
+pytestmark = pytest.mark.heavy
+
 TIMES = np.linspace(0, T_MAX, 15)
 UNEVEN = np.sort(np.r_[0.0, T_MAX, np.random.default_rng(9).uniform(0, T_MAX, 13)])
 UP = np.array([0.0, 0.0, 1.0])

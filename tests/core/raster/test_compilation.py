@@ -11,6 +11,8 @@ import pytest
 
 from r5dgs_core.raster import compilation
 
+pytestmark = pytest.mark.heavy
+
 CORE = Path(__file__).resolve().parents[3] / "r5dgs_core"
 TOY = """
 from r5dgs_core.raster.compilation import kernel

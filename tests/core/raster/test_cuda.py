@@ -26,6 +26,8 @@ from tests.support import gsplat_stand_in, splats
 from tests.support.gsplat_stand_in import OLD_STAND_IN, STAND_IN
 from tests.support.splats import camera, relative
 
+pytestmark = pytest.mark.heavy
+
 ROOT = Path(__file__).parents[3]
 TOLERANCE = 2e-5  # float32 against float64, as for the other backends; about 4e-6 was seen with the stand-in
 # On a GPU fast exponentials move a few pixels over a cut-off (share of them), and the backward pass starts from

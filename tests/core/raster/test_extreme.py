@@ -12,6 +12,8 @@ from r5dgs_core.raster import RasterSettings, RasterStats, rasterize_splats
 from tests.support.agreement import FORWARD, assert_within_bars
 from tests.support.splats import camera, draw, splats
 
+pytestmark = pytest.mark.heavy
+
 BACKENDS = ("cpu", "reference")
 NEAR = RasterSettings().near_plane
 ALPHA_MIN, ALPHA_MAX = RasterSettings().alpha_min, RasterSettings().alpha_max

@@ -17,6 +17,8 @@ from r5dgs_core.render import warm_up
 from r5dgs_core.scene import scene_file
 from tests.support import scenes, tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 ROOT = Path(__file__).resolve().parents[3]
 
 USE_EVERYTHING = """

@@ -19,6 +19,8 @@ from r5dgs_core.stability import cases as stability_cases
 from r5dgs_core.stability import scenes as stability_scenes
 from r5dgs_core.stability import training
 
+pytestmark = pytest.mark.heavy
+
 LONG = [case for case in stability.CASES if case.name.endswith("1e7 frames")]  # seconds each; few frames run, too
 SHORT = [case for case in stability.CASES if case not in LONG]
 

@@ -26,6 +26,8 @@ from r5dgs_core.errors import CheckpointError
 from r5dgs_core.train import checkpoint, checkpoint_content, checkpoint_file, run
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 OVERRIDES = ("train.iterations=40", "identity.iterations=4", "train.checkpoint_every=5", "train.probe_every=0")
 
 

@@ -10,7 +10,7 @@ from r5dgs_core import atomic_files
 from r5dgs_core.train import checkpoint, learning_curves, run
 from tests.support import tiny_datasets
 
-pytestmark = pytest.mark.usefixtures("plots")
+pytestmark = [pytest.mark.usefixtures("plots"), pytest.mark.heavy]
 ROWS = [
     {"iteration": 10 * k, "seconds": 1.5 * k, "loss": 0.5 / k, "gaussians": 100 + k, "val_psnr": 20 + k}
     for k in range(1, 6)

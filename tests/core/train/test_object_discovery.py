@@ -18,6 +18,8 @@ from r5dgs_core.train.identity import packed_masks
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 BRIEF = ("train.iterations=60", "identity.iterations=0")
 
 

@@ -13,6 +13,8 @@ from r5dgs_core.train import probe as train_probe
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 
 def events_of(root, folder, *overrides):
     found = []

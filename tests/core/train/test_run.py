@@ -15,6 +15,8 @@ from r5dgs_core.errors import CheckpointError, Interrupted, TrainingError
 from r5dgs_core.train import checkpoint, finish, run, step_log
 from tests.support import processes, tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 STEPS, IDENTITY = 150, 20
 OVERRIDES = (f"train.iterations={STEPS}", f"identity.iterations={IDENTITY}", "train.checkpoint_every=20")
 

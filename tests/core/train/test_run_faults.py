@@ -23,6 +23,8 @@ from r5dgs_core.train.trainer import Trainer
 from tests.support import processes, tiny_datasets
 from tests.support.command_line import complaint
 
+pytestmark = pytest.mark.heavy
+
 OVERRIDES = ("train.iterations=40", "identity.iterations=4", "train.checkpoint_every=10", "train.probe_every=0")
 # What a process does to itself when it writes its second checkpoint.
 KILLED_WITHIN_A_WRITE = """

@@ -14,6 +14,8 @@ from r5dgs_core.train.representations import tracks
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 SHORT = ("train.iterations=60",)
 
 

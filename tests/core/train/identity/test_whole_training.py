@@ -10,6 +10,8 @@ from r5dgs_core.train import checkpoint, run
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 CHANGES = ("train.iterations=40", "identity.spatial=1.0", "identity.every=3", "identity.samples=100")
 
 

@@ -23,6 +23,8 @@ from r5dgs_core.train.representations.field_motion import Clock
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 FIELD = (
     "train.representation='field'",
     "field.place_steps=60",

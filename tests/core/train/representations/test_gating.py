@@ -18,6 +18,8 @@ from r5dgs_core.train.representations import gating
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 TIMES = np.linspace(0, 0.75, 6)
 SHORT = ("train.representation='field'", "train.iterations=40", "field.trd_steps=20", "field.place_steps=20")
 

@@ -20,6 +20,8 @@ from r5dgs_core.train.representations import residual
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 BRICK, BALL = tiny_datasets.BRICK, tiny_datasets.BALL
 KNOTS = 4
 

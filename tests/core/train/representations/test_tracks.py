@@ -16,6 +16,8 @@ from r5dgs_core.train.representations import tracks as tracks_representation
 from r5dgs_core.train.trainer import Trainer
 from tests.support import scenes, tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 TIMES = np.array([0.0, 0.1, 0.3, 0.4, 0.6, 0.9, 1.0])
 VELOCITY, SPIN = np.array([0.8, -0.4, 0.2]), np.array([0.3, 0.1, 1.5])
 
