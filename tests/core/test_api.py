@@ -12,6 +12,8 @@ from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
 from tests.support import pages, tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 PAGE = "docs/reference/python.md"
 PLAY, TRAIN, RASTERIZE = pages.blocks(PAGE)
 

@@ -14,6 +14,8 @@ from r5dgs_core.errors import CheckpointError
 from r5dgs_core.train import checkpoint, run
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 HOLDS = """
 import sys, pathlib
 from r5dgs_core import folder_lock

@@ -14,6 +14,8 @@ from r5dgs_core.scene import validation
 from r5dgs_core.train import checkpoint
 from tests.support import tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 TIMES = np.array([0.0, 0.25, 0.5, 0.75])
 
 

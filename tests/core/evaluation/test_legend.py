@@ -9,6 +9,8 @@ from r5dgs_core.evaluation import legend
 from r5dgs_core.render import viewpoints
 from tests.support import scenes
 
+pytestmark = pytest.mark.heavy
+
 BACKEND = "reference"
 
 

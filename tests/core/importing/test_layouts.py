@@ -16,6 +16,8 @@ from r5dgs_core.scene import scene_file
 from tests.support import foreign_runs as foreign
 from tests.support.foreign_runs import T_MAX, Drawn
 
+pytestmark = pytest.mark.heavy
+
 KNOTS = 8
 LATER = T_MAX + 0.1
 

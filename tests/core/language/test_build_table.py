@@ -18,6 +18,8 @@ from r5dgs_core.search import embedding_search, object_search
 from tests.support import encoder_folders
 from tests.support.scenes import make_scene
 
+pytestmark = pytest.mark.heavy
+
 WORDS = common_nouns.words()
 PER_GAUSSIAN = (
     *("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids"),

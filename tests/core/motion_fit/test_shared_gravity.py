@@ -12,6 +12,8 @@ from r5dgs_core.motion_fit import model_selection, shared_gravity
 from tests.support import problems
 from tests.support.problems import RADIUS, SIZE, T_MAX
 
+pytestmark = pytest.mark.heavy
+
 TIMES = np.linspace(0, T_MAX, 15)
 G = np.array([0.0, 0.0, -9.0])
 

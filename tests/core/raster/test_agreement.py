@@ -15,6 +15,8 @@ from r5dgs_core.scene.cameras import Camera
 from tests.support.agreement import FORWARD, assert_within_bars
 from tests.support.splats import NAMES, camera, draw, relative, splats
 
+pytestmark = pytest.mark.heavy
+
 THRESHOLDS = RasterSettings()
 
 

@@ -26,6 +26,8 @@ from r5dgs_core.render import warm_up
 from r5dgs_core.scene import cameras, sh_color
 from tests.support.splats import camera, draw, relative, splats
 
+pytestmark = pytest.mark.heavy
+
 # float32 against float64: rounding grows with the number of layers; the largest seen on these scenes is about 3e-6
 TOLERANCE = 2e-5
 

@@ -13,6 +13,8 @@ from r5dgs_core import errors
 from r5dgs_core.scene import archive, scene_file
 from tests.support.scenes import make_scene
 
+pytestmark = pytest.mark.heavy
+
 READERS = (scene_file.read, scene_file.read_meanings, scene_file.is_exact)
 SPENT = 24 << 20  # bytes that a refusal may take
 

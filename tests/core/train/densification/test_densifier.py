@@ -19,6 +19,8 @@ from r5dgs_core.train.densification import densifier, gradient
 from r5dgs_core.train.trainer import Trainer
 from tests.support import scenes, tiny_datasets
 
+pytestmark = pytest.mark.heavy
+
 PIXEL = 0.05
 SECTION = DensifySection(share=0.25, split_pixels=1.0, prune_opacity=0.01)
 

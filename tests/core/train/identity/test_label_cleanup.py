@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 
 from r5dgs_core.bake import bake
@@ -11,6 +12,8 @@ from r5dgs_core.motion import rotations
 from r5dgs_core.train import checkpoint, observed_motion, run
 from r5dgs_core.train.identity import label_cleanup
 from tests.support import scenes, tiny_datasets
+
+pytestmark = pytest.mark.heavy
 
 LEFT, RIGHT, WIRE = 1, 2, 3
 PIXELS = 20.0  # of votes that a Gaussian has
