@@ -66,9 +66,9 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
     )
     display: EnumProperty(
         name="Display",
-        description="Representation of Gaussians in viewports that draw no splats",
+        description="Representation of Gaussians in viewports",
         items=viewport_display.ITEMS,
-        default=viewport_display.POINTS,
+        default=viewport_display.SPLATS,
     )
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Set Display operator: show the Gaussians of a loaded scene as points or ellipsoids."""
+"""Set Display operator: show the Gaussians of a loaded scene as splats, points or ellipsoids."""
 
 import bpy
 from bpy.props import EnumProperty
@@ -7,7 +7,7 @@ from ..r5dgs_addon.scene import loaded_scenes, polls, viewport_display
 
 
 class R5DGS_OT_set_display(polls.NeedsScene, bpy.types.Operator):
-    """Choose how viewports that draw no splats represent the Gaussians of this scene"""
+    """Choose how viewports represent the Gaussians of this scene"""
 
     bl_idname = "r5dgs.set_display"
     bl_label = "Set Display"

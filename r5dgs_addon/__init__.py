@@ -5,6 +5,7 @@ from .engine import engine, live_preview, render_notes, render_stats
 from .language import prompt_state
 from .motion import exact_mode, extrapolate, motion_fields, pivot
 from .scene import click_select, evaluated_points, object_names, object_tint, properties, relink
+from .splats import viewport_splats
 from .worker import jobs
 
 MODULES = (
@@ -21,6 +22,7 @@ MODULES = (
     render_stats,
     render_notes,
     engine,
+    viewport_splats,
     panels,
     relink,
     click_select,

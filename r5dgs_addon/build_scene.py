@@ -35,7 +35,7 @@ class Options:
         key_tolerance: Maximum error of the reduced keys, as a fraction of the scene's extent.
         fit_timeline: True to set the frame range and the t_max marker.
         sh_degree: Highest spherical-harmonics degree stored on the points.
-        display: Key of `viewport_display.ITEMS` for viewports that do not draw splats.
+        display: Key of `viewport_display.ITEMS`.
     """
 
     world_convention: str = ""
@@ -44,7 +44,7 @@ class Options:
     key_tolerance: float = keyframes.TOLERANCE
     fit_timeline: bool = True
     sh_degree: int = 3
-    display: str = viewport_display.POINTS
+    display: str = viewport_display.SPLATS
 
 
 @dataclass(frozen=True)
@@ -276,6 +276,9 @@ def _describe(
     state.filepath = relink.relative_to(str(path.resolve()), bpy.data.filepath)  # also trusts the file
     state.seen_at = str(path.resolve())
     state.gaussians = len(scene.gaussians.means)
+    collection[loaded_scenes.SKY] = scene.background_sh.astype(np.float64).ravel().tolist()
+    if scene.shading is not None:
+        collection[loaded_scenes.LIGHT] = np.asarray(scene.shading.light, np.float64).tolist()
     state.root = root
     state.t_start, state.t_max, state.t_end = times.t_start, times.t_max, times.t_end
     state.frames_per_unit, state.frame_zero = times.frames_per_unit, times.frame_zero

@@ -163,11 +163,12 @@ ADDON_ALLOWED = {
     "color": {"compat", "ui", "scene"},
     "worker": {"ui", "process_group", "find_python", "preferences", "scene"},
     "engine": {"compat", "ui", "scene", "color", "worker"},
+    "splats": {"ui", "scene", "engine"},
     "language": {"ui", "preferences", "scene", "worker", "engine"},
     "motion": {"compat", "ui", "scene", "engine"},
     "build_scene": {"compat", "scene", "motion"},
     "export": {"ui", "scene", "worker", "engine", "motion"},
-    "panels": {"ui", "scene", "color", "worker", "engine", "language", "motion"},
+    "panels": {"ui", "scene", "color", "worker", "engine", "splats", "language", "motion"},
     "capture": {"ui", "export"},
 }
 LIGHT = GROUND | {"motion", "scene", "color", "formats", "playback", "editing", "search", "protocol", "user_settings"}

@@ -3,6 +3,7 @@
 import bpy
 
 from ..scene import evaluated_points, loaded_scenes, timeline, trust, viewport_display
+from ..splats import viewport_splats
 from ..ui import plural, status_bar
 from . import sidebar
 
@@ -41,8 +42,10 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
         if not timeline.fits(context.scene, times):
             layout.operator("r5dgs.fit_timeline", icon="TIME")
         row = layout.row(align=True)
-        for value, name, _ in viewport_display.ITEMS:
+        for value, name, *_ in viewport_display.ITEMS:
             row.operator("r5dgs.set_display", text=name, depress=state.display == value).display = value
+        if viewport_splats.message():
+            status_bar.wrapped(layout, context, viewport_splats.message(), "ERROR")
         row = layout.split(factor=0.33)  # beside the field, Blender would truncate the name
         row.label(text="Scene File")
         row.prop(state, "filepath", text="")

@@ -108,10 +108,10 @@ def evaluated(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.type
 
 
 def _is_modified(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Return True if enabled modifiers other than the ellipsoids change the points."""
+    """Return True if enabled modifiers other than those of the display change the points."""
     flag = "show_render" if depsgraph.mode == "RENDER" else "show_viewport"
     found = obj.evaluated_get(depsgraph).modifiers  # renders do not write animated switches to the original
-    return any(one.name != viewport_display.MODIFIER and getattr(one, flag) for one in found)
+    return any(one.name not in viewport_display.MODIFIERS and getattr(one, flag) for one in found)
 
 
 def _compare(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, edited: bool, gaussians: int) -> Found:
@@ -239,11 +239,12 @@ def _without_the_originals(
 
 
 def _is_radius_changed(obj: bpy.types.Object, cloud: bpy.types.PointCloud, stored: dict[str, str]) -> bool:
+    hidden = any(obj.modifiers.get(name) is not None for name in viewport_display.MODIFIERS)  # they set it to 0
+    cloud = obj.data if hidden else cloud
     radius = point_clouds.attribute(cloud, "radius", "FLOAT")
     if radius is None or "radius" not in stored or len(cloud.points) != obj.r5dgs.count:
         return False
-    ellipsoids = obj.modifiers.get(viewport_display.MODIFIER) is not None  # they set the radius to 0
-    return not ellipsoids and point_clouds.fingerprint(point_clouds.view(radius, "value", 1)) != stored["radius"]
+    return point_clouds.fingerprint(point_clouds.view(radius, "value", 1)) != stored["radius"]
 
 
 def _made_besides_points(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> list[str]:

@@ -7,6 +7,8 @@ import bpy
 import numpy as np
 
 ORIGIN = "r5dgs_origin"  # custom property of the root, because Blender's built-in vectors are float32
+SKY = "r5dgs_sky"  # custom property of the collection: coefficients of the sky
+LIGHT = "r5dgs_light"  # the same: direction of the light that shading depends on
 
 
 def scene_collections() -> list[bpy.types.Collection]:
@@ -82,6 +84,12 @@ def origin(collection: bpy.types.Collection | None) -> np.ndarray:
     except (TypeError, ValueError):
         found = np.zeros(0)
     return found if found.shape == (3,) and np.isfinite(found).all() else np.zeros(3)
+
+
+def light(collection: bpy.types.Collection) -> np.ndarray | None:
+    """Direction of a loaded scene's light in its own world, or None without shading. [3] float64"""
+    found = np.array(collection.get(LIGHT, ()), np.float64)
+    return found if found.shape == (3,) and np.isfinite(found).all() else None
 
 
 def origin_text(origin: np.ndarray) -> str:

@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core.color import srgb
+from ...r5dgs_core.playback import posing
 from ...r5dgs_core.scene import spherical_harmonics
 from ...r5dgs_core.scene.scene import Scene
 from ...r5dgs_core.scene.splats import to_opacities
@@ -16,6 +17,7 @@ from .. import compat
 DISPLAY_COLOR = "display_color"
 ROW = "gaussian"
 HARMONICS = "radiance:sh_"
+SHADING, SHADING_REST = "shading", "shading_rest"
 BIND = "bind_state:"  # prefix of attributes that keep the values overwritten by Exact Mode
 _FINGERPRINTS = "r5dgs_fingerprints"  # custom property of point clouds
 _BLOCK = 2048
@@ -54,6 +56,9 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     }
     for k, plane in enumerate(_planes(sh[:, 1 : (sh_degree + 1) ** 2])):
         written[f"{HARMONICS}{k}"] = _write(cloud, f"{HARMONICS}{k}", "FLOAT_VECTOR", "vector", plane)
+    if scene.shading is not None:
+        _write(cloud, SHADING, "FLOAT_VECTOR", "vector", scene.shading.vectors[rows])
+        _write(cloud, SHADING_REST, "FLOAT", "value", posing.rest_factors(scene)[rows])
     cloud[_FINGERPRINTS] = {name: fingerprint(values) for name, values in written.items()}
     _write(cloud, "object_id", "INT", "value", scene.gaussians.object_ids[rows], np.int32)
     _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", np.concatenate([shown, opacities[:, None]], axis=-1))

@@ -106,7 +106,7 @@ class R5DGS_PG_scene(bpy.types.PropertyGroup):
     )
     display: EnumProperty(
         name="Display",
-        description="Representation of Gaussians in viewports that draw no splats",
+        description="Representation of Gaussians in viewports",
         items=viewport_display.ITEMS,
     )
     gaussians: IntProperty(name="Gaussians", description="Number of Gaussians in the scene file")

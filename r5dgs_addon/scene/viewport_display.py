@@ -1,20 +1,23 @@
-"""Display of Gaussians in viewports without splats: points, or one ellipsoid each by geometry nodes.
+"""Display of Gaussians in viewports: splats, points, or one ellipsoid each by geometry nodes.
 
-Points are fast for any number of Gaussians. Ellipsoids show size, orientation and opacity, but are slower. They are
-instances created by a modifier, which passes the points on with radius 0, so that the evaluated point cloud keeps
-them.
+Splats are drawn by the add-on. Points are fast for any number of Gaussians. Ellipsoids show size, orientation and
+opacity, but are slower. They are instances created by a modifier. Splats and ellipsoids have a modifier that passes the
+points on with radius 0, so that Blender does not draw them and the evaluated point cloud keeps them.
 """
 
 import bpy
 
 from . import point_clouds
 
-POINTS, ELLIPSOIDS = "POINTS", "ELLIPSOIDS"
-ITEMS = (
-    (POINTS, "Points", "A sphere for each Gaussian, of at most a hundredth of the scene's size; fast"),
-    (ELLIPSOIDS, "Ellipsoids", "Each Gaussian with its size, orientation and opacity; slow above 100,000"),
+SPLATS, POINTS, ELLIPSOIDS = "SPLATS", "POINTS", "ELLIPSOIDS"
+ITEMS = (  # the numbers are stored in .blend files
+    (SPLATS, "Splats", "The trained picture", 2),
+    (POINTS, "Points", "A sphere for each Gaussian, of at most a hundredth of the scene's size; fast", 0),
+    (ELLIPSOIDS, "Ellipsoids", "Each Gaussian with its size, orientation and opacity; slow above 100,000", 1),
 )
 MODIFIER = "R5DGS Ellipsoids"
+SPLATS_MODIFIER = "R5DGS Splats"
+MODIFIERS = (MODIFIER, SPLATS_MODIFIER)
 SIGMAS = 1.5  # half axes of an ellipsoid, in standard deviations
 JOIN = "GeometryNodeJoinGeometry"
 SUBDIVISIONS = 2  # icosphere subdivisions: 80 faces
@@ -27,23 +30,35 @@ def show(collection: bpy.types.Collection, display: str) -> None:
         collection: Loaded scene of this .blend file.
         display: Key of `ITEMS`.
     """
-    every = [obj for obj in collection.all_objects if obj.r5dgs.role == "CLOUD" and obj.library is None]
-    present = [(cloud, cloud.modifiers.get(MODIFIER)) for cloud in every]
-    used = {found.node_group for _, found in present if found is not None and found.node_group is not None}
-    if display == ELLIPSOIDS:
-        current = [found.node_group for cloud, found in present if found is not None and not hides_points(cloud)]
-        tree = next(filter(None, current), None) or _tree(point_clouds.instance_material(MODIFIER))
-        for cloud, found in present:
-            (found or cloud.modifiers.new(MODIFIER, "NODES")).node_group = tree
+    clouds = [obj for obj in collection.all_objects if obj.r5dgs.role == "CLOUD" and obj.library is None]
+    for name, wanted, make in ((MODIFIER, ELLIPSOIDS, _ellipsoids), (SPLATS_MODIFIER, SPLATS, _hidden_points)):
+        present = [(cloud, cloud.modifiers.get(name)) for cloud in clouds]
+        used = {found.node_group for _, found in present if found is not None and found.node_group is not None}
+        tree = None
+        if display == wanted:
+            current = [found.node_group for cloud, found in present if found is not None and not hides_points(cloud)]
+            tree = next(filter(None, current), None) or make()
+            for cloud, found in present:
+                (found or _new_modifier(cloud, name)).node_group = tree
+        else:
+            for cloud, found in present:
+                if found is not None:
+                    cloud.modifiers.remove(found)
         for old in used - {tree}:
             _forget(old)
-    else:
-        for cloud, found in present:
-            if found is not None:
-                cloud.modifiers.remove(found)
-        for tree in used:
-            _forget(tree)
     collection.r5dgs.display = display
+
+
+def draws_splats(cloud: bpy.types.Object) -> bool:
+    """Return True if a point cloud object is displayed as splats."""
+    return cloud.modifiers.get(SPLATS_MODIFIER) is not None
+
+
+def _new_modifier(cloud: bpy.types.Object, name: str) -> bpy.types.Modifier:
+    modifier = cloud.modifiers.new(name, "NODES")
+    if name == SPLATS_MODIFIER:  # other engines still render points
+        modifier.show_render = modifier.show_expanded = False
+    return modifier
 
 
 def hides_points(cloud: bpy.types.Object) -> bool:
@@ -64,11 +79,31 @@ def _forget(tree: bpy.types.NodeTree) -> None:
             bpy.data.materials.remove(material)
 
 
-def _tree(material: bpy.types.Material) -> bpy.types.NodeTree:
-    """Geometry node tree that places an ellipsoid on every point by its attributes `scale` and `rotation`."""
-    tree = bpy.data.node_groups.new(MODIFIER, "GeometryNodeTree")
+def _new_tree(name: str) -> bpy.types.NodeTree:
+    tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     for in_out in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=in_out, socket_type="NodeSocketGeometry")
+    return tree
+
+
+def _hidden_points() -> bpy.types.NodeTree:
+    """Geometry node tree that sets the radius of every point to 0."""
+    tree = _new_tree(SPLATS_MODIFIER)
+    entry, hidden, leave = (
+        tree.nodes.new(kind) for kind in ("NodeGroupInput", "GeometryNodeSetPointRadius", "NodeGroupOutput")
+    )
+    for column, node in enumerate((entry, hidden, leave)):
+        node.location = (220 * column, 0)
+    hidden.inputs["Radius"].default_value = 0.0
+    tree.links.new(entry.outputs[0], hidden.inputs[0])
+    tree.links.new(hidden.outputs[0], leave.inputs[0])
+    return tree
+
+
+def _ellipsoids() -> bpy.types.NodeTree:
+    """Geometry node tree that places an ellipsoid on every point by its attributes `scale` and `rotation`."""
+    material = point_clouds.instance_material(MODIFIER)
+    tree = _new_tree(MODIFIER)
     entry, sphere, painted, scale, rotation, instances, hidden, join, leave = (
         tree.nodes.new(kind)
         for kind in (

@@ -126,7 +126,7 @@ def test_points_carry_the_files_gaussians_under_the_native_names(blender, scene_
 def test_loading_leaves_no_temporary_data(blender, scene_path):
     before = len(blender.data.objects), len(blender.data.pointclouds)
     collection = motions.load(blender, scene_path)
-    assert len(blender.data.scenes) == 1 and not blender.data.node_groups
+    assert len(blender.data.scenes) == 1 and [tree.name for tree in blender.data.node_groups] == ["R5DGS Splats"]
     assert len(blender.data.objects) == before[0] + len(collection.all_objects)
     assert len(blender.data.pointclouds) == before[1] + len(motions.clouds(collection))
 

@@ -1,4 +1,4 @@
-"""Gaussians are shown in the viewport as points, or as ellipsoids with their size, orientation and opacity."""
+"""Display of Gaussians in viewports: splats, points, or ellipsoids with their size, orientation and opacity."""
 
 import numpy as np
 import pytest
@@ -57,18 +57,26 @@ def test_an_ellipsoid_has_one_and_a_half_standard_deviations_and_the_opacity(ble
 
 
 def test_the_display_can_be_changed_and_leaves_nothing_behind(blender, scene_path):
-    blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    blender.ops.r5dgs.load_scene(filepath=str(scene_path), display="POINTS")
     collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
     before = {kind: len(getattr(blender.data, kind)) for kind in ("materials", "node_groups", "objects", "pointclouds")}
     clouds = [obj for obj in collection.all_objects if obj.r5dgs.role == "CLOUD"]
     assert collection.r5dgs.display == "POINTS" and not any(cloud.modifiers for cloud in clouds)
-    for _ in range(2):  # twice: nothing is made twice either
-        assert blender.ops.r5dgs.set_display(display="ELLIPSOIDS") == {"FINISHED"}
-    assert collection.r5dgs.display == "ELLIPSOIDS" and {len(cloud.modifiers) for cloud in clouds} == {1}
-    assert len(blender.data.node_groups) == before["node_groups"] + 1
+    for display in ("ELLIPSOIDS", "ELLIPSOIDS", "SPLATS", "SPLATS"):  # twice: nothing is made twice either
+        assert blender.ops.r5dgs.set_display(display=display) == {"FINISHED"}
+        assert collection.r5dgs.display == display and {len(cloud.modifiers) for cloud in clouds} == {1}
+        assert len(blender.data.node_groups) == before["node_groups"] + 1
     blender.ops.r5dgs.set_display(display="POINTS")
     assert not any(cloud.modifiers for cloud in clouds)
     assert {kind: len(getattr(blender.data, kind)) for kind in before} == before
+
+
+def test_splats_hide_their_points_in_viewports_only(blender, scene_path):
+    blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    cloud = next(obj for obj in blender.data.objects if obj.r5dgs.role == "CLOUD")
+    shown = cloud.evaluated_get(blender.context.evaluated_depsgraph_get()).data
+    assert len(shown.points) == len(cloud.data.points) and {point.radius for point in shown.points} == {0.0}
+    assert min(point.radius for point in cloud.data.points) > 0 and not cloud.modifiers[0].show_render
 
 
 def test_one_undo_takes_a_display_back_and_redo_brings_it(blender, scene_path):
@@ -83,7 +91,7 @@ def test_one_undo_takes_a_display_back_and_redo_brings_it(blender, scene_path):
     blender.ops.ed.undo_push(message="Set Display")
     assert display() == ("ELLIPSOIDS", {1}, 1)
     blender.ops.ed.undo()
-    assert display() == ("POINTS", {0}, 0)
+    assert display() == ("SPLATS", {1}, 1)
     blender.ops.ed.redo()
     assert display() == ("ELLIPSOIDS", {1}, 1)
 

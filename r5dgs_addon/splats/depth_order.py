@@ -1,0 +1,145 @@
+"""Back-to-front order of Gaussians, sorted by 16-bit depth keys (numpy's stable sort of uint16 is a radix sort)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+LEVELS = 65535
+MARGIN = 1.25  # factor on both ends of the depth range, so that moving Gaussians stay inside it
+WORTHWHILE = 0.3  # share of unmoved Gaussians from which on their order is reused
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Conversion of depths to keys, the nearest Gaussian having the largest key.
+
+    Perspective keys are the leading bits of the float32 depth, so their relative resolution is the same at all depths.
+    Parallel keys are linear.
+
+    Attributes:
+        low: Smallest depth with a key of its own.
+        high: Largest one.
+        parallel: True for orthographic views.
+    """
+
+    low: float
+    high: float
+    parallel: bool
+
+    @classmethod
+    def of(cls, depths: np.ndarray, near: float, parallel: bool) -> Keys:
+        """Return keys for depths and the motion that is likely to follow. [n]"""
+        low, high = float(depths.min()), float(depths.max())
+        if parallel:
+            margin = (MARGIN - 1) * max(high - low, 1e-6)
+            return cls(low - margin, high + margin, True)
+        low = max(low, near)
+        return cls(low / MARGIN, max(high, low) * MARGIN, False)
+
+    def hold(self, depths: np.ndarray) -> bool:
+        """Return True if no depth is beyond the far end. Nearer ones are culled or sorted last. [n]"""
+        return float(depths.max()) <= self.high and (not self.parallel or float(depths.min()) >= self.low)
+
+    def __call__(self, depths: np.ndarray) -> np.ndarray:
+        """Convert float32 depths, which are overwritten, to keys. [n] uint16"""
+        np.clip(depths, self.low, self.high, out=depths)
+        if self.parallel:
+            depths -= np.float32(self.high)
+            depths *= np.float32(-LEVELS / (self.high - self.low))
+            return depths.astype(np.uint16)
+        first, last = np.array([self.low, self.high], np.float32).view(np.int32)
+        shift = max(int(last - first).bit_length() - 16, 0)
+        bits = depths.view(np.int32)
+        np.subtract(last, bits, out=bits)
+        bits >>= shift
+        return bits.astype(np.uint16)
+
+
+@dataclass(frozen=True)
+class _Sorted:
+    """Sorted Gaussians of some groups: the groups, their conversion, keys and rows, from far to near."""
+
+    groups: frozenset[int]
+    keys: Keys
+    sorted_keys: np.ndarray
+    rows: np.ndarray
+
+
+class DepthOrder:
+    """Order of the Gaussians in one view. Groups that did not move keep theirs, and the others are merged into it.
+
+    Args:
+        positions: Centres in the frames of their groups. [N, 3] float32
+        starts: First row of each group, and N. [G + 1]
+    """
+
+    def __init__(self, positions: np.ndarray, starts: Sequence[int]):
+        self._positions, self._starts = positions, starts
+        self._planes: dict[int, bytes] = {}
+        self._still: _Sorted | None = None
+
+    def update(self, planes: dict[int, np.ndarray], near: float, parallel: bool) -> np.ndarray:
+        """Sort the Gaussians of the visible groups.
+
+        Args:
+            planes: Visible groups; depth of a point (x, y, z) is plane . (x, y, z, 1). [4] each
+            near: Depth at which a perspective view begins.
+            parallel: True for orthographic views.
+
+        Returns:
+            Rows of the Gaussians, from far to near. [n] int64
+        """
+        now = {group: plane.tobytes() for group, plane in planes.items()}
+        unmoved = frozenset(group for group, plane in now.items() if self._planes.get(group) == plane)
+        self._planes = now
+        moved = now.keys() - unmoved
+        if not moved and self._still is not None and self._still.groups == now.keys():
+            return self._still.rows
+        if self._still is None or not self._still.groups <= unmoved or self._still.keys.parallel != parallel:
+            self._still = self._sort(planes, unmoved, near, parallel) if self._count(unmoved) else None
+        total = self._count(now)
+        if self._still is not None and self._count(self._still.groups) >= WORTHWHILE * total:
+            merged = self._merge(planes, self._still)
+            if merged is not None:
+                return merged
+        everything = self._sort(planes, frozenset(now), near, parallel)
+        self._still = everything
+        return everything.rows
+
+    def _count(self, groups) -> int:
+        return sum(self._starts[group + 1] - self._starts[group] for group in groups)
+
+    def _depths(self, planes: dict[int, np.ndarray], groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Depths and rows of the Gaussians of groups. [n] float32, [n] int64"""
+        depths, filled = np.empty(self._count(groups), np.float32), 0
+        spans = [(self._starts[group], self._starts[group + 1]) for group in groups]
+        for group, (start, stop) in zip(groups, spans, strict=True):
+            part, plane = depths[filled : filled + stop - start], planes[group]
+            np.dot(self._positions[start:stop], plane[:3].astype(np.float32), out=part)
+            part += np.float32(plane[3])
+            filled += stop - start
+        rows = np.concatenate([np.empty(0, np.int64), *(np.arange(*span) for span in spans)])
+        return depths, rows
+
+    def _sort(self, planes: dict[int, np.ndarray], groups: frozenset[int], near: float, parallel: bool) -> _Sorted:
+        depths, rows = self._depths(planes, sorted(groups))
+        if not len(rows):
+            return _Sorted(groups, Keys(near, near, False), np.empty(0, np.uint16), rows)
+        conversion = Keys.of(depths, near, parallel)
+        keys = conversion(depths)
+        order = np.argsort(keys, kind="stable")
+        return _Sorted(groups, conversion, keys[order], rows[order])
+
+    def _merge(self, planes: dict[int, np.ndarray], still: _Sorted) -> np.ndarray | None:
+        """Merge the other groups into a sorted set, or return None if they leave its range of depths."""
+        depths, rows = self._depths(planes, sorted(planes.keys() - still.groups))
+        if not len(rows):
+            return still.rows
+        if not still.keys.hold(depths):
+            return None
+        keys = still.keys(depths)
+        order = np.argsort(keys, kind="stable")
+        return np.insert(still.rows, np.searchsorted(still.sorted_keys, keys[order], side="right"), rows[order])

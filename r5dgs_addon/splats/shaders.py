@@ -1,0 +1,200 @@
+"""Shaders of the viewport splats: Gaussians into an own buffer, and that buffer into the viewport."""
+
+from __future__ import annotations
+
+import gpu
+
+WIDTH = 4096  # texels of a row of the table, at most
+POSE_TEXELS = 6  # of each group: three rows of its matrix to the camera, tint, change of the light, viewpoint
+
+_HARMONICS = """
+/* Color of harmonics in the direction d, from coefficients packed in texels of COEFFICIENTS from `at` on. */
+float coefficient(ivec2 at, int k) { return texelFetch(COEFFICIENTS, at + ivec2(k / 4, 0), 0)[k % 4]; }
+vec3 harmonics(ivec2 at, vec3 d, int degree)
+{
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+  float values[15];
+  values[0] = -0.4886025119029199 * y;
+  values[1] = 0.4886025119029199 * z;
+  values[2] = -0.4886025119029199 * x;
+  values[3] = 1.0925484305920792 * x * y;
+  values[4] = -1.0925484305920792 * y * z;
+  values[5] = 0.31539156525252005 * (2.0 * zz - xx - yy);
+  values[6] = -1.0925484305920792 * x * z;
+  values[7] = 0.5462742152960396 * (xx - yy);
+  values[8] = -0.5900435899266435 * y * (3.0 * xx - yy);
+  values[9] = 2.890611442640554 * x * y * z;
+  values[10] = -0.4570457994644658 * y * (4.0 * zz - xx - yy);
+  values[11] = 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy);
+  values[12] = -0.4570457994644658 * x * (4.0 * zz - xx - yy);
+  values[13] = 1.445305721320277 * z * (xx - yy);
+  values[14] = -0.5900435899266435 * x * (xx - 3.0 * yy);
+  int count = (degree + 1) * (degree + 1) - 1;
+  vec3 sum = vec3(0.0);
+  for (int k = 0; k < count; k++) {
+    vec3 c = vec3(coefficient(at, 3 * k), coefficient(at, 3 * k + 1), coefficient(at, 3 * k + 2));
+    sum += values[k] * c;
+  }
+  return sum;
+}
+"""
+
+_SPLAT_VERTEX = (
+    _HARMONICS
+    + """
+void main()
+{
+  int place_of = gl_InstanceID;
+  int id = int(texelFetch(order, ivec2(place_of % ORDER_WIDTH, place_of / ORDER_WIDTH), 0).r);
+  ivec2 first = ivec2((id % PER_ROW) * TEXELS, id / PER_ROW);
+  vec4 place = texelFetch(table, first, 0);
+  vec4 s0 = texelFetch(table, first + ivec2(1, 0), 0);
+  vec4 s1 = texelFetch(table, first + ivec2(2, 0), 0);
+  vec4 base = texelFetch(table, first + ivec2(3, 0), 0);
+  int group = int(place.w);
+  vec4 r0 = texelFetch(poses, ivec2(0, group), 0);
+  vec4 r1 = texelFetch(poses, ivec2(1, group), 0);
+  vec4 r2 = texelFetch(poses, ivec2(2, group), 0);
+  vec4 h = vec4(place.xyz, 1.0);
+  vec3 p = vec3(dot(r0, h), dot(r1, h), dot(r2, h));  /* camera space, looking along -z */
+  vec4 clip = projection * vec4(p, 1.0);
+  delta = vec2(0.0);
+  conic = vec3(0.0);
+  depths = vec3(0.0);
+  paint = vec4(0.0);
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  /* outside: the quad is clipped */
+  bool parallel = projection[3][3] > 0.5;
+  if ((!parallel && -p.z < view.z) || base.a * 255.0 < 1.0) { return; }
+  mat3 A = transpose(mat3(r0.xyz, r1.xyz, r2.xyz));
+  mat3 S = mat3(s0.x, s0.y, s0.z, s0.y, s0.w, s1.x, s0.z, s1.x, s1.y);
+  mat3 C = A * S * transpose(A);
+  vec2 f = vec2(projection[0][0], projection[1][1]) * 0.5 * view.xy;
+  vec3 jx, jy;
+  if (parallel) { jx = vec3(f.x, 0.0, 0.0); jy = vec3(0.0, f.y, 0.0); }
+  else {
+    float inverse = 1.0 / -p.z;
+    vec2 slope = clamp(p.xy * inverse, slopes.xz, slopes.yw);
+    jx = vec3(f.x, 0.0, f.x * slope.x) * inverse;
+    jy = vec3(0.0, f.y, f.y * slope.y) * inverse;
+  }
+  vec3 cx = C * jx;
+  float a = dot(jx, cx) + 0.3, b = dot(jy, cx), c = dot(jy, C * jy) + 0.3;
+  float det = a * c - b * b;
+  if (det <= 0.0) { return; }
+  conic = vec3(c, -b, a) / det;
+  /* Depth at which the Gaussian is densest along the ray of a pixel: linear in the offset from its centre. */
+  vec2 along = -vec2(cx.z, (C * jy).z);
+  depths = vec3(-p.z, conic.x * along.x + conic.y * along.y, conic.y * along.x + conic.z * along.y);
+  vec3 color = 0.5 + 0.28209479177387814 * base.rgb;
+#if DEGREE > 0
+  vec4 eye = texelFetch(poses, ivec2(5, group), 0);  /* viewpoint, or with w = 0 the line of sight */
+  vec3 sight = eye.w * place.xyz - eye.xyz;
+  float far_off = length(sight);
+  if (far_off > 0.0) { color += harmonics(first + ivec2(TEXELS - REST, 0), sight / far_off, DEGREE); }
+#endif
+  color = max(color, 0.0);
+#if SHADED > 0
+  vec4 light = texelFetch(table, first + ivec2(4, 0), 0);
+  color *= max(light.w + dot(light.xyz, texelFetch(poses, ivec2(4, group), 0).xyz), 0.0);
+#endif
+  paint = vec4(color * texelFetch(poses, ivec2(3, group), 0).rgb, base.a);
+  float reach = 2.0 * log(base.a * 255.0);  /* alpha is 1/255 where the exponent is this */
+  delta = corner * sqrt(reach * vec2(a, c));
+  gl_Position = clip + vec4(2.0 * delta / view.xy * clip.w, 0.0, 0.0);
+  gl_Position.z = clamp(gl_Position.z, -clip.w, clip.w);  /* no far plane, as in the core */
+}
+"""
+)
+_SPLAT_FRAGMENT = """
+void main()
+{
+  float power = conic.x * delta.x * delta.x + 2.0 * conic.y * delta.x * delta.y + conic.z * delta.y * delta.y;
+  float alpha = min(0.99, paint.a * exp(-0.5 * power));
+  if (alpha < 1.0 / 255.0) { discard; }
+  if (view.w > 0.5) {
+    float solid = 2.0 * texelFetch(meshes, ivec2(gl_FragCoord.xy), 0).r - 1.0;
+    bool parallel = projection[3][3] > 0.5;
+    float limit = parallel ? projection[3][2] - solid : projection[3][2];
+    limit /= parallel ? projection[2][2] : solid + projection[2][2];
+    if (solid < 1.0 && depths.x + dot(depths.yz, delta) > limit) { discard; }
+  }
+  picture = vec4(paint.rgb * alpha, alpha);
+}
+"""
+
+_PASTE_VERTEX = "void main() { uv = corner; gl_Position = vec4(corner, 0.0, 1.0); }"
+# Blender merges its overlay with the scene by this gamma, not by the sRGB curve. Over a known color behind, the result
+# is exact; over meshes, soft edges are blended in that gamma.
+_PASTE_FRAGMENT = (
+    _HARMONICS
+    + """
+void main()
+{
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  vec4 c = texelFetch(splats, at, 0);
+  bool open = meshes_drawn < 1 || texelFetch(meshes, at, 0).r >= 1.0;  /* nothing solid in this pixel */
+  if (sky_degree >= 0 && open) {
+    vec4 ray = to_world * vec4(uv, 1.0, 1.0);
+    vec3 d = normalize(ray.xyz);
+    vec3 sky = 0.5 + 0.28209479177387814 * texelFetch(sky_terms, ivec2(0, 0), 0).rgb;
+    if (sky_degree > 0) { sky += harmonics(ivec2(1, 0), d, sky_degree); }
+    picture = vec4(pow(clamp(c.rgb + clamp(sky, 0.0, 1.0) * (1.0 - c.a), 0.0, 1.0), vec3(2.2)), 1.0);
+    return;
+  }
+  if (c.a <= 0.0) { discard; }
+  vec3 s = clamp(c.rgb / c.a, 0.0, 1.0);
+  vec3 below = open ? behind : vec3(0.5);
+  vec3 b = pow(below, vec3(2.2)) * (1.0 - c.a);
+  picture = vec4(max(pow(s * c.a + below * (1.0 - c.a), vec3(2.2)) - b, vec3(0.0)), c.a);
+}
+"""
+)
+
+
+def splats(degree: int, shaded: bool, texels: int, order_width: int) -> gpu.types.GPUShader:
+    """Compile the shader that draws Gaussians.
+
+    Args:
+        degree: Degree of the harmonics in the table.
+        shaded: True if the table has shading.
+        texels: Texels of each Gaussian.
+        order_width: Width of the texture of rows.
+    """
+    info = _info(_SPLAT_VERTEX, _SPLAT_FRAGMENT, ("table", "poses", "order", "meshes"))
+    for kind, name in (("MAT4", "projection"), ("VEC4", "view"), ("VEC4", "slopes")):
+        info.push_constant(kind, name)
+    between = gpu.types.GPUStageInterfaceInfo("r5dgs_splat")
+    between.smooth("VEC2", "delta")
+    between.flat("VEC3", "conic")
+    between.flat("VEC4", "paint")
+    between.flat("VEC3", "depths")
+    info.vertex_out(between)
+    rest = texels - 4 - shaded
+    info.define("COEFFICIENTS", "table")
+    defines = {"DEGREE": degree, "SHADED": int(shaded), "TEXELS": texels, "REST": rest, "ORDER_WIDTH": order_width}
+    for name, value in {**defines, "PER_ROW": WIDTH // texels}.items():
+        info.define(name, str(value))
+    return gpu.shader.create_from_info(info)
+
+
+def paste() -> gpu.types.GPUShader:
+    """Compile the shader that draws the buffer into a viewport."""
+    info = _info(_PASTE_VERTEX, _PASTE_FRAGMENT, ("splats", "meshes", "sky_terms"))
+    for kind, name in (("MAT4", "to_world"), ("VEC3", "behind"), ("INT", "sky_degree"), ("INT", "meshes_drawn")):
+        info.push_constant(kind, name)
+    between = gpu.types.GPUStageInterfaceInfo("r5dgs_paste")
+    between.smooth("VEC2", "uv")
+    info.vertex_out(between)
+    info.define("COEFFICIENTS", "sky_terms")
+    return gpu.shader.create_from_info(info)
+
+
+def _info(vertex: str, fragment: str, textures: tuple[str, ...]) -> gpu.types.GPUShaderCreateInfo:
+    info = gpu.types.GPUShaderCreateInfo()
+    info.vertex_in(0, "VEC2", "corner")
+    for slot, name in enumerate(textures):
+        info.sampler(slot, "FLOAT_2D", name)
+    info.fragment_out(0, "VEC4", "picture")
+    info.vertex_source(vertex)
+    info.fragment_source(fragment)
+    return info

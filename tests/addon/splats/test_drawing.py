@@ -1,0 +1,167 @@
+"""Splats drawn by the graphics card against the core's pictures, without a window.
+
+A render engine with `bl_use_gpu_context` may draw in background mode; everywhere else `gpu` refuses.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core import api
+from r5dgs_core.scene import scene_file
+from tests.support import motions, scenes
+
+pytest.importorskip("numba", reason="numba is not installed in this Python, which draws the core's pictures here")
+
+SIZE = (160, 120)
+AT_LEAST_DB = 60.0
+
+
+@pytest.fixture
+def drawn(blender):
+    """Draws the visible splats from the active camera: premultiplied colors and coverage. [H, W, 4]"""
+    module = motions.addon("splats.viewport_splats")
+    import gpu
+
+    pictures = []
+
+    class Engine(blender.types.RenderEngine):
+        bl_idname, bl_label, bl_use_gpu_context = "R5DGS_TEST_SPLATS", "Splats", True
+
+        def render(self, depsgraph):
+            try:
+                pictures.append(self.picture(depsgraph))
+            except BaseException as error:
+                pictures.append(error)
+            finally:
+                module._state.forget()  # this context ends with the render
+
+        def picture(self, depsgraph):
+            camera = depsgraph.scene.camera.evaluated_get(depsgraph)
+            found = module.shown(depsgraph)
+            buffer = module.renderer.SplatBuffer()
+            view = module.renderer.View(
+                np.linalg.inv(np.array(camera.matrix_world, np.float64)),
+                np.array(camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), np.float64),
+                *SIZE,
+            )
+            if found is None:
+                return np.zeros((SIZE[1], SIZE[0], 4))
+            buffer.draw(found.table, found.groups, view)
+            with buffer._offscreen.bind():
+                pixels = gpu.state.active_framebuffer_get().read_color(0, 0, *SIZE, 4, 0, "FLOAT")
+            pixels.dimensions = SIZE[0] * SIZE[1] * 4
+            return np.array(pixels, np.float32).reshape(SIZE[1], SIZE[0], 4)[::-1]
+
+    blender.utils.register_class(Engine)
+    scene = blender.context.scene
+
+    def draw():
+        scene.render.engine = Engine.bl_idname
+        scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = *SIZE, 100
+        blender.ops.render.render()
+        found = pictures.pop()
+        if isinstance(found, BaseException):
+            raise found
+        return found
+
+    yield draw
+    blender.utils.unregister_class(Engine)  # otherwise some versions crash or hang at exit
+
+
+def expected(blender, scene, t):
+    """The core's picture over black from Blender's active camera. [H, W, 3]"""
+    view_cameras = motions.addon("engine.view_cameras")
+    depsgraph = blender.context.evaluated_depsgraph_get()
+    view = view_cameras.of_camera(depsgraph, lambda: np.zeros((0, 3)))
+    black = scene.background_sh.copy() * 0
+    black[0] = -0.5 / 0.28209479177387814
+    return api.picture(dataclasses.replace(scene, background_sh=black), t, view.camera)
+
+
+def psnr(a, b):
+    return -10 * np.log10(np.square(a - b).mean())
+
+
+@pytest.mark.parametrize("degree, shading", [(0, False), (1, True), (2, False), (3, True)])
+def test_pictures_equal_the_cores_at_any_time(blender, drawn, tmp_path, degree, shading):
+    scene = scenes.make_scene(n=400, objects=3, sh_degree=degree, shading=shading)
+    path = scene_file.write(scene, tmp_path / "scene.r5dgs")
+    blender.ops.object.select_all(action="SELECT")
+    collection = motions.load(blender, path)
+    stored = scene_file.read(path)
+    for t in (0.2, scenes.T_MAX, 0.9):
+        motions.go_to(blender, collection, t)
+        found = drawn()
+        assert found[..., 3].max() > 0.5
+        assert psnr(np.clip(found[..., :3], 0, 1), expected(blender, stored, t)) > AT_LEAST_DB
+
+
+def moved(bpy, mug):
+    mug.parent.rotation_quaternion, mug.parent.scale = (0.8, 0.3, 0.5, 0.1), (1.5, 0.7, 1.0)
+
+
+def tinted(bpy, mug):
+    mug.r5dgs_look.tint = (0.3, 1.2, 0.8)
+
+
+def hidden(bpy, mug):
+    mug.hide_viewport = mug.hide_render = True
+
+
+def edited(bpy, mug):
+    values = np.empty(3 * len(mug.data.points), np.float32)
+    mug.data.attributes["scale"].data.foreach_get("vector", values)
+    mug.data.attributes["scale"].data.foreach_set("vector", 2 * values)
+    mug.data.update_tag()
+
+
+def deleted_by_nodes(bpy, mug):
+    tree = bpy.data.node_groups.new("half", "GeometryNodeTree")
+    for in_out in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=in_out, socket_type="NodeSocketGeometry")
+    entry, leave = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
+    delete, random = tree.nodes.new("GeometryNodeDeleteGeometry"), tree.nodes.new("FunctionNodeRandomValue")
+    random.data_type = "BOOLEAN"
+    tree.links.new(entry.outputs[0], delete.inputs["Geometry"])
+    tree.links.new(next(out for out in random.outputs if out.enabled), delete.inputs["Selection"])
+    tree.links.new(delete.outputs[0], leave.inputs[0])
+    mug.modifiers.new("half", "NODES").node_group = tree
+
+
+def instanced(bpy, mug):
+    instancer = bpy.data.objects.new("instancer", None)
+    instancer.instance_type, instancer.instance_collection = "COLLECTION", mug.users_collection[0]
+    instancer.location = (0.5, 0.4, 0.3)
+    bpy.context.scene.collection.objects.link(instancer)
+
+
+def parallel(bpy, mug):
+    bpy.context.scene.camera.data.type = "ORTHO"
+    bpy.context.scene.camera.data.ortho_scale = 5
+
+
+@pytest.mark.parametrize(
+    "change", [moved, tinted, hidden, edited, deleted_by_nodes, instanced, parallel], ids=lambda one: one.__name__
+)
+def test_edits_are_drawn_as_the_worker_draws_them(blender, drawn, tmp_path, change):
+    scene = scenes.make_scene(n=400, objects=3, sh_degree=1)
+    collection = motions.load(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
+    motions.go_to(blender, collection, 0.3)
+    before = drawn()
+    change(blender, max(motions.clouds(collection), key=lambda cloud: (cloud.r5dgs.object_id == 1, cloud.r5dgs.count)))
+    request = motions.addon("engine.render_request")
+    found = drawn()
+    depsgraph = blender.context.evaluated_depsgraph_get()
+    arrays = request.render(request.shown(depsgraph), ("alpha",), sky=False)[1]
+    assert psnr(before, found) < 50  # the change is seen
+    assert psnr(np.clip(found[..., :3], 0, 1), np.clip(arrays["color"], 0, 1)) > AT_LEAST_DB
+    assert psnr(found[..., 3], arrays["alpha"]) > AT_LEAST_DB
+
+
+def test_scenes_with_another_display_are_left_out(blender, drawn, tmp_path):
+    collection = motions.load(blender, scene_file.write(scenes.make_scene(n=100), tmp_path / "scene.r5dgs"))
+    assert drawn().any()
+    blender.ops.r5dgs.set_display(display="POINTS")
+    assert not drawn().any() and collection.r5dgs.display == "POINTS"
