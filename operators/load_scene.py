@@ -25,7 +25,16 @@ SH_DEGREES = (
     ("2", "Degree 2", "8 harmonics in addition to the color"),
     ("3", "Degree 3", "15 harmonics in addition to the color"),
 )
-OPTIONS = ("world_convention", "frame_zero", "t_end", "key_tolerance", "fit_timeline", "sh_degree", "display")
+OPTIONS = (
+    "world_convention",
+    "frame_zero",
+    "t_end",
+    "key_tolerance",
+    "fit_timeline",
+    "frame_views",
+    "sh_degree",
+    "display",
+)
 
 
 class R5DGS_OT_load_scene(bpy.types.Operator):
@@ -64,6 +73,9 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         items=SH_DEGREES,
         default="ALL",
     )
+    frame_views: BoolProperty(
+        name="Frame Views", description="Look at the scene from a captured camera in all 3D views", default=True
+    )
     display: EnumProperty(
         name="Display",
         description="Representation of Gaussians in viewports",
@@ -99,6 +111,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             key_tolerance=self.key_tolerance,
             fit_timeline=self.fit_timeline,
             sh_degree=3 if self.sh_degree == "ALL" else int(self.sh_degree),
+            frame_views=self.frame_views,
             display=self.display,
         )
         try:

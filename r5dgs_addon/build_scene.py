@@ -19,7 +19,7 @@ from ..r5dgs_core.scene import cameras
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
 from . import compat
 from .motion import keyframes, physics
-from .scene import loaded_scenes, object_names, point_clouds, relink, timeline, viewport_display
+from .scene import first_view, loaded_scenes, object_names, point_clouds, relink, timeline, viewport_display
 
 SMALLEST = 1e-4  # minimum extent of a scene (units); Blender's F-curves ignore changes below 1.2e-7
 
@@ -35,6 +35,7 @@ class Options:
         key_tolerance: Maximum error of the reduced keys, as a fraction of the scene's extent.
         fit_timeline: True to set the frame range and the t_max marker.
         sh_degree: Highest spherical-harmonics degree stored on the points.
+        frame_views: True to look at the scene in all 3D views.
         display: Key of `viewport_display.ITEMS`.
     """
 
@@ -44,6 +45,7 @@ class Options:
     key_tolerance: float = keyframes.TOLERANCE
     fit_timeline: bool = True
     sh_degree: int = 3
+    frame_views: bool = True
     display: str = viewport_display.SPLATS
 
 
@@ -113,6 +115,7 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         _describe(collection, scene, path, root, times)
         anchors = _objects(collection, root, scene, options.sh_degree)
         viewport_display.show(collection, options.display)
+        first_view.remember(collection, scene)
         reaches = keyframes.reaches(scene)
         for (_, motion_id), anchor in anchors.items():
             keyframes.animate(anchor, scene, motion_id, times, options.key_tolerance, float(reaches[motion_id]))
@@ -121,6 +124,8 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         if options.fit_timeline:
             timeline.fit(context.scene, times)
         context.view_layer.update()
+    if options.frame_views:
+        first_view.show(context, collection)
     for selected in context.selected_objects:
         selected.select_set(False)
     root.select_set(True)

@@ -41,6 +41,7 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
             status_bar.wrapped(layout, context, note, "ERROR")
         if not timeline.fits(context.scene, times):
             layout.operator("r5dgs.fit_timeline", icon="TIME")
+        layout.operator("r5dgs.view_as_trained", icon="CAMERA_DATA")
         row = layout.row(align=True)
         for value, name, *_ in viewport_display.ITEMS:
             row.operator("r5dgs.set_display", text=name, depress=state.display == value).display = value

@@ -1,0 +1,74 @@
+"""View of a loaded scene from its best captured camera, in all 3D views."""
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...r5dgs_core.scene import cameras
+from ...r5dgs_core.scene.scene import Scene
+from . import loaded_scenes
+
+SAMPLE = 2000  # Gaussians that the best camera is chosen by
+NEAREST, FARTHEST = 1e-3, 100.0  # clip range as factors of the distance to the objects
+DEFAULT_CLIP = (0.01, 1000.0)  # Blender's own, which is only widened
+
+
+def remember(collection: bpy.types.Collection, scene: Scene) -> None:
+    """Store the pose of the best captured camera and the distance to the objects; nothing if there are no cameras."""
+    points = _points(scene)
+    shots = [(_score(camera, points), camera) for camera in scene.cameras]
+    if not shots:
+        return
+    _, camera = max(shots, key=lambda shot: shot[0])
+    depths = (points - camera.center) @ camera.forward
+    distance = float(np.median(depths[depths > 0])) if (depths > 0).any() else scene.extent
+    pose = cameras.cam_world_to_opengl(camera.T_cam_world)
+    collection[loaded_scenes.VIEW] = [*pose.ravel().tolist(), distance]
+
+
+def show(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
+    """Look at a loaded scene in all 3D views of the windows that show the active Blender scene.
+
+    Views through a camera and locked ones keep their view. The clip range of a view is widened if needed.
+
+    Returns:
+        Number of views that changed.
+    """
+    found = np.array(collection.get(loaded_scenes.VIEW, ()), np.float64)
+    if found.shape != (17,) or not np.isfinite(found).all() or collection.r5dgs.root is None:
+        return 0
+    root = np.array(collection.r5dgs.root.matrix_world, np.float64)
+    pose, distance = root @ found[:16].reshape(4, 4), found[16] * np.linalg.norm(root[:3, 2])
+    rotation = Matrix(pose[:3, :3].tolist()).to_quaternion()
+    target = pose[:3, 3] - distance * pose[:3, 2] / np.linalg.norm(pose[:3, 2])
+    changed = 0
+    for window in context.window_manager.windows:
+        areas = window.screen.areas if window.scene == context.scene else ()
+        for space in (area.spaces.active for area in areas if area.type == "VIEW_3D"):
+            view = space.region_3d
+            if view.view_perspective == "CAMERA" or view.lock_rotation or space.region_quadviews:
+                continue
+            view.view_rotation, view.view_location, view.view_distance = rotation, target, distance
+            space.clip_start = min(space.clip_start, max(NEAREST * distance, 1e-6), DEFAULT_CLIP[0])
+            space.clip_end = max(space.clip_end, FARTHEST * distance, DEFAULT_CLIP[1])
+            changed += 1
+    return changed
+
+
+def _points(scene: Scene) -> np.ndarray:
+    """Sample of the Gaussians of objects, or of all if there are no objects. [n, 3]"""
+    rows = np.flatnonzero(scene.gaussians.object_ids > 0)
+    rows = rows if len(rows) else np.arange(len(scene.gaussians.means))
+    chosen = rows[np.linspace(0, len(rows) - 1, min(SAMPLE, len(rows))).astype(int)]
+    return scene.gaussians.means[chosen].astype(np.float64)
+
+
+def _score(camera: cameras.Camera, points: np.ndarray) -> float:
+    """Share of the points inside a camera's picture, less their mean distance from its middle in half diagonals."""
+    own = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
+    depth = np.maximum(own[:, 2:], 1e-9)
+    pixels = (own @ camera.intrinsics.T)[:, :2] / depth
+    size = np.array([camera.width, camera.height])
+    inside = ((pixels >= 0) & (pixels < size)).all(1) & (own[:, 2] > 0)
+    off = np.linalg.norm(pixels - size / 2, axis=1) / (np.linalg.norm(size) / 2)
+    return float(inside.mean() - np.minimum(off, 1.0).mean())
