@@ -65,7 +65,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         precision=6,
     )
     fit_timeline: BoolProperty(
-        name="Fit Timeline", description="Set the frame range and mark the last observed time", default=True
+        name="Fit Timeline", description="Set the frame range, and mark the last observed time and events", default=True
     )
     sh_degree: EnumProperty(
         name="View Dependence",

@@ -16,7 +16,7 @@ ACTIONS = (
 
 
 class R5DGS_OT_show_confidence(polls.NeedsScene, bpy.types.Operator):
-    """Show the extrapolated paths of the selected objects, or of all, as tubes of one standard deviation"""
+    """Show the extrapolated paths of the selected objects, or of all, as tubes that hold the true path with 95 %"""
 
     bl_idname = "r5dgs.show_confidence"
     bl_label = "Show Confidence"
@@ -50,7 +50,7 @@ class R5DGS_OT_show_confidence(polls.NeedsScene, bpy.types.Operator):
             self.report({"WARNING"}, "Nothing moves after the last observed time")
             return {"CANCELLED"}
         context.view_layer.update()
-        self.report({"INFO"}, f"{plural.of(count, 'tube')}, as thick as one standard deviation")
+        self.report({"INFO"}, f"{plural.of(count, 'tube')} of 95 % confidence")
         return {"FINISHED"}
 
 

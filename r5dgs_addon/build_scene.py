@@ -18,7 +18,7 @@ from ..r5dgs_core.color import srgb
 from ..r5dgs_core.scene import cameras
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
 from . import compat
-from .motion import keyframes, physics
+from .motion import event_markers, keyframes, physics
 from .scene import first_view, loaded_scenes, object_names, point_clouds, relink, timeline, viewport_display
 
 SMALLEST = 1e-4  # minimum extent of a scene (units); Blender's F-curves ignore changes below 1.2e-7
@@ -33,7 +33,7 @@ class Options:
         frame_zero: Frame of scene time 0.
         t_end: Scene time up to which motion is extrapolated, or None for `timeline.default_end`.
         key_tolerance: Maximum error of the reduced keys, as a fraction of the scene's extent.
-        fit_timeline: True to set the frame range and the t_max marker.
+        fit_timeline: True to set the frame range, and markers at t_max and at the observed events.
         sh_degree: Highest spherical-harmonics degree stored on the points.
         frame_views: True to look at the scene in all 3D views.
         display: Key of `viewport_display.ITEMS`.
@@ -123,6 +123,7 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         object_names.remember(collection, meanings=scene.vocabulary_embeddings is not None)
         if options.fit_timeline:
             timeline.fit(context.scene, times)
+            event_markers.show(context.scene, collection)
         context.view_layer.update()
     if options.frame_views:
         first_view.show(context, collection)

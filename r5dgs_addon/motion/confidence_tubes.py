@@ -1,7 +1,9 @@
-"""Confidence tubes around extrapolated paths, with the position's standard deviation as radius.
+"""Confidence tubes around extrapolated paths: 95 % bands.
 
-The tube is a mesh with the anchor's parent. It is not rendered and not selectable. Its colour shows the uncertainty
-relative to the object's size. Only the uncertainty of the learned motion is shown; edited rates count as certain.
+The radius is the half width of the stored band. If there is none, or the motion was edited, it is two standard
+deviations of the position by the covariance of the rates; edited rates then count as certain. The tube is a mesh with
+the anchor's parent. It is not rendered and not selectable. Its colour shows the uncertainty relative to the object's
+size.
 """
 
 import bpy
@@ -19,7 +21,8 @@ SIDES = 12
 THINNEST = 0.004  # minimum radius as a fraction of the object's reach, so that certain paths stay visible
 COLOR = "confidence"
 SURE, UNSURE = (0.05, 0.6, 0.3), (0.9, 0.15, 0.05)  # linear RGB
-LOST = 0.5  # standard deviation of the most uncertain colour, as a fraction of the object's reach
+LOST = 1.0  # half width of the most uncertain colour, as a fraction of the object's reach
+SIGMAS = 2.0  # half width of a 95 % band in standard deviations
 
 
 def helper_of(anchor: bpy.types.Object) -> bpy.types.Object | None:
@@ -41,7 +44,7 @@ def show(anchor: bpy.types.Object, times: timeline.Times) -> bpy.types.Object | 
     if not moves(anchor, times):
         hide(anchor)
         return None
-    centers, sigmas = path(anchor, times)
+    centers, widths = path(anchor, times)
     _, reach = physics.key_error(anchor)
     reach = max(reach, 1e-9)
     tube = helper_of(anchor)
@@ -57,8 +60,8 @@ def show(anchor: bpy.types.Object, times: timeline.Times) -> bpy.types.Object | 
         anchor.r5dgs_motion.tube = tube
     tube.parent = anchor.parent
     tube.matrix_parent_inverse = anchor.matrix_parent_inverse
-    doubts = np.clip(sigmas / (LOST * reach), 0.0, 1.0)
-    _fill(tube.data, centers, np.maximum(sigmas, THINNEST * reach), doubts)
+    doubts = np.clip(widths / (LOST * reach), 0.0, 1.0)
+    _fill(tube.data, centers, np.maximum(widths, THINNEST * reach), doubts)
     tube.color = (*_color(doubts[-1:])[0], 1.0)  # for viewports with object colours
     return tube
 
@@ -84,10 +87,10 @@ def hide(anchor: bpy.types.Object) -> bool:
 
 
 def path(anchor: bpy.types.Object, times: timeline.Times) -> tuple[np.ndarray, np.ndarray]:
-    """Positions of an anchor past t_max in its parent's axes, and their standard deviations.
+    """Positions of an anchor past t_max in its parent's axes, and half widths of their 95 % band.
 
     Returns:
-        Positions [H, 3] and standard deviations [H], from t_max to the end.
+        Positions [H, 3] and half widths [H], from t_max to the end.
 
     Raises:
         ConfigError: The motion is too fast to integrate, or the F-curves cannot be read.
@@ -99,11 +102,12 @@ def path(anchor: bpy.types.Object, times: timeline.Times) -> tuple[np.ndarray, n
     if models.steps_needed(model, tau[-1:])[0] > _MOST_STEPS:
         raise errors.ConfigError(f"{anchor.name}: moves too fast for a path; take smaller rates under Motion")
     _, displacements = models.evaluate(model, tau)
-    sigmas = confidence.position_sigma(model, tau)
+    band = physics.band(physics.mover(anchor))
+    widths = SIGMAS * confidence.position_sigma(model, tau) if band is None else band.widths(times.t_max + tau)
     if follow is not None:
         displacements = displacements @ follow.T
-        sigmas = sigmas * float(np.linalg.norm(follow, 2))
-    return start + displacements, sigmas
+        widths = widths * float(np.linalg.norm(follow, 2))
+    return start + displacements, widths
 
 
 def _fill(mesh: bpy.types.Mesh, centers: np.ndarray, radii: np.ndarray, doubts: np.ndarray) -> None:

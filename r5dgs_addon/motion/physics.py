@@ -13,7 +13,10 @@ import numpy as np
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import confidence, free_top, models, rotations
+from ...r5dgs_core.motion.history import NONE as NO_HISTORY
+from ...r5dgs_core.motion.history import Band, History
 from ...r5dgs_core.motion.models import MotionModel
+from ...r5dgs_core.scene import history_json, json_row
 from ...r5dgs_core.scene.scene import Scene
 from ..scene import timeline
 from ..ui import plural
@@ -47,6 +50,7 @@ def remember(
         state.learned = json.dumps(
             {
                 "model": group.model.to_dict(),
+                "history": history_json.tree(group.history),
                 "follow_matrix": None if group.follow_matrix is None else np.asarray(group.follow_matrix).tolist(),
                 "reach": float(reaches[motion_id]) if motion_id else 0.0,
                 "allowed": tolerance * extent,
@@ -145,6 +149,22 @@ def basis(state: bpy.types.PropertyGroup) -> MotionModel:
     if state.taken:
         return MotionModel.from_dict(json.loads(state.taken))
     return MotionModel.from_dict(json.loads(state.learned)["model"]) if state.learned else models.STATIC
+
+
+def history(anchor: bpy.types.Object) -> History:
+    """Observed events of an anchor and the band of its learned motion; empty for files of older versions."""
+    learned = anchor.r5dgs_motion.learned
+    stored = json.loads(learned).get("history", {}) if learned else {}
+    try:
+        return history_json.read(json_row.Row(stored, anchor.name))
+    except errors.R5dgsError:  # written by a newer version
+        return NO_HISTORY
+
+
+def band(anchor: bpy.types.Object) -> Band | None:
+    """Confidence band of an anchor's motion, or None if it is unknown or the motion was edited."""
+    state = anchor.r5dgs_motion
+    return None if state.taken or edited(state) else history(anchor).band
 
 
 def edited(state: bpy.types.PropertyGroup) -> set[str]:

@@ -47,6 +47,7 @@ def _physics(layout, anchor) -> None:
     if physics.follow_matrix(state) is not None:
         layout.label(text="Follows another object", icon="LINKED")
         return
+    _history(layout, anchor)
     layout.prop(state, "kind")
     if not refused:
         _pivot(layout, anchor)
@@ -61,6 +62,15 @@ def _physics(layout, anchor) -> None:
         layout.label(text="Edited", icon="GREASEPENCIL")
     else:
         layout.label(text="As learned", icon="CHECKMARK")
+
+
+def _history(layout, anchor) -> None:
+    """Draw the observed events, and the reason to distrust the learned prediction."""
+    found = physics.history(anchor)
+    for event in found.events:
+        layout.label(text=event.text().capitalize(), icon="MARKER")
+    if found.warning() and physics.band(anchor) is not None:
+        status_bar.wrapped(layout, bpy.context, found.warning().capitalize(), "ERROR")
 
 
 def _pivot(layout, anchor) -> None:

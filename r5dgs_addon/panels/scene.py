@@ -2,6 +2,7 @@
 
 import bpy
 
+from ..motion import event_markers
 from ..scene import evaluated_points, loaded_scenes, timeline, trust, viewport_display
 from ..splats import viewport_splats
 from ..ui import plural, status_bar
@@ -39,7 +40,7 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
             column.label(text=f"t = {t:.3f}: observed", icon="HIDE_OFF")
         for note in evaluated_points.notes(collection):
             status_bar.wrapped(layout, context, note, "ERROR")
-        if not timeline.fits(context.scene, times):
+        if not (timeline.fits(context.scene, times) and event_markers.shown(context.scene, collection)):
             layout.operator("r5dgs.fit_timeline", icon="TIME")
         layout.operator("r5dgs.view_as_trained", icon="CAMERA_DATA")
         row = layout.row(align=True)

@@ -152,7 +152,7 @@ WITHOUT_A_SCENE = {
         "add_alias", "allow_scene_file", "exact_mode", "export_format", "export_masks", "export_ply", "export_scene",
         "extrapolate_until", "fit_timeline", "isolate", "preview", "remove_alias",
         "rename_object", "select_by_prompt", "select_object", "set_display",
-        "show_confidence",
+        "show_confidence", "view_as_trained",
     ),
     "Select an object of an R5DGS scene first": (
         "delete_object", "duplicate_object", "pivot_to_cursor", "re_extrapolate", "reset_motion", "simplify_keys",

@@ -1,4 +1,4 @@
-"""The uncertainty of a path is shown as a tube with a radius of one standard deviation."""
+"""The uncertainty of a path is shown as a tube with the half width of its 95 % band."""
 
 import dataclasses
 
@@ -40,7 +40,7 @@ def rings(tube):
     return points.reshape(-1, motions.addon("motion.confidence_tubes").SIDES, 3)
 
 
-def test_a_tube_runs_along_the_path_as_thick_as_one_standard_deviation(blender, scene, loaded):
+def test_a_tube_without_a_band_has_a_radius_of_two_standard_deviations(blender, scene, loaded):
     mug = blender.data.objects["mug anchor"]
     motions.choose(blender, mug)
     assert blender.ops.r5dgs.show_confidence() == {"FINISHED"}
@@ -52,7 +52,7 @@ def test_a_tube_runs_along_the_path_as_thick_as_one_standard_deviation(blender, 
     _, displacements = models.evaluate(model, tau)
     np.testing.assert_allclose(found.mean(axis=1), pivot + displacements, atol=1e-5)
     radii = np.linalg.norm(found - found.mean(axis=1, keepdims=True), axis=-1)
-    sigma = confidence.position_sigma(model, tau)
+    sigma = 2 * confidence.position_sigma(model, tau)
     grown = sigma > 0.01
     assert grown.any() and not grown[0]
     np.testing.assert_allclose(radii[grown], np.repeat(sigma[grown, None], radii.shape[1], 1), rtol=1e-4)
