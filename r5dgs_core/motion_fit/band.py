@@ -21,8 +21,9 @@ from .evidence import Evidence
 from .fitted_motion import FADE_PER_SPAN
 
 LEVEL = 0.95
-WIDE = 0.33  # half width from which a motion is not predictable, in radii
+WIDE = 0.4  # half width from which a motion is not predictable, in radii
 _MULTIPLE = 1.65  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
+_DRIFT = 5.0  # drift of a track over its span, in its least noise
 _SOFT = 4.0  # difference of scores that reduces a candidate's weight by e
 _FARTHEST = 8.0  # radii; largest counted distance of another candidate
 _MOST_SCALE = 36.0  # limit of the misses of earlier predictions, which scale the covariance
@@ -34,16 +35,22 @@ def of(
     evidence: Evidence,
     track: PoseTrack,
     noise: Noise,
+    least: Noise,
 ) -> Widths:
-    """Band of a chosen solution, up to one observed span past t_max."""
+    """Band of a chosen solution, up to one observed span past t_max.
+
+    If the noise has a lower bound, the track may drift slowly: ``least`` is taken for a share of this drift.
+    """
     tau = np.linspace(0.0, 1.0, MOST_KNOTS)
     place, turn = _variance(chosen, evidence, tau)
     place2, turn2 = _spread(chosen, all_solutions, evidence, tau)
     fading = np.exp(-2 * tau / FADE_PER_SPAN)  # of the bind state, which is a noisy pose
     last = evidence.level * fading
     scale = min(max(rolling.misses(chosen, track, noise, evidence), 1.0), _MOST_SCALE)
-    turn = scale * turn + turn2 + 3 * noise.turn**2 * last
-    width = _MULTIPLE * np.sqrt(scale * place + place2 + 3 * noise.place**2 * last + 2 / 3 * turn)
+    drift = 3 * (_DRIFT * (0.5 + tau)) ** 2
+    turn = scale * turn + turn2 + 3 * noise.turn**2 * last + drift * least.turn**2
+    place = scale * place + place2 + 3 * noise.place**2 * last + drift * least.place**2
+    width = _MULTIPLE * np.sqrt(place + 2 / 3 * turn)
     wide = np.flatnonzero(width > WIDE)
     return Widths(tau, width, _MULTIPLE * np.sqrt(turn), _crossing(tau, width, int(wide[0])) if len(wide) else None)
 

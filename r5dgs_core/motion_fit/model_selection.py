@@ -116,15 +116,15 @@ def fit(
     if candidates is None and inertia is not None and free_top.tumbles(np.asarray(inertia, np.float64)):
         family = (*family, replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64)))
     family = tuple(replace(candidate, window=track.window) for candidate in family)
-    if len(track) < 4:
-        selected = search.few(track, family)
-    else:
-        least = Noise(max(least_noise[0] / radius, noise.FLOOR), max(least_noise[1], noise.FLOOR))
-        selected = search.select(track, family, least, candidates is None, up)
-    return _result(selected, family, float(times[-1]), radius, span)
+    least = Noise(max(least_noise[0] / radius, noise.FLOOR), max(least_noise[1], noise.FLOOR))
+    few = len(track) < 4
+    selected = search.few(track, family) if few else search.select(track, family, least, candidates is None, up)
+    return _result(selected, family, float(times[-1]), radius, span, least)
 
 
-def _result(selected: Selected, family: tuple[Candidate, ...], t_max: float, radius: float, span: float) -> Fit:
+def _result(
+    selected: Selected, family: tuple[Candidate, ...], t_max: float, radius: float, span: float, least: Noise
+) -> Fit:
     """Fit in world units."""
     chosen, evidence, level = selected.chosen, selected.evidence, selected.noise
     model = fitted_motion.to_model(chosen, evidence, radius, span)
@@ -133,7 +133,7 @@ def _result(selected: Selected, family: tuple[Candidate, ...], t_max: float, rad
     owners = [part for part, own in parts for _ in own]
     first = t_max + span * selected.first
     segments = fitted_motion.segments([*owners, chosen], found, first, t_max, radius, span)
-    band = bands.of(chosen, selected.solutions, evidence, selected.track, level).scaled(t_max, radius, span)
+    band = bands.of(chosen, selected.solutions, evidence, selected.track, level, least).scaled(t_max, radius, span)
     name = chosen.candidate.law.name
     rests = bool(found) and found[-1].kind == "stop"
     by_name = {s.candidate.name: s for s in selected.solutions}

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..motion import rotations
 from ..motion.pose_track import PoseTrack
 from . import candidates as families
 from . import evidence as evidences
@@ -28,11 +29,14 @@ _EXACT = 1e-4  # gain at which the selected candidate is final
 _CONTRADICTED = 3.0  # squared miss of later poses, in that of the best law, above which a law is not taken
 _SMALL_JUMP = 0.15  # relative change of the rates below which a break needs stronger evidence
 _POOR = 3.0  # noise level, in that of neighbouring poses, from which a track may have several breaks
+_HOPELESS_LOSS = 200.0  # excess of the loss of a candidate above which it is not refitted
 _HOPELESS = 30.0  # excess of plain parts above which a track is not cut
 _CUTS = 4  # breaks at which such a track is cut
 _FEWEST = 4  # poses of its parts
 _PLAIN = ("static", "translation + spin", "ballistic + spin", "drag")  # laws that decide where to cut
 _WELL = 1.5  # loss of a part, in that of noise, below which it is not searched again
+_AHEAD = 1 / 3  # time past t_max, in spans, over which a law must be plausible
+_RUNAWAY = 2.5  # way in this time, in the largest seen, above which it is not
 _LEAST_PART = 7  # poses after a break that are searched for a law of their own
 
 
@@ -88,16 +92,21 @@ def select(
         finer = Noise(max(finer.place, least.place), max(finer.turn, least.turn))
         if finer.place > 0.9 * level.place and finer.turn > 0.9 * level.turn:
             break
+        best = _best(found, broken)
+        found = _refined(found, best, track, level, finer)
+        broken = kinks.search(track, finer) if best.candidate.placed else _refined(broken, best, track, level, finer)
         level = finer
-        gaps_matter = _best(found, broken).candidate.placed
-        found = [_again(s, track, level) for s in found]
-        broken = kinks.search(track, level) if gaps_matter else [_again(s, track, level) for s in broken]
     evidence = Evidence.of((*found, *broken), _floor(level, least))
     laws = [s for s in found if _determined(s, evidence) and not _rises(s, up)] or found[:1]
-    chosen = _simplest(laws, evidence, track, level)
+    plausible = [s for s in laws if not runs_away(s, track)] or laws[:1]
+    chosen = _simplest(plausible, evidence, track, level)
+    smooth = [s for s in plausible if not s.candidate.events(s.theta)]
+    if chosen.candidate.events(chosen.theta) and smooth:
+        other = _simplest(smooth, evidence, track, level)
+        chosen = other if evidence.score(chosen) + evidences.STRONG > evidence.score(other) else chosen
     if broken:
         best = min(broken, key=evidence.score)
-        if evidence.score(best) + _margin(best) < min(evidence.score(s) for s in laws):
+        if evidence.score(best) + _margin(best) < min(evidence.score(s) for s in plausible):
             chosen = best
     solutions = (*laws, *broken)
     final = _again(chosen, track, level, _EXACT)
@@ -223,6 +232,17 @@ def _excess(parts: Sequence[Solution], single: Solution, least: float) -> float:
     return evidence.of_sums(loss, parameters, placed) - evidence.score(single)
 
 
+def _refined(
+    solutions: Sequence[Solution], best: Solution, track: PoseTrack, level: Noise, finer: Noise
+) -> list[Solution]:
+    """Refits to the same poses with less noise; solutions far worse than the best are only scored anew."""
+    scales = np.repeat([level.place / finer.place, level.turn / finer.turn], 3)
+    return [
+        _again(s, track, finer) if s.loss < best.loss + _HOPELESS_LOSS else replace(s, residuals=scales * s.residuals)
+        for s in solutions
+    ]
+
+
 def _again(solution: Solution, track: PoseTrack, level: Noise, enough: float | None = None) -> Solution:
     """Refit a solution from its own parameters."""
     options = {} if enough is None else {"enough": enough, "steps": 40}
@@ -255,7 +275,7 @@ def _determined(solution: Solution, evidence: Evidence) -> bool:
     window = candidate.window
     if "bounce" in rows:
         times = [float(time.reshape(-1)[0]) for _, time in candidate.events(solution.theta)]
-        return len(times) < 2 or max(np.diff(times)) > 2 * -window.first / (evidence.count - 1)
+        return bool(len(times) < 2 or max(np.diff(times)) > 2 * -window.first / (evidence.count - 1))
     for block in ("pace", "pace2"):
         if block not in rows:
             continue
@@ -291,6 +311,21 @@ def _rises(solution: Solution, up: np.ndarray | None) -> bool:
         return False
     v = solution.candidate.parts(solution.theta)["v"]
     return bool(abs(v @ up) > STEEP * np.linalg.norm(v) * np.linalg.norm(up))
+
+
+def runs_away(solution: Solution, track: PoseTrack) -> bool:
+    """Return True if the body would go or turn much further than it ever did in an equal time."""
+    ends = np.searchsorted(track.tau, track.tau + _AHEAD)
+    starts = np.flatnonzero(ends < len(track))
+    if len(starts) == 0:
+        return False
+    ends, tau = ends[starts], track.tau
+    ways = track.displacements[ends] - track.displacements[starts]
+    seen = (ways**2).sum(-1) + 2 / 3 * ((track.turned[ends] - track.turned[starts]) ** 2).sum(-1)
+    most = float(np.max(np.sqrt(seen) * _AHEAD / (tau[ends] - tau[starts])))
+    quats, d = solution.candidate.path(solution.theta, np.linspace(0.0, _AHEAD, 9))
+    angle = float(rotations.angle_between(quats[1:], quats[:-1]).sum())
+    return bool(math.hypot(float(np.linalg.norm(d[-1] - d[0])), angle * math.sqrt(2 / 3)) > _RUNAWAY * most)
 
 
 def few(track: PoseTrack, family: tuple[Candidate, ...]) -> Selected:

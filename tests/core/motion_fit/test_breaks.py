@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from r5dgs_core.motion import models, rotations
-from r5dgs_core.motion_fit import kinks, model_selection
+from r5dgs_core.motion import models, pose_track, rotations
+from r5dgs_core.motion_fit import candidates, evidence, fitted_motion, kinks, model_selection, search
 from tests.support import problems
 from tests.support.problems import RADIUS, SIZE, T_MAX
 
@@ -190,10 +190,15 @@ def test_a_small_change_of_the_rates_needs_more_evidence_than_a_large_one():
 
 
 def test_bounces_that_no_pose_separates_are_one_event():
-    path = broken(0.4, v=np.array([[3.0, 0, 0], [3.0, 0.15, 0]]), w=np.zeros((2, 3)))
-    fit, _ = observed(path, np.random.default_rng(2), (0.002 * SIZE, 0.002))
-    assert fit.model.kind == "bounce"  # a ball that lands
-    assert 1 <= len(fit.history.events) <= 2
+    parts = {"bounce": np.array([-0.5]), "logit_rho": np.array([0.0]), "w": ZERO}
+    parts |= {"v": np.array([1.0, 0, 0.5]), "a": np.array([0, 0, -10.0]), "r": ZERO, "e": ZERO}
+    ball = candidates.BY_NAME["bounces"]
+    theta = ball.pack(parts)
+    solution = candidates.Solution(ball, theta, np.eye(len(theta)), np.zeros((15, 6)), np.ones(15))
+    assert len(ball.events(theta)) > 10
+    found = fitted_motion.events(solution, evidence.Evidence(15, 1.0, 1.0), T_MAX, T_MAX)
+    assert len(found) > 1
+    assert min(np.diff([event.time for event in found])) > T_MAX / 15
 
 
 def test_motion_that_no_law_describes_is_not_taken_for_rest():
@@ -202,3 +207,13 @@ def test_motion_that_no_law_describes_is_not_taken_for_rest():
     names = ["static", "ballistic + spin, accelerating"]
     fit = model_selection.fit(TIMES, quats, d, radius=RADIUS, candidates=names)
     assert fit.chosen == names[1]
+
+
+@pytest.mark.parametrize(("acceleration", "much"), [(1.0, False), (200.0, True)])
+def test_a_law_by_which_a_body_goes_further_than_ever_is_implausible(acceleration, much):
+    tau = np.linspace(-1, 0, 15)
+    track = pose_track.PoseTrack(tau, rotations.identity(15), 3.0 * tau[:, None] * [1, 0, 0], np.ones(15))
+    law = candidates.BY_NAME["translation, quadratic"]
+    theta = law.pack({"r": ZERO, "e": ZERO, "v": np.array([3.0, 0, 0]), "a": np.array([0, acceleration, 0])})
+    solution = candidates.Solution(law, theta, np.eye(len(theta)), np.zeros((15, 6)), np.ones(15))
+    assert search.runs_away(solution, track) == much
