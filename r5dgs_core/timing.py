@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -38,11 +38,11 @@ class Times:
         """Return the times multiplied by a factor, such as one over the frames of a call."""
         return Times(factor * self.wall, factor * self.cpu)
 
-    def columns(self, clock: str = "wall") -> dict[str, float]:
-        """Return columns of `report_rows.Row`: ``ms`` and its quartiles by a clock of `CLOCKS`, and both medians."""
+    def columns(self, clock: str = "wall") -> dict[str, Any]:
+        """Return columns of `report_rows.Row`: the clock, ``ms`` and its quartiles by that clock, and both medians."""
         _, low, middle, high = (self.wall if clock == "wall" else self.cpu).tolist()
         both = {"ms_wall": float(self.wall[2]), "ms_cpu": float(self.cpu[2])}
-        return {"ms": middle, "ms_low": low, "ms_high": high, **both}
+        return {"clock": clock, "ms": middle, "ms_low": low, "ms_high": high, **both}
 
     def ms(self, clock: str = "wall") -> float:
         """Return the median by a clock."""

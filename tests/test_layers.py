@@ -84,6 +84,7 @@ ALLOWED = {
         "playback",
         "render",
         "evaluation",
+        "train",
         "bench",
     },
     "api": {"motion", "scene", "data", "config", "playback", "render", "evaluation", "train", "bake"},

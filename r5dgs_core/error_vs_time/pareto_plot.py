@@ -11,17 +11,20 @@ from typing import Any
 import numpy as np
 
 from ..evaluation import label_placement
-from . import image_task, report_rows, tables
+from . import family_task, image_task, report_rows, tables
 from .report_rows import Row
 
 # Per task: plotted kind of error, axis label, and factor on the values.
 _SHOWN = {
     "dynamics": ("position", "position error, % of the object's size", 100.0),
     "poses": ("position", "position error, % of the object's size", 100.0),
+    "family": ("position", "position error, % of the object's size", 100.0),
     "images": ("psnr", "error of pixels, 8-bit levels (rms)", 1.0),
     "raster": ("difference", "difference to the finest picture, 8-bit levels (rms)", 1.0),
+    "training": ("psnr@val", "error of pixels of held-out views, 8-bit levels (rms)", 1.0),
 }
-_FLOOR = {"dynamics": 1e-13, "poses": 1e-4, "images": 1e-3, "raster": 1e-4}  # smaller errors are drawn at this value
+_FLOOR = {"dynamics": 1e-13, "poses": 1e-4, "family": 1e-4, "images": 1e-3, "raster": 1e-4, "training": 1e-3}
+# Smaller errors are drawn at the floor.
 # Colors distinguishable with any color vision (Okabe and Ito 2008).
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F7F7F", "#000000")
 _FRONT = "#B00020"
@@ -31,25 +34,29 @@ LEAST_SPAN = 2.0  # minimum ratio between the ends of a time axis
 
 @dataclass(frozen=True)
 class _Point:
-    """Point of a panel: position, row, label and color."""
+    """Point of a panel: position, range over runs, row, label and color."""
 
     x: float
     y: float
+    low: float
+    high: float
     row: Row
     name: str
     color: str
 
 
-def png(report: dict[str, Any]) -> bytes:
-    """Return the plot as a PNG.
+def png(report: dict[str, Any], name: str) -> bytes:
+    """Return the plot of a scene as a PNG.
 
     Args:
-        report: Result of `report.measure`; tasks without timed rows have no panel.
+        report: Result of `report.collect`; tasks without timed rows have no panel.
+        name: Name of the scene.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    groups = report_rows.by_task(report_rows.from_dicts(report["rows"]))
+    scene = next(scene for scene in report["scenes"] if scene["name"] == name)
+    groups = report_rows.by_task([row for row in report_rows.from_dicts(report["rows"]) if row.scene == name])
     panels = {task: found for task, rows in groups.items() if (found := _points(task, rows))}
     oracle = {
         row.task: _pixel_error(row.error)
@@ -60,17 +67,19 @@ def png(report: dict[str, Any]) -> bytes:
     lines = max(1, math.ceil(len(panels) / 2))
     figure = Figure(figsize=(9.2 * columns, 6.9 * lines), dpi=_DPI, layout="constrained")
     canvas = FigureCanvasAgg(figure)
+    count = len(scene["runs"])
+    runs = f"; medians of {count} runs, bars: their range" if count > 1 else ""
     figure.suptitle(
-        f"{report['scene']}: error against run time. {report['gaussians']} Gaussians, {report['groups']} motion "
-        f"groups, {report['machine']['raster_threads']} threads.\n"
-        "Down and left is better; red: the Pareto front, where no better method is as fast."
+        f"{name}: error against run time. {scene['gaussians']} Gaussians, {scene['groups']} motion "
+        f"groups, {report['machine']['raster_threads']} threads{runs}.\n"
+        "Down and left is better; red: the Pareto front, where no better method is as fast, beyond the noise."
     )
     if not panels:
         figure.text(0.5, 0.5, "nothing could be timed", ha="center")
     grid = figure.subplots(lines, columns, squeeze=False).ravel() if panels else []
     drawn = []
     for axes, (task, points) in zip(grid, panels.items(), strict=False):
-        _draw(axes, task, points, report)
+        _draw(axes, task, points, scene)
         if task in oracle:
             axes.axhline(oracle[task], color="0.35", linestyle="--", linewidth=1, zorder=0)
         drawn.append((axes, task, points))
@@ -91,9 +100,12 @@ def _points(task: str, rows: Sequence[Row]) -> list[_Point]:
     series = list(dict.fromkeys(_series(row) for row in shown))
     points = []
     for row in shown:
-        y = _pixel_error(row.error) if kind == "psnr" else factor * row.error
+        values = (row.error, row.error_min, row.error_max)
+        drawn = [_pixel_error(v) if row.kind.more_is_better else factor * v for v in values]
+        y, low, high = (max(v, _FLOOR[task]) if math.isfinite(v) else math.nan for v in drawn)
         color = _COLORS[series.index(_series(row)) % len(_COLORS)]
-        points.append(_Point(row.ms, max(y, _FLOOR[task]), row, _name_of(row), color))
+        scale = 1e-3 if task in tables.SECONDS else 1.0
+        points.append(_Point(scale * row.ms, y, min(low, high), max(low, high), row, _name_of(row), color))
     return points
 
 
@@ -108,6 +120,8 @@ def _series(row: Row) -> tuple[str, str]:
         return row.mode, row.method
     if row.task == "raster":
         return row.mode, row.setting.split()[0]
+    if row.task in ("training", "family"):
+        return row.mode, row.method if row.task == "training" else ""
     base = row.mode.split("/")[0]
     return base, "models" if row.mode == "rigid/fitted" else ""
 
@@ -117,37 +131,32 @@ def _name_of(row: Row) -> str:
         return row.setting
     if row.task == "images":
         return row.mode
+    if row.task == "training":
+        return row.setting.removeprefix("step ")
+    if row.task == "family":
+        return row.setting if row.setting == family_task.WHOLE else row.method.split()[0]
     if row.task == "poses":
         return row.method if row.mode == "rigid/fitted" else f"mode {row.mode}"
     return row.setting.removesuffix(" steps").removesuffix(" step")
 
 
-def _draw(axes: Any, task: str, points: Sequence[_Point], report: dict[str, Any]) -> None:
-    kind, label, _ = _SHOWN[task]
-    axes.set(xscale="log", yscale="log", xlabel=f"{tables.CLOCKS[report['clock']]} per frame, ms", ylabel=label)
+def _draw(axes: Any, task: str, points: Sequence[_Point], scene: dict[str, Any]) -> None:
+    _, label, _ = _SHOWN[task]
     first = points[0].row
-    tau = report["horizon"]["tau"]
-    titles = {
-        "dynamics": f"Integrating {first.count} groups to {tau:.3g} past t_max: error against a fine reference "
-        "(numbers: steps)",
-        "poses": f"Predicted poses of {first.count} objects at the last time: median error against the truth",
-        "images": f"Modes on {first.count} images of {first.setting}: motion + rasterization",
-        "raster": f"Thresholds of the rasterizer ({first.count} pictures)",
-    }
-    axes.set_title(titles[task], fontsize=11, loc="left")
-    if task == "dynamics":
+    axes.set(xscale="log", yscale="log", xlabel=_time_label(task, first.clock), ylabel=label)
+    axes.set_title(_title(task, first, scene), fontsize=11, loc="left")
+    if task in ("dynamics", "training", "family"):
         for series in dict.fromkeys(_series(p.row) for p in points):
-            some = [p for p in points if _series(p.row) == series and p.row.setting.endswith(("step", "steps"))]
-            axes.plot(
-                [p.x for p in some],
-                [p.y for p in some],
-                "-",
-                color=next(iter(some), points[0]).color,
-                alpha=0.5,
-                linewidth=1,
-            )
+            some = [p for p in points if _series(p.row) == series and _in_line(p.row)]
+            color = next(iter(some), points[0]).color
+            axes.plot([p.x for p in some], [p.y for p in some], "-", color=color, alpha=0.5, linewidth=1)
     for p in points:
-        axes.plot([p.row.ms_low, p.row.ms_high], [p.y, p.y], "-", color=p.color, alpha=0.3, linewidth=2)
+        scale = p.x / p.row.ms
+        several = math.isfinite(p.row.ms_max)
+        ends = (p.row.ms_min, p.row.ms_max) if several else (p.row.ms_low, p.row.ms_high)
+        axes.plot([scale * end for end in ends], [p.y, p.y], "-", color=p.color, alpha=0.3, linewidth=2)
+        if math.isfinite(p.low):
+            axes.plot([p.x, p.x], [p.low, p.high], "-", color=p.color, alpha=0.3, linewidth=2)
         marker = {"markeredgecolor": _FRONT, "markeredgewidth": 1.6} if p.row.pareto else {"markeredgewidth": 0}
         axes.plot(p.x, p.y, "o", color=p.color, markersize=6.5, **marker)
     front = sorted((p for p in points if p.row.pareto), key=lambda p: p.x)
@@ -160,20 +169,46 @@ def _draw(axes: Any, task: str, points: Sequence[_Point], report: dict[str, Any]
         axes.set_xlim(middle / math.sqrt(LEAST_SPAN), middle * math.sqrt(LEAST_SPAN))
     axes.grid(alpha=0.25, which="major")
     _ticks(axes)
-    if kind == "psnr":
-        right = axes.secondary_yaxis(
-            "right", functions=(lambda y: -20 * np.log10(np.maximum(y, 1e-9) / 255), lambda dB: 255 * 10 ** (-dB / 20))
-        )
-        right.set_ylabel("PSNR, dB")
-        from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
-
-        right.yaxis.set_major_locator(MaxNLocator(8))
-        right.yaxis.set_major_formatter(ScalarFormatter())
-        right.yaxis.set_minor_formatter(NullFormatter())
+    if first.kind.more_is_better:
+        _decibel_axis(axes)
     if any(p.y == _FLOOR[task] for p in points):
         axes.text(
             0.99, 0.01, f"lowest line: {_FLOOR[task]:g} or less", transform=axes.transAxes, ha="right", fontsize=8
         )
+
+
+def _time_label(task: str, clock: str) -> str:
+    subject = {"training": "training, s", "family": "the fits of all objects, ms"}.get(task, "a frame, ms")
+    return f"{tables.CLOCKS[clock]} of {subject}"
+
+
+def _title(task: str, first: Row, scene: dict[str, Any]) -> str:
+    return {
+        "dynamics": f"Integrating {first.count} groups to {scene['horizon']['tau']:.3g} past t_max: error against a "
+        "fine reference (numbers: steps)",
+        "poses": f"Predicted poses of {first.count} objects at the last time: median error against the truth",
+        "family": f"Choosing the motion model of {first.count} objects (numbers: candidates): median error at the end",
+        "images": f"Modes on {first.count} images of {first.setting}: motion + rasterization",
+        "raster": f"Thresholds of the rasterizer ({first.count} pictures)",
+        "training": f"Training ({first.method}; numbers: steps)",
+    }[task]
+
+
+def _in_line(row: Row) -> bool:
+    """Return True if a row is a point of its series' line."""
+    return row.task != "dynamics" or row.setting.endswith(("step", "steps"))
+
+
+def _decibel_axis(axes: Any) -> None:
+    from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
+
+    right = axes.secondary_yaxis(
+        "right", functions=(lambda y: -20 * np.log10(np.maximum(y, 1e-9) / 255), lambda dB: 255 * 10 ** (-dB / 20))
+    )
+    right.set_ylabel("PSNR, dB")
+    right.yaxis.set_major_locator(MaxNLocator(8))
+    right.yaxis.set_major_formatter(ScalarFormatter())
+    right.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _ticks(axes: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +19,15 @@ from ..scene.scene import MotionGroup, Scene
 from .report_rows import Row, spread
 
 MODELS = tuple(candidates.BY_NAME)  # fitted one at a time
+ALONE = "for all objects"  # setting of a row of one model; which of them is best is known only afterwards
+CHOSEN = "chosen of the family"
 STEADY = {"spring": "translation, quadratic", "pendulum": "hinge"}  # fallback of a model for objects that do not swing
 _SAME = 1e-9  # tolerance for equal times
 _LEAST_MOMENT = 1e-6  # added to the inertia, which is singular for collinear members but must not be for a free top
 
 
 @dataclass(frozen=True)
-class _Fitted:
+class Fitted:
     """One model fitted to every body.
 
     Attributes:
@@ -84,7 +87,7 @@ def _of_modes(
             predicted, method = _member_motion(scene, player, bodies, times), "rigid fit to moved Gaussians"
             note = "time is that of all Gaussians"
         label = {"task": "poses", "mode": mode, "method": method, "setting": "as baked", "note": note}
-        rows += _errors(bodies, later, predicted, {**label, **timed[mode].columns(clock)})
+        rows += errors(scene, bodies, later, predicted, {**label, **timed[mode].columns(clock)})
     absent = []
     if len(players) == 1:
         absent.append("poses of rigid/representative, median, least_squares, kabsch, standard, rigid_paper: the scene "
@@ -100,34 +103,35 @@ def _of_models(
     """Measure each motion model alone, the selected one, and its confidence band."""
     times = bodies[0].times[later]
     taus = times - scene.t_max
-    fitted = {name: _fit(scene, bodies, (name, STEADY[name]) if name in STEADY else (name,)) for name in MODELS}
-    chosen = _fit(scene, bodies, None)
+    fitted = {name: fit_all(scene, bodies, (name, STEADY[name]) if name in STEADY else (name,)) for name in MODELS}
+    chosen = fit_all(scene, bodies, None)
     counts = {name: sum(fit is not None and fit.chosen == name for fit in chosen.fits) for name in MODELS}
-    found = {**fitted, "chosen of the family": chosen}
+    found = {**fitted, CHOSEN: chosen}
     sets = {
-        name: [_model(body, fit) for body, fit in zip(bodies, some.fits, strict=True)] for name, some in found.items()
+        name: [model_of(body, fit) for body, fit in zip(bodies, some.fits, strict=True)] for name, some in found.items()
     }
     stacks = {name: models.Stack(some) for name, some in sets.items()}
     timed = timing.take({name: lambda s=stack: s.poses(float(taus[-1])) for name, stack in stacks.items()}, rounds)
     rows = []
     for name, some in found.items():
-        predicted = np.stack([_model_motion(b, m, taus) for b, m in zip(bodies, sets[name], strict=True)])
+        predicted = np.stack([model_motion(b, m, taus) for b, m in zip(bodies, sets[name], strict=True)])
         count = counts.get(name)
-        setting = "evidence, breaks" if count is None else f"chosen for {count} of {len(bodies)}"
+        setting = "evidence, breaks" if count is None else ALONE
         rested = sum(fit is not None and fit.rested for fit in some.fits)
-        notes = [f"{rested} found at rest"] if rested else []
+        notes = [f"chosen for {count} of {len(bodies)}"] if count else []
+        notes += [f"{rested} found at rest"] if rested else []
         notes += [f"{STEADY[name]} where nothing swings"] if name in STEADY else []
         label = {"task": "poses", "mode": "rigid/fitted", "method": name, "setting": setting, "note": "; ".join(notes)}
-        rows += _errors(bodies, later, predicted, {**label, **timed[name].columns(clock), "ms_once": some.ms})
+        rows += errors(scene, bodies, later, predicted, {**label, **timed[name].columns(clock), "ms_once_cpu": some.ms})
     band, absent = _band(bodies, chosen, times, taus)
     return rows + band, absent
 
 
-def _fit(scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], names: tuple[str, ...] | None) -> _Fitted:
+def fit_all(scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], names: tuple[str, ...] | None) -> Fitted:
     """Fit the tracks of the bodies as baking does, choosing from ``names``."""
     started = time.process_time()
     fits = tuple(fit_group(scene, body.group, names) if body.group.role == "body" else None for body in bodies)
-    return _Fitted(fits, 1e3 * (time.process_time() - started))
+    return Fitted(fits, 1e3 * (time.process_time() - started))
 
 
 def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -> model_selection.Fit:
@@ -158,11 +162,11 @@ def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -
     )
 
 
-def _model(body: ground_truth_poses.Body, fit: model_selection.Fit | None) -> models.MotionModel:
+def model_of(body: ground_truth_poses.Body, fit: model_selection.Fit | None) -> models.MotionModel:
     return models.MotionModel(radius=body.size / 2) if fit is None else fit.model
 
 
-def _model_motion(body: ground_truth_poses.Body, model: models.MotionModel, taus: np.ndarray) -> np.ndarray:
+def model_motion(body: ground_truth_poses.Body, model: models.MotionModel, taus: np.ndarray) -> np.ndarray:
     """Return the motion of a body by a model at times past t_max. [H, 4, 4]"""
     quats, displacements = models.evaluate(model, taus)
     return np.stack(
@@ -198,10 +202,23 @@ def _member_motion(
     return result
 
 
-def _errors(
-    bodies: tuple[ground_truth_poses.Body, ...], later: np.ndarray, predicted: np.ndarray, shared: dict
+def errors(
+    scene: Scene,
+    bodies: tuple[ground_truth_poses.Body, ...],
+    later: np.ndarray,
+    predicted: np.ndarray,
+    shared: dict[str, Any],
 ) -> list[Row]:
-    """Return rows of a prediction [B, H, 4, 4] at the last time, and at the earlier times past t_max."""
+    """Return rows of a prediction at the last time, and at the earlier times past t_max.
+
+    Args:
+        scene: The scene.
+        bodies: Its bodies with true poses.
+        later: Mask of the bodies' times past t_max. [S]
+        predicted: Predicted motion. [B, H, 4, 4]
+        shared: Other attributes of the rows.
+    """
+    names = [scene.object(body.object_id).name for body in bodies]
     pairs = [
         metrics.pose_errors(some, body.motion[later], body.group.pivot)
         for body, some in zip(bodies, predicted, strict=True)
@@ -213,14 +230,14 @@ def _errors(
     for k in reversed(range(len(times))):
         at = "" if k == len(times) - 1 else f"@t={times[k]:.4g}"
         rows += [
-            Row(error_kind=f"position{at}", **spread(positions[:, k]), count=len(bodies), **shared),
-            Row(error_kind=f"rotation{at}", **spread(angles[:, k]), count=len(bodies), **shared),
+            Row(error_kind=f"position{at}", **spread(positions[:, k], names=names), count=len(bodies), **shared),
+            Row(error_kind=f"rotation{at}", **spread(angles[:, k], names=names), count=len(bodies), **shared),
         ]
     return rows
 
 
 def _band(
-    bodies: tuple[ground_truth_poses.Body, ...], chosen: _Fitted, times: np.ndarray, taus: np.ndarray
+    bodies: tuple[ground_truth_poses.Body, ...], chosen: Fitted, times: np.ndarray, taus: np.ndarray
 ) -> tuple[list[Row], list[str]]:
     """Return the share of errors outside the 95 % band, over bodies and times within reach of the band.
 
@@ -234,7 +251,7 @@ def _band(
             continue
         reached = times <= band.times[-1] + _SAME
         truth = body.motion[np.isin(body.times, times)]
-        distances, angles = metrics.pose_errors(_model_motion(body, fit.model, taus), truth, body.group.pivot)
+        distances, angles = metrics.pose_errors(model_motion(body, fit.model, taus), truth, body.group.pivot)
         if not body.turn_seen:  # then neither its rotation nor the pivot's place in the true body is known
             places = body.group.pivot + models.evaluate(fit.model, taus)[1]
             distances, angles = np.linalg.norm(places - body.path[np.isin(body.times, times)], axis=-1), 0.0 * angles
@@ -250,7 +267,7 @@ def _band(
         task="poses",
         mode="rigid/fitted",
         method="95 % band",
-        setting="chosen of the family",
+        setting=CHOSEN,
         error_kind="outside_band",
         error=1 - inside / count,
         count=count,

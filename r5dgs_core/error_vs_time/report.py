@@ -1,12 +1,15 @@
-"""Report "error against run time": integrators, poses, pictures and rasterizer settings of one scene.
+"""Report "error against run time": integrators, poses, pictures, rasterizer settings and training of scenes.
 
-Compared methods are timed in interleaved rounds (`timing`), and every time is reported with its error.
+Compared methods are timed in interleaved rounds (`timing`), and every time is reported with its error. Several runs of
+a scene are combined into medians with their spread.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +20,20 @@ from ..data.dataset import Dataset
 from ..errors import ConfigError
 from ..render import machine
 from ..scene.scene import Scene
-from . import image_task, integrator_task, pareto_plot, pose_task, rasterizer_task, report_rows, tables
+from . import (
+    family_task,
+    image_task,
+    integrator_task,
+    pareto_plot,
+    pose_task,
+    rasterizer_task,
+    recommendation,
+    report_rows,
+    run_spread,
+    scene_groups,
+    tables,
+    training_task,
+)
 from .report_rows import Row
 
 JSON_FILE, CSV_FILE, MARKDOWN_FILE, PLOT_FILE = "report.json", "report.csv", "report.md", "report.png"
@@ -25,62 +41,128 @@ ROUNDS = 7
 SHARE = 1 / 3  # horizon past t_max without test views, as a share of the observed time
 
 
-def measure(
-    scene: Scene,
-    dataset: Dataset | None = None,
-    *,
-    tasks: Sequence[str] = report_rows.TASKS,
-    splits: Sequence[str] = ("test",),
-    rounds: int = ROUNDS,
-    clock: str = "wall",
-    backend: str = "auto",
-    progress: Callable[[dict[str, Any]], None] = lambda event: None,
-) -> dict[str, Any]:
-    """Measure a scene.
+@dataclass(frozen=True)
+class Options:
+    """What to measure.
 
-    Args:
-        scene: The scene.
-        dataset: Its data set, with images and true poses to compare with; None skips these comparisons.
+    Attributes:
         tasks: Tasks from `report_rows.TASKS`.
         splits: Splits whose images are compared; the first one determines the Pareto front.
         rounds: Timing rounds, over which medians and quartiles are taken.
         clock: "wall", or "cpu" for processor time, which is less sensitive to other load.
         backend: Rasterizer.
-        progress: Called with events.
-
-    Returns:
-        In JSON types ``scene gaussians groups t_max horizon rounds clock machine kinds absent rows``. ``horizon`` is
-        the time past t_max at which integration errors are measured, ``absent`` lists missing measurements with the
-        reason, and ``rows`` holds `report_rows.Row`.
     """
+
+    tasks: Sequence[str] = report_rows.TASKS
+    splits: Sequence[str] = ("test",)
+    rounds: int = ROUNDS
+    clock: str = "wall"
+    backend: str = "auto"
+
+
+@dataclass(frozen=True)
+class RunMeasurement:
+    """Measurement of one run or scene file.
+
+    Attributes:
+        place: Path of the run or scene file.
+        identity: Data and configuration without the seed; runs with equal ones are combined.
+        facts: In JSON types ``scene gaussians groups t_max image_size horizon``. ``horizon`` is the time past t_max at
+            which integration errors are measured.
+        absent: Missing measurements with the reason.
+        rows: The rows.
+    """
+
+    place: str
+    identity: dict[str, Any]
+    facts: dict[str, Any]
+    absent: list[str]
+    rows: list[Row]
+
+
+def measure(
+    scene: Scene,
+    dataset: Dataset | None = None,
+    options: Options | None = None,
+    *,
+    place: Path | None = None,
+    progress: Callable[[dict[str, Any]], None] = lambda event: None,
+) -> RunMeasurement:
+    """Measure a scene.
+
+    Args:
+        scene: The scene.
+        dataset: Its data set, with images and true poses to compare with; None skips these comparisons.
+        options: What to measure; all of the split "test" if None.
+        place: Path of its run folder or scene file, or None.
+        progress: Called with events.
+    """
+    options = options or Options()
     tau, why = horizon(scene, dataset)
     rows: list[Row] = []
-    absent = [f"{task}: not asked for" for task in report_rows.TASKS if task not in tasks]
-    for task in (task for task in report_rows.TASKS if task in tasks):
+    absent = [f"{task}: not asked for" for task in report_rows.TASKS if task not in options.tasks]
+    for task in (task for task in report_rows.TASKS if task in options.tasks):
         if task != "images":
             progress({"event": "report", "text": task})
-        measured, missing = _measure_task(task, scene, dataset, tau, splits, rounds, clock, backend, progress)
+        if task == "training":
+            measured, missing = training_task.measure(place if place and place.is_dir() else None, _final(rows))
+        else:
+            measured, missing = _measure_task(task, scene, dataset, tau, options, progress)
         rows += measured
         absent += missing
     busy = _busy(rows)
-    if busy > timing.BUSY and clock == "wall":
+    if busy > timing.BUSY and options.clock == "wall":
         absent.append(
             f"wall times of an idle machine: here they are {busy:.1f} times the processor times (median); "
             "measure again when nothing else runs, or with --clock cpu"
         )
-    rows = report_rows.mark_front(rows)
-    return {
+    views = () if dataset is None else dataset.views(options.splits[0]) or dataset.train
+    facts = {
         "scene": scene.name,
         "gaussians": len(scene.gaussians.means),
         "groups": len(scene.groups),
         "t_max": scene.t_max,
+        "image_size": [views[0].camera.width, views[0].camera.height] if views else None,
         "horizon": {"tau": tau, "why": why},
-        "rounds": rounds,
-        "clock": clock,
+    }
+    name = scene.name if place is None else str(place)
+    return RunMeasurement(name, scene_groups.identity(scene.name, scene.provenance), facts, absent, rows)
+
+
+def _final(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of the images of the trained scene as it is played by default."""
+    return [row for row in rows if row.task == "images" and row.mode == "rigid" and row.method != image_task.ORACLE]
+
+
+def collect(measured: Sequence[RunMeasurement], options: Options) -> dict[str, Any]:
+    """Return the report on measured runs, those of one scene and configuration combined.
+
+    Returns:
+        In JSON types ``rounds clock machine kinds scenes rows recommendations``. ``scenes`` has the facts of a scene
+        (`RunMeasurement`), its ``name``, ``runs`` and what is ``absent``. ``rows`` holds `report_rows.Row`, with
+        medians and ranges over the runs. The rows of each run are in ``runs`` if there are several.
+    """
+    scenes, rows, recommendations = [], [], []
+    for name, members in scene_groups.by_name({m.place: m.identity for m in measured}).items():
+        runs = [m for m in measured if m.place in members]
+        several = len(runs) > 1
+        combined = run_spread.combine([run.rows for run in runs], name)
+        rows += combined
+        recommendations += recommendation.of(combined, run_spread.lines([run.rows for run in runs]))
+        absent = dict.fromkeys(text for run in runs for text in run.absent)
+        listed = [
+            {"place": run.place, **run.facts} | ({"rows": [row.to_dict() for row in run.rows]} if several else {})
+            for run in runs
+        ]
+        scenes.append({"name": name, **runs[0].facts, "runs": listed, "absent": list(absent)})
+    return {
+        "rounds": options.rounds,
+        "clock": options.clock,
         "machine": {**machine.describe(), "versions": machine.versions()},
         "kinds": {k: {"label": v.label, "more_is_better": v.more_is_better} for k, v in report_rows.KINDS.items()},
-        "absent": absent,
+        "scenes": scenes,
         "rows": [row.to_dict() for row in rows],
+        "recommendations": recommendations,
     }
 
 
@@ -89,10 +171,7 @@ def _measure_task(
     scene: Scene,
     dataset: Dataset | None,
     tau: float,
-    splits: Sequence[str],
-    rounds: int,
-    clock: str,
-    backend: str,
+    options: Options,
     progress: Callable[[dict[str, Any]], None],
 ) -> tuple[list[Row], list[str]]:
     """Return the rows of a task and the reasons for missing ones; ``tau`` is the horizon, other arguments `measure`."""
@@ -100,23 +179,24 @@ def _measure_task(
     def count(done: int, total: int) -> None:
         progress({"event": "images", "done": done, "total": total})
 
+    splits, rounds, clock, backend = options.splits, options.rounds, options.clock, options.backend
     if task == "dynamics":
         return integrator_task.measure(scene, tau, rounds, clock)
     if task == "raster":
         views = () if dataset is None else dataset.views(splits[0])
         return rasterizer_task.measure(scene, views, rounds, clock=clock, backend=backend)
-    if task == "poses":
-        if dataset is None:
-            return [], ["poses: no data set was given, so no true poses are known"]
-        return pose_task.measure(scene, dataset.ground_truth, rounds, clock)
     if dataset is None:
-        return [], ["images: no data set was given, so there is nothing to compare with"]
+        return [], [f"{task}: no data set was given, so there is nothing to compare with"]
+    if task == "poses":
+        return pose_task.measure(scene, dataset.ground_truth, rounds, clock)
+    if task == "family":
+        return family_task.measure(scene, dataset.ground_truth)
     return image_task.measure(scene, dataset, splits, rounds, clock=clock, backend=backend, progress=count)
 
 
 def _busy(rows: Sequence[Row]) -> float:
     """Return the median ratio of wall time to processor time, 1 without rows."""
-    ratios = [row.ms_wall / row.ms_cpu for row in rows if row.ms_cpu > 0]
+    ratios = [row.ms_wall / row.ms_cpu for row in rows if row.ms_cpu > 0 and math.isfinite(row.ms_wall)]
     return float(np.median(ratios)) if ratios else 1.0
 
 
@@ -130,10 +210,10 @@ def horizon(scene: Scene, dataset: Dataset | None) -> tuple[float, str]:
 
 
 def write(report: dict[str, Any], folder: Path) -> tuple[Path, ...]:
-    """Write a report as JSON, CSV, Markdown and plot.
+    """Write a report as JSON, CSV, Markdown and one plot per scene.
 
     Args:
-        report: Result of `measure`.
+        report: Result of `collect`.
         folder: Output folder, created if missing.
 
     Returns:
@@ -147,7 +227,7 @@ def write(report: dict[str, Any], folder: Path) -> tuple[Path, ...]:
         JSON_FILE: json.dumps(report, indent=2, allow_nan=False).encode(),
         CSV_FILE: report_rows.to_csv(rows).encode(),
         MARKDOWN_FILE: tables.markdown(report).encode(),
-        PLOT_FILE: pareto_plot.png(report),
+        **{name: pareto_plot.png(report, scene["name"]) for name, scene in _plots(report).items()},
     }
     paths = []
     try:
@@ -158,3 +238,10 @@ def write(report: dict[str, Any], folder: Path) -> tuple[Path, ...]:
     except OSError as error:
         raise ConfigError(f"--out {folder}: the report cannot be written: {error}") from error
     return tuple(paths)
+
+
+def _plots(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the scenes by the name of their plot: ``report.png``, numbered from the second scene on."""
+    stem, _, suffix = PLOT_FILE.partition(".")
+    scenes = report["scenes"]
+    return {f"{stem}_{i + 1}.{suffix}" if i else PLOT_FILE: scene for i, scene in enumerate(scenes)}

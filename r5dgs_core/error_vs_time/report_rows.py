@@ -1,13 +1,11 @@
 """Rows of the report "error against run time".
 
-A row is one error of one method, with its time. The Pareto front (`mark_front`) is taken over the rows of a task with
-the same kind of error.
+A row is one error of one method, with its time. `pareto_front` compares the rows of a task with the same kind of error.
 """
 
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import itertools
 import math
@@ -17,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-TASKS = ("dynamics", "poses", "images", "raster")
+TASKS = ("dynamics", "poses", "family", "images", "raster", "training")
 
 
 @dataclass(frozen=True)
@@ -27,29 +25,34 @@ class Kind:
     Attributes:
         label: Label for users.
         more_is_better: True if larger values are better, as for PSNR.
+        least: Smallest difference that counts, in the unit of the error.
+        least_share: Smallest difference that counts, as a share of the larger error.
     """
 
     label: str
     more_is_better: bool = False
+    least: float = 0.0
+    least_share: float = 0.0
 
 
+# Differences below the last printed digit do not count, nor do those of rounding.
 KINDS = {
-    "position": Kind("position error, share of the object's size"),
-    "rotation": Kind("rotation error, degrees"),
-    "outside_band": Kind("share of true errors outside the 95 % band"),
-    "psnr": Kind("PSNR, dB", more_is_better=True),
-    "psnr_objects": Kind("PSNR on object pixels, dB", more_is_better=True),
-    "ssim": Kind("SSIM", more_is_better=True),
-    "flip": Kind("FLIP"),
-    "lpips": Kind("LPIPS"),
-    "miou": Kind("mIoU", more_is_better=True),
-    "difference": Kind("difference to the finest picture, 8-bit levels (rms)"),
+    "position": Kind("position error, share of the object's size", least=1e-9, least_share=0.01),
+    "rotation": Kind("rotation error, degrees", least=1e-7, least_share=0.01),
+    "outside_band": Kind("share of true errors outside the 95 % band", least=1e-3),
+    "psnr": Kind("PSNR, dB", more_is_better=True, least=0.01),
+    "psnr_objects": Kind("PSNR on object pixels, dB", more_is_better=True, least=0.01),
+    "ssim": Kind("SSIM", more_is_better=True, least=1e-4),
+    "flip": Kind("FLIP", least=1e-4),
+    "lpips": Kind("LPIPS", least=1e-4),
+    "miou": Kind("mIoU", more_is_better=True, least=1e-3),
+    "difference": Kind("difference to the finest picture, 8-bit levels (rms)", least=1e-3, least_share=0.01),
 }
 
 
 @dataclass(frozen=True)
 class Row:
-    """One error of one method, and its time.
+    """One error of one method, and its time: of one run, or the median of several runs of a scene.
 
     Attributes:
         task: Task, from `TASKS`.
@@ -58,20 +61,29 @@ class Row:
         setting: Settings of the method, such as steps or thresholds.
         error_kind: Key of `KINDS`, with "@t=..." appended for times before the last one, or "@split" for other splits.
         error: The error; the median if there are several objects.
-        ms: Time of one frame by the report's clock, milliseconds, median over rounds; NaN if not timed.
+        ms: Time by ``clock``, milliseconds, median over rounds; NaN if not timed. Time of one frame, except in the
+            tasks "training" (time from the start of training) and "family" (time of the fits of all objects).
         error_low: Lower quartile over objects; the error itself for one object.
         error_high: Upper quartile over objects.
         error_worst: Worst error over objects.
+        worst_name: Name of the object with the worst error.
         ms_low: Lower quartile of ``ms`` over rounds.
         ms_high: Upper quartile of ``ms`` over rounds.
         ms_wall: Wall time, median over rounds.
         ms_cpu: Processor time over all threads, median over rounds.
         ms_motion: Part of ``ms`` spent on motion, if measured separately.
         ms_raster: Part of ``ms`` spent on rasterization.
-        ms_once: Processor time of work done once per scene, such as a fit.
+        ms_once_cpu: Processor time of work done once per scene, such as a fit.
         count: Number of objects, Gaussians or images behind the error.
         note: Further information for the reader.
         pareto: True if the row is on the Pareto front of its task and kind of error.
+        clock: Clock of ``ms``, its quartiles and its parts: "wall", or "cpu" for processor time.
+        scene: Name of the scene, or of its group of runs.
+        runs: Number of runs.
+        error_min: Smallest error over runs.
+        error_max: Largest error over runs.
+        ms_min: Smallest ``ms`` over runs.
+        ms_max: Largest ``ms`` over runs.
     """
 
     task: str
@@ -90,10 +102,18 @@ class Row:
     ms_cpu: float = math.nan
     ms_motion: float = math.nan
     ms_raster: float = math.nan
-    ms_once: float = math.nan
+    ms_once_cpu: float = math.nan
     count: int = 1
     note: str = ""
     pareto: bool = False
+    worst_name: str = ""
+    clock: str = "wall"
+    scene: str = ""
+    runs: int = 1
+    error_min: float = math.nan
+    error_max: float = math.nan
+    ms_min: float = math.nan
+    ms_max: float = math.nan
 
     @property
     def kind(self) -> Kind:
@@ -106,56 +126,26 @@ class Row:
         return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
 
 
-_FIRST = ("task", "mode", "method", "setting", "error_kind", "error", "ms", "pareto")
+_FIRST = ("scene", "task", "mode", "method", "setting", "error_kind", "error", "ms", "clock", "pareto")
 COLUMNS = (*_FIRST, *(f.name for f in fields(Row) if f.name not in _FIRST))
 
 
-def spread(values: np.ndarray, *, more_is_better: bool = False) -> dict[str, float]:
-    """Return median, quartiles and worst of several errors, by the names of `Row`; NaN if there are none."""
+def spread(values: np.ndarray, *, more_is_better: bool = False, names: Sequence[str] = ()) -> dict[str, Any]:
+    """Return median, quartiles and worst of several errors, by the names of `Row`; NaN if there are none.
+
+    Args:
+        values: The errors. [B]
+        more_is_better: True if the smallest value is the worst.
+        names: Names of the objects, for ``worst_name``. [B], or empty
+    """
     values = np.asarray(values, np.float64)
     if not len(values):
         return dict.fromkeys(("error", "error_low", "error_high", "error_worst"), math.nan)
     low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-    worst = values.min() if more_is_better else values.max()
-    numbers = {"error": middle, "error_low": low, "error_high": high, "error_worst": worst}
-    return {name: float(value) for name, value in numbers.items()}
-
-
-def mark_front(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows with the Pareto front of each task and kind of error marked.
-
-    A row is dominated by a row that is better and not slower. Times whose quartiles overlap count as equal, so of
-    methods that are equally fast within noise only the best is on the front. Rows without time or error are not.
-
-    Args:
-        rows: Rows of any tasks and kinds.
-
-    Returns:
-        The rows in their order.
-    """
-    marked = list(rows)
-    key = [(row.task, row.error_kind) for row in rows]
-    for group in dict.fromkeys(key):
-        members = [i for i, k in enumerate(key) if k == group]
-        front: list[Row] = []
-        for i in sorted(members, key=lambda i: (_badness(rows[i]), rows[i].ms)):
-            row = rows[i]
-            timed = math.isfinite(row.ms) and math.isfinite(row.error)
-            on_front = timed and all(_faster(row, better) for better in front)
-            front += [row] if on_front else []
-            marked[i] = dataclasses.replace(row, pareto=on_front)
-    return marked
-
-
-def _badness(row: Row) -> float:
-    return -row.error if row.kind.more_is_better else row.error
-
-
-def _faster(row: Row, other: Row) -> bool:
-    """Return True if a row is faster than another by more than the spread of both."""
-    high = row.ms_high if math.isfinite(row.ms_high) else row.ms
-    low = other.ms_low if math.isfinite(other.ms_low) else other.ms
-    return high < low
+    worst = int(values.argmin() if more_is_better else values.argmax())
+    numbers = {"error": middle, "error_low": low, "error_high": high, "error_worst": values[worst]}
+    found: dict[str, Any] = {name: float(value) for name, value in numbers.items()}
+    return found | ({"worst_name": names[worst]} if names else {})
 
 
 def to_csv(rows: Sequence[Row]) -> str:

@@ -108,7 +108,7 @@ def _train(
     iterations = run.config.train.iterations
     done = 0 if state is None else state.iteration
     progress({"event": "start", "iterations": iterations, "from": done, "dataset": str(dataset_root)})
-    began = time.monotonic()
+    began, began_cpu = time.monotonic(), time.process_time()
     if state is not None and state.finished:
         count = len(state.tensors["gaussians.means"])
         progress({"event": "trained", "gaussians": count, "text": "already finished"})
@@ -127,9 +127,11 @@ def _train(
         trainer.restore(state)
         began -= state.seconds
     step_log.clean_up(folder / checkpoint.LOG_FILE, trainer.iteration)
+    before = step_log.cpu_seconds(folder / checkpoint.LOG_FILE)
+    began_cpu = None if before is None else began_cpu - before
     pictures = learning_curves.Curves(run.folder)
     _plan(trainer, progress)
-    _optimise(trainer, run, began, go_on, progress, probe, pictures)
+    _optimise(trainer, run, began, began_cpu, go_on, progress, probe, pictures)
     with interrupt.at_once(f"stopped after the last step, before the labels; go on with: {go_on}"):
         _save(trainer, run, began, finished=True, extra=finish.outcome(trainer, progress))
         pictures.update(finished=True)
@@ -217,12 +219,17 @@ def _optimise(
     trainer: Trainer,
     run: checkpoint.Run,
     began: float,
+    began_cpu: float | None,
     go_on: str,
     progress: Timed,
     probe: probe.Probe | None,
     pictures: learning_curves.Curves,
 ) -> None:
-    """Take the remaining steps, and write the log and checkpoints."""
+    """Take the remaining steps, and write the log and checkpoints.
+
+    ``began`` and ``began_cpu`` are the readings of the wall and the processor clock at the start of training, minus the
+    time of earlier sessions. The log of an older version has no processor time, so ``began_cpu`` is None.
+    """
     section = trainer.config.train
     decision = decision_step(trainer)
     with interrupt.collected() as asked, step_log.StepLog(run.folder / checkpoint.LOG_FILE) as steps:
@@ -237,6 +244,8 @@ def _optimise(
                     "gaussians": len(trainer.gaussians),
                     "seconds": time.monotonic() - began,
                 }
+                if began_cpu is not None:
+                    event["cpu_seconds"] = time.process_time() - began_cpu
                 event = progress.timed(event)
                 if look and probe is not None:
                     event["val_psnr"] = probe.psnr()

@@ -59,6 +59,20 @@ def clean_up(path: Path, iteration: int) -> None:
         raise CheckpointError(f"{path}: cannot be written: {error}") from error
 
 
+def cpu_seconds(path: Path) -> float | None:
+    """Return the processor time in the last line of a log: 0 without lines, None if the line has none.
+
+    Raises:
+        CheckpointError: The file cannot be read.
+    """
+    try:
+        lines = path.read_bytes().splitlines() if path.exists() else []
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error}") from error
+    event = _parse(lines[-1]) if lines else {"cpu_seconds": 0.0}
+    return None if event is None else event.get("cpu_seconds")
+
+
 def _parse(line: bytes) -> dict[str, Any] | None:
     """Return the event of a line of the log; None if the line is incomplete."""
     try:

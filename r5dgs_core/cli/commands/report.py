@@ -14,20 +14,21 @@ from ..exit_status import ExitStatus
 NAME = "report"
 SHORT = "measure error against run time, or test numerical stability"
 LONG = (
-    "Measure error against run time of motion models, playback modes and rasterizer settings. With --stability,\n"
+    "Measure error against run time of motion models, playback modes, rasterizer settings and training. Several runs\n"
+    "of a scene are combined into medians with their spread. With --stability,\n"
     "run the stiff and extreme cases of the motion code instead; the exit status is 1 if a case fails."
 )
-EXAMPLE = "RUN --out report"
+EXAMPLE = "RUN [RUN ...] --out report"
 PAGE = "user/report.md"
 
-TASKS = ("dynamics", "poses", "images", "raster")  # of `error_vs_time.report_rows`
+TASKS = ("dynamics", "poses", "family", "images", "raster", "training")  # of `error_vs_time.report_rows`
 SPLITS = ("train", "val", "test")  # of `data.dataset`
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    p.add_argument("target", type=Path, nargs="?", metavar="RUN|SCENE", help="run folder or .r5dgs file")
-    p.add_argument("data", type=Path, nargs="?", metavar="DATA", help="data set (default: the run's own)")
+    paths = "run folders or .r5dgs files; a data set applies to those before it (default: the run's own)"
+    p.add_argument("paths", type=Path, nargs="*", metavar="RUN|SCENE|DATA", help=paths)
     p.add_argument("--out", type=Path, metavar="DIR", help="output folder for report.json, .csv, .md and .png")
     tasks = f"tasks to measure, of {', '.join(TASKS)} (default: all)"
     p.add_argument("--tasks", nargs="+", choices=TASKS, metavar="TASK", help=tasks)
@@ -45,7 +46,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> ExitStatus | None:
     """Run the command."""
-    measured = (args.target, args.out, args.tasks, args.splits, args.repeats)
+    measured = (args.paths or None, args.out, args.tasks, args.splits, args.repeats)
     if args.stability and any(given is not None for given in measured):
         raise errors.UsageError("report --stability: needs no scene; takes --json FILE alone")
     if args.json is not None and not args.stability:
@@ -53,16 +54,31 @@ def run(args: argparse.Namespace) -> ExitStatus | None:
     shared = {"threads": args.threads, "progress_kind": args.progress}
     if args.stability:
         return None if run_stability(args.json, **shared) else ExitStatus.NEGATIVE
-    if args.target is None or args.out is None:
+    if not args.paths or args.out is None:
         raise errors.UsageError("report: expected RUN|SCENE and --out DIR, or --stability")
     given = {"tasks": args.tasks, "splits": args.splits, "rounds": args.repeats, "clock": args.clock}
-    run_report(args.target, args.data, args.out, **given, **shared)
+    run_report(pair(args.paths), args.out, **given, **shared)
     return None
 
 
+def pair(paths: Sequence[Path]) -> list[tuple[Path, Path | None]]:
+    """Return runs and scene files, each with its data set or None.
+
+    A folder without ``run.json`` behind a run is a data set. It applies to all runs since the data set before it.
+    """
+    found: list[tuple[Path, Path | None]] = []
+    open_ones: list[Path] = []
+    for path in paths:
+        if open_ones and path.is_dir() and not (path / input_paths.RUN_FILE).exists():
+            found += [(target, path) for target in open_ones]
+            open_ones = []
+        else:
+            open_ones.append(path)
+    return found + [(target, None) for target in open_ones]
+
+
 def run_report(
-    target: Path,
-    data: Path | None,
+    targets: Sequence[tuple[Path, Path | None]],
     out: Path,
     *,
     tasks: Sequence[str] | None = None,
@@ -72,11 +88,11 @@ def run_report(
     threads: int | None = None,
     progress_kind: str = "none",
 ) -> dict[str, Any]:
-    """Measure error against run time of a run or scene file (see `error_vs_time.report`) and write it to a folder.
+    """Measure error against run time of runs or scene files (see `error_vs_time.report`) and write it to a folder.
 
     Args:
-        target: Run folder or ``.r5dgs`` file.
-        data: Data set; if None, that of the run; a scene file is then measured without data.
+        targets: Run folders or ``.r5dgs`` files, with their data sets; None for that of the run; a scene file is then
+            measured without data.
         out: Folder of ``report.json``, ``.csv``, ``.md`` and ``.png``.
         tasks: Tasks to measure; all if None.
         splits: Splits whose images are compared; "test" if None.
@@ -88,32 +104,41 @@ def run_report(
     Returns:
         The report, in the form of ``report.json``.
     """
-    inputs.check_target(target, data)
+    _check_targets(targets)
     input_paths.check_output_folder("--out", out)
     from ...error_vs_time import report, report_rows, tables
     from ...progress import make
 
     options.use_threads(threads)
+    settings = report.Options(
+        tuple(tasks or report_rows.TASKS), tuple(splits or ("test",)), rounds or report.ROUNDS, clock
+    )
+    measured = []
     with make(progress_kind) as progress:
-        progress({"event": "prepare", "text": "the scene"})
-        scene, dataset = inputs.open_target(target, data)
-        if dataset is None and tasks and set(tasks) <= {"images", "poses"}:
-            given = " ".join(tasks)
-            raise errors.ConfigError(f"--tasks {given}: require the data set: r5dgs report {target} DATA --out {out}")
-        result = report.measure(
-            scene,
-            dataset,
-            tasks=tasks or report_rows.TASKS,
-            splits=splits or ("test",),
-            rounds=rounds or report.ROUNDS,
-            clock=clock,
-            progress=progress,
-        )
+        for target, data in targets:
+            progress({"event": "prepare", "text": str(target)})
+            scene, dataset = inputs.open_target(target, data)
+            if dataset is None and tasks and set(tasks) <= {"images", "poses", "family"}:
+                given = " ".join(tasks)
+                remedy = f"r5dgs report {target} DATA --out {out}"
+                raise errors.ConfigError(f"--tasks {given}: require the data set: {remedy}")
+            measured.append(report.measure(scene, dataset, settings, place=target, progress=progress))
+    result = report.collect(measured, settings)
     paths = report.write(result, out)
     if progress_kind != "json":
         tables.show(result)
         print("\n".join(f"written: {path}" for path in paths))
     return result
+
+
+def _check_targets(targets: Sequence[tuple[Path, Path | None]]) -> None:
+    """Raise R5dgsError if a path is given twice, or is neither a run folder, a scene file nor a data set."""
+    for target, data in targets:
+        inputs.check_target(target, data)
+    names = [target.resolve() for target, _ in targets]
+    twice = next((target for target, _ in targets if names.count(target.resolve()) > 1), None)
+    if twice is not None:
+        raise errors.UsageError(f"report: {twice}: is given twice; its spread would be too small")
 
 
 def run_stability(json_path: Path | None = None, *, threads: int | None = None, progress_kind: str = "none") -> bool:

@@ -13,53 +13,11 @@ from r5dgs_core.error_vs_time import report_rows
 from r5dgs_core.error_vs_time.report_rows import Row
 from r5dgs_core.evaluation import label_placement
 
-SHAPE = ("task", "mode", "method", "setting", "error_kind", "error", "ms", "pareto")
+SHAPE = ("scene", "task", "mode", "method", "setting", "error_kind", "error", "ms", "clock", "pareto")
 
 
 def row(error=1.0, ms=1.0, kind="position", task="dynamics", spread=0.0, **more):
     return Row(task, "rigid", "m", "s", kind, error, ms, ms_low=ms - spread, ms_high=ms + spread, **more)
-
-
-@st.composite
-def rows(draw):
-    numbers = st.integers(1, 12).map(float)
-    kinds = st.sampled_from(["position", "psnr"])
-    make = st.builds(row, error=numbers, ms=numbers, kind=kinds, spread=st.sampled_from([0.0, 0.4, 1.5]))
-    return draw(st.lists(make, max_size=12))
-
-
-@given(rows())
-def test_the_front_is_what_nothing_better_beats(some):
-    marked = report_rows.mark_front(some)
-    assert [(r.error, r.ms) for r in marked] == [(r.error, r.ms) for r in some]
-    for kind in ("position", "psnr"):
-        sign = -1 if kind == "psnr" else 1
-        front = [r for r in marked if r.pareto and r.error_kind == kind]
-        mine = [r for r in marked if r.error_kind == kind]
-        assert bool(front) == bool(mine)
-        for one in mine:
-            beaten = any(
-                sign * other.error <= sign * one.error and other.ms_low <= one.ms_high
-                for other in front
-                if other is not one
-            )
-            assert beaten != one.pareto
-
-
-def test_only_the_best_of_equally_fast_methods_is_on_the_pareto_front():
-    marked = report_rows.mark_front([row(2.0, 1.0, spread=0.2), row(1.0, 1.1, spread=0.2), row(0.5, 9.0)])
-    assert [r.pareto for r in marked] == [False, True, True]
-
-
-def test_more_decibels_are_better_and_tasks_have_fronts_of_their_own():
-    marked = report_rows.mark_front(
-        [row(30.0, 1.0, "psnr"), row(20.0, 2.0, "psnr"), row(20.0, 2.0, "psnr", "raster"), row(9.0, 1.0, "flip")]
-    )
-    assert [r.pareto for r in marked] == [True, False, True, True]
-
-
-def test_a_row_without_time_is_on_no_front():
-    assert not any(r.pareto for r in report_rows.mark_front([row(0.0, math.nan), row(math.nan, 1.0)]))
 
 
 def test_rows_survive_json_and_csv():
@@ -74,6 +32,7 @@ def test_rows_survive_json_and_csv():
 def test_spread_is_median_quartiles_and_worst():
     found = report_rows.spread(np.array([1.0, 2.0, 3.0, 4.0, 100.0]))
     assert found == {"error": 3.0, "error_low": 2.0, "error_high": 4.0, "error_worst": 100.0}
+    assert report_rows.spread(np.array([1.0, 3.0, 2.0]), names=("a", "b", "c"))["worst_name"] == "b"
     assert report_rows.spread(np.array([1.0, 2.0]), more_is_better=True)["error_worst"] == 1.0
     assert all(math.isnan(v) for v in report_rows.spread(np.array([])).values())
 

@@ -14,6 +14,7 @@ from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images
 from r5dgs_core.error_vs_time import (
+    family_task,
     image_task,
     integrator_task,
     pose_task,
@@ -213,6 +214,15 @@ def test_poses_and_matrices_are_inverse():
     np.testing.assert_allclose(back[1], displacement, atol=1e-12)
 
 
+def test_a_larger_family_takes_longer_and_the_worst_object_is_named(scene, data):
+    rows, _ = family_task.measure(scene, data.ground_truth)
+    found = pick(rows, error_kind="position")
+    assert [row.setting for row in found][-1] == family_task.WHOLE and found[0].method == "1 candidate"
+    names = {o.name for o in scene.objects}
+    assert all(row.worst_name in names and row.clock == "cpu" and row.ms > 0 for row in found)
+    assert found[-1].error_worst < found[0].error_worst  # a body at rest is no candidate for the others
+
+
 # Pictures.
 
 
@@ -253,11 +263,17 @@ def test_without_a_data_set_the_cameras_of_the_scene_serve(scene):
 # All of it.
 
 
+def whole(scene, data=None, place=None, **options):
+    """The report on one run."""
+    chosen = error_vs_time_report.Options(rounds=1, backend=BACKEND, **options)
+    return error_vs_time_report.collect([error_vs_time_report.measure(scene, data, chosen, place=place)], chosen)
+
+
 @pytest.fixture(scope="module")
 def report(field, data):
     with pytest.MonkeyPatch.context() as patch:
         hurry(patch)
-        return error_vs_time_report.measure(field, data, rounds=1, backend=BACKEND, splits=("test", "val"))
+        return whole(field, data, splits=("test", "val"))
 
 
 def test_the_report_is_written_for_programs_and_people(report, field, tmp_path):
@@ -265,7 +281,7 @@ def test_the_report_is_written_for_programs_and_people(report, field, tmp_path):
     by_name = {path.name: path for path in paths}
     assert json.loads(by_name["report.json"].read_text()) == report
     table = list(csv.DictReader(by_name["report.csv"].open()))
-    assert len(table) == len(report["rows"]) and {row["task"] for row in table} == set(report_rows.TASKS)
+    assert len(table) == len(report["rows"]) and {row["task"] for row in table} == {*report_rows.TASKS} - {"training"}
     text = by_name["report.md"].read_text()
     for word in (
         "Magnus-4",
@@ -285,7 +301,7 @@ def test_every_mode_is_shown_past_t_max_and_one_before(report, field):
     rows = report_rows.from_dicts(report["rows"])
     assert {row.mode for row in pick(rows, method="playback", error_kind="psnr")} == set(scene_player.modes(field))
     assert {row.mode for row in pick(rows, error_kind="psnr@val")} == {"rigid"}
-    assert any("up to t_max all are the same" in text for text in report["absent"])
+    assert any("up to t_max all are the same" in text for text in report["scenes"][0]["absent"])
 
 
 def test_every_task_has_a_front(report):
@@ -298,18 +314,20 @@ def test_the_terminal_shows_the_tables_and_absent_tasks(report, capsys):
     tables.show(report)
     text = capsys.readouterr().out
     assert "Dynamics" in text and "Poses along the horizon" in text and "not measured" in text
+    assert "wall ms" in text and "processor ms" in text and "recommended: images" in text
 
 
 def test_tasks_without_their_data_are_listed_as_absent(scene, tmp_path):
-    report = error_vs_time_report.measure(scene, rounds=1, backend=BACKEND, tasks=("poses", "images", "raster"))
-    text = "\n".join(report["absent"])
+    report = whole(scene, tasks=("poses", "images", "raster", "training"))
+    text = "\n".join(report["scenes"][0]["absent"])
+    assert "training: a scene file holds no log" in text
     assert "poses: no data set" in text and "images: no data set" in text and "dynamics: not asked for" in text
-    assert report["horizon"] == {"tau": pytest.approx(0.25), "why": "a third of the observed time"}
+    assert report["scenes"][0]["horizon"] == {"tau": pytest.approx(0.25), "why": "a third of the observed time"}
     error_vs_time_report.write(report, tmp_path)
 
 
 def test_a_report_without_any_row_is_still_written(scene, tmp_path):
-    nothing = error_vs_time_report.measure(scene, rounds=1, backend=BACKEND, tasks=("poses",))
+    nothing = whole(scene, tasks=("poses",))
     assert nothing["rows"] == [] and len(error_vs_time_report.write(nothing, tmp_path)) == 4
 
 
@@ -341,6 +359,6 @@ def test_a_wrong_call_is_one_line(arguments, words, capsys):
 
 def test_an_unwritable_report_raises(scene, tmp_path):
     (tmp_path / "file").write_text("mine")
-    report = error_vs_time_report.measure(scene, rounds=1, backend=BACKEND, tasks=("poses",))
+    report = whole(scene, tasks=("poses",))
     with pytest.raises(errors.ConfigError, match="--out"):
         error_vs_time_report.write(report, tmp_path / "file")
