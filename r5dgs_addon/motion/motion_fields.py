@@ -14,6 +14,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import models
 
+VECTORS = {**models.RATES, **models.EXTRA_RATES}
 _re_extrapolate: Callable[[list[bpy.types.Object]], object] | None = None  # set by `extrapolate`
 
 
@@ -38,7 +39,7 @@ def call_on_change(re_extrapolate: Callable[[list[bpy.types.Object]], object] | 
 
 def _vector(name: str):
     """Property options with getter and setter of a vector in Blender's units."""
-    power = models.RATES[name].per_time
+    power = VECTORS[name].per_time
 
     def read(state):
         factor = units_per_second(state) ** power
@@ -51,12 +52,18 @@ def _vector(name: str):
     return {"get": read, "set": write, "size": 3, "update": write_at_once, "options": set()}
 
 
-def _read_swing(state):
-    return state.stored_frequency * units_per_second(state) / math.tau
+def _scalar(name: str, unit: float = 1.0, most: float = math.inf):
+    """Property options with getter and setter of a number >= 0 in Blender's units, in multiples of ``unit``."""
+    power = models.SCALARS[name]
 
+    def read(state):
+        return getattr(state, f"stored_{name}") * units_per_second(state) ** power / unit
 
-def _write_swing(state, value):
-    state.stored_frequency = max(value, 0.0) * math.tau / units_per_second(state)
+    def write(state, value):
+        value = min(max(value, 0.0), most)
+        setattr(state, f"stored_{name}", value * unit / units_per_second(state) ** power)
+
+    return {"get": read, "set": write, "update": write_at_once, "options": set()}
 
 
 def _stored(**options):
@@ -95,7 +102,17 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     stored_angular_velocity: _stored()
     stored_angular_acceleration: _stored()
     stored_center_offset: _stored()
+    stored_precession: _stored()
+    stored_second_velocity: _stored()
+    stored_second_acceleration: _stored()
+    stored_second_angular_velocity: _stored()
+    stored_second_angular_acceleration: _stored()
     stored_frequency: FloatProperty(options={"HIDDEN"})
+    stored_second_frequency: FloatProperty(options={"HIDDEN"})
+    stored_damping: FloatProperty(options={"HIDDEN"})
+    stored_stop_time: FloatProperty(options={"HIDDEN"})
+    stored_bounce_time: FloatProperty(options={"HIDDEN"})
+    stored_restitution: FloatProperty(options={"HIDDEN"})
     stored_pivot: _stored()  # point chosen on an axis, relative to the anchor
     velocity: FloatVectorProperty(
         name="Velocity",
@@ -133,10 +150,71 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     frequency: FloatProperty(
         name="Swings /s",
         description="Oscillations per second; 0 for none",
-        get=_read_swing,
-        set=_write_swing,
-        update=write_at_once,
-        options=set(),
+        **_scalar("frequency", math.tau),
+    )
+    damping: FloatProperty(
+        name="Damping /s",
+        description="Rate at which a swing, or the velocity under drag, decays, per second",
+        **_scalar("damping"),
+    )
+    stop_time: FloatProperty(
+        name="Rests After",
+        description="Seconds from the last observed time until the object rests; 0 for never",
+        subtype="TIME_ABSOLUTE",
+        unit="TIME_ABSOLUTE",
+        **_scalar("stop_time"),
+    )
+    bounce_time: FloatProperty(
+        name="Next Bounce",
+        description="Seconds from the last observed time until the next bounce",
+        subtype="TIME_ABSOLUTE",
+        unit="TIME_ABSOLUTE",
+        **_scalar("bounce_time"),
+    )
+    restitution: FloatProperty(
+        name="Restitution",
+        description="Speed after a bounce as a share of the speed before it",
+        subtype="FACTOR",
+        soft_max=1.0,
+        **_scalar("restitution", most=1.0),
+    )
+    precession: FloatVectorProperty(
+        name="Precession /s",
+        description="Rotation vector per second by which the spin axis turns",
+        subtype="EULER",
+        unit="ROTATION",
+        **_vector("precession"),
+    )
+    second_velocity: FloatVectorProperty(
+        name="2nd Velocity",
+        description="Velocity of the second swing at the last observed time",
+        subtype="VELOCITY",
+        **_vector("second_velocity"),
+    )
+    second_acceleration: FloatVectorProperty(
+        name="2nd Acceleration",
+        description="Change of the velocity of the second swing",
+        subtype="ACCELERATION",
+        **_vector("second_acceleration"),
+    )
+    second_angular_velocity: FloatVectorProperty(
+        name="2nd Spin /s",
+        description="Spin of the second swing",
+        subtype="EULER",
+        unit="ROTATION",
+        **_vector("second_angular_velocity"),
+    )
+    second_angular_acceleration: FloatVectorProperty(
+        name="2nd Spin /s²",
+        description="Change of the spin of the second swing",
+        subtype="EULER",
+        unit="ROTATION",
+        **_vector("second_angular_acceleration"),
+    )
+    second_frequency: FloatProperty(
+        name="2nd Swings /s",
+        description="Oscillations of the second swing per second",
+        **_scalar("second_frequency", math.tau),
     )
     learned_leader: PointerProperty(type=bpy.types.Object, options={"HIDDEN"})
     tube: PointerProperty(

@@ -20,9 +20,10 @@ from ...r5dgs_core.scene import history_json, json_row
 from ...r5dgs_core.scene.scene import Scene
 from ..scene import timeline
 from ..ui import plural
-from . import curve_place, fcurves
+from . import curve_place, fcurves, motion_fields
 
-RATES = tuple(models.RATES)
+RATES = tuple(motion_fields.VECTORS)
+FIELDS = (*RATES, *models.SCALARS)
 _LEAST_MOMENT = 1e-3  # minimum moment of inertia of flat or thin bodies, as a fraction of the largest
 
 
@@ -76,9 +77,12 @@ def is_written(anchor: bpy.types.Object) -> bool:
 
 def _digest(anchor: bpy.types.Object) -> str:
     state = anchor.r5dgs_motion
-    fields = [list(getattr(state, f"stored_{name}")) for name in RATES]
+    fields = [list(getattr(state, f"stored_{name}")) for name in models.RATES]
     leader = state.leader.name if follow_matrix(state) is not None else ""
-    text = json.dumps([state.taken, state.kind, *fields, state.stored_frequency, leader])
+    others = {name: value for name, value in stored(state).items() if name not in models.RATES and np.any(value)}
+    frequency = others.pop("frequency", 0.0)
+    more = [{name: np.asarray(value).tolist() for name, value in others.items()}] if others else []
+    text = json.dumps([state.taken, state.kind, *fields, frequency, leader, *more])  # as in older files without others
     return hashlib.sha1(text.encode(), usedforsecurity=False).hexdigest()
 
 
@@ -111,9 +115,8 @@ def has_motion(anchor: bpy.types.Object) -> bool:
 def show(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
     """Set the fields of an anchor to a motion."""
     state.kind = model.kind
-    for name in RATES:
+    for name in FIELDS:
         setattr(state, f"stored_{name}", getattr(model, name))
-    state.stored_frequency = model.frequency
     state.stored_pivot = (0.0, 0.0, 0.0)
 
 
@@ -132,7 +135,7 @@ def take(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -
         base = replace(base, inertia=back @ base.inertia @ back.T)
     taker.taken = json.dumps(base.to_dict())
     taker.kind, taker.leader = giver.kind, None
-    for name in (*RATES, "frequency", "pivot"):
+    for name in (*FIELDS, "pivot"):
         setattr(taker, f"stored_{name}", getattr(giver, f"stored_{name}"))
 
 
@@ -167,11 +170,18 @@ def band(anchor: bpy.types.Object) -> Band | None:
     return None if state.taken or edited(state) else history(anchor).band
 
 
+def stored(state: bpy.types.PropertyGroup) -> dict[str, np.ndarray | float]:
+    """Rates of the fields by name, as in `MotionModel`."""
+    vectors = {name: np.array(getattr(state, f"stored_{name}"), np.float64) for name in RATES}
+    return {**vectors, **{name: getattr(state, f"stored_{name}") for name in models.SCALARS}}
+
+
 def edited(state: bpy.types.PropertyGroup) -> set[str]:
     """Names of the fields that differ from the `basis`."""
     model = basis(state)
-    stored = {name: np.array(getattr(state, f"stored_{name}"), np.float32) for name in (*RATES, "frequency")}
-    found = {name for name, value in stored.items() if (value != np.float32(getattr(model, name))).any()}
+    found = {
+        name for name, value in stored(state).items() if (np.float32(value) != np.float32(getattr(model, name))).any()
+    }
     return found | ({"kind"} if state.kind != model.kind else set())
 
 
@@ -186,9 +196,7 @@ def model(anchor: bpy.types.Object) -> MotionModel:
     """
     state = anchor.r5dgs_motion
     base, changed = basis(state), edited(state)
-    values = {name: np.array(getattr(state, f"stored_{name}"), np.float64) for name in RATES if name in changed}
-    if "frequency" in changed:
-        values["frequency"] = state.stored_frequency
+    values = {name: value for name, value in stored(state).items() if name in changed}
     if changed:
         values.update(offset_rotvec=np.zeros(3), offset_displacement=np.zeros(3))
     if "kind" in changed:

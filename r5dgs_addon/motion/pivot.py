@@ -96,9 +96,8 @@ def _model(anchor: bpy.types.Object) -> MotionModel | None:
     state = anchor.r5dgs_motion
     if state.leader is not None:
         return None
-    rates = {name: getattr(state, f"stored_{name}") for name in physics.RATES}
     try:
-        return MotionModel(state.kind, frequency=state.stored_frequency, **rates)
+        return MotionModel(state.kind, **physics.stored(state))
     except ValueError:  # invalid values, or a kind that needs an inertia
         return None
 

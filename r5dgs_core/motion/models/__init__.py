@@ -4,7 +4,7 @@ import importlib
 
 from .base import BLOCKS, Block, MotionKind, Rates, clocks
 from .evaluation import Stack, curve, evaluate, evaluate_all, evaluate_with_rates, steps_needed
-from .motion_model import KINDS, RATES, SCALARS, VECTORS, MotionModel
+from .motion_model import EXTRA_RATES, KINDS, RATES, SCALARS, VECTORS, MotionModel
 
 # Each kind is the module of its name. Append new ones: .blend files store the position in Blender's menu.
 _NAMES = (
@@ -24,6 +24,7 @@ KINDS.update({name: importlib.import_module(f"{__name__}.{name}").KIND for name 
 STATIC = MotionModel()
 
 __all__ = [
+    "EXTRA_RATES",
     "BLOCKS",
     "KINDS",
     "RATES",

@@ -18,7 +18,7 @@ class BallisticSpin(MotionKind):
     label = "Throw and Spin"
     tooltip = "Spins about a center that flies; a hinge or a pendulum if the center is fixed"
     word = "throw+spin"
-    fields = (*_SPIN, "frequency")
+    fields = (*_SPIN, "frequency", "damping")
     fits = {
         "spin": ("w",),
         "spin, accelerating": ("w", "kappa"),

@@ -26,7 +26,7 @@ class Bounce(MotionKind):
     label = "Bounce"
     tooltip = "Flies and bounces off a floor that is perpendicular to its acceleration, ever lower"
     word = "bounce"
-    fields = ("velocity", "acceleration", "angular_velocity")
+    fields = ("velocity", "acceleration", "angular_velocity", "bounce_time", "restitution")
     fits = {"bounces": ("w", "v", "a", "bounce", "logit_rho")}
     blocks = {"bounce": Block(1, 3.0), "logit_rho": Block(1, 3.0)}
 

@@ -22,7 +22,7 @@ class Drag(MotionKind):
     label = "Drag"
     tooltip = "Slows down in air or water and nears a steady velocity"
     word = "drag"
-    fields = ("velocity", "acceleration", "angular_velocity")
+    fields = ("velocity", "acceleration", "angular_velocity", "damping")
     fits = {"drag": ("v", "w", "log_c"), "fall with drag": ("v", "w", "log_c", "terminal")}
     blocks = {"log_c": Block(1, 2.0), "terminal": Block(3, 100.0)}
 

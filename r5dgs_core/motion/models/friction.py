@@ -20,7 +20,7 @@ class Friction(MotionKind):
     label = "Friction"
     tooltip = "Slides or rolls ever slower until it rests"
     word = "friction"
-    fields = ("velocity", "angular_velocity")
+    fields = ("velocity", "angular_velocity", "stop_time")
     fits = {"slide, friction": ("v", "log_stop"), "slide + turn, friction": ("v", "w", "log_stop")}
     blocks = {"log_stop": Block(1, 2.0)}
 

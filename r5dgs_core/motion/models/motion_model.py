@@ -34,7 +34,7 @@ EXTRA_RATES = {
     "second_angular_velocity": Unit(False, 1),
     "second_angular_acceleration": Unit(False, 2),
 }
-"""Vectors of single kinds; stored only if they are not zero."""
+"""Vectors of single kinds that users edit; stored only if they are not zero."""
 SCALARS = {
     "frequency": 1,
     "second_frequency": 1,

@@ -21,7 +21,7 @@ class Precession(MotionKind):
     label = "Precession"
     tooltip = "Spins about an axis that turns steadily about a point, like a gyroscope"
     word = "precession"
-    fields = ("angular_velocity", "center_offset")
+    fields = ("angular_velocity", "precession", "center_offset")
     fits = {"precession": ("p", "s", "u")}
     blocks = {"p": Block(3, 30.0), "s": Block(3, 30.0)}
 

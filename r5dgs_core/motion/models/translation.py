@@ -16,7 +16,7 @@ class Translation(MotionKind):
     label = "Slide"
     tooltip = "Moves without turning; with swings, it oscillates like a mass on a spring"
     word = "slide"
-    fields = ("velocity", "acceleration", "frequency")
+    fields = ("velocity", "acceleration", "frequency", "damping")
     fits = {"translation": ("v",), "translation, quadratic": ("v", "a"), "spring": ("v", "a", "pace")} | {
         "damped spring": ("v", "a", "pace", "decay")
     }

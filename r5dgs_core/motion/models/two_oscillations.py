@@ -18,7 +18,11 @@ class TwoOscillations(MotionKind):
     label = "Two Swings"
     tooltip = "Oscillates with two frequencies at once"
     word = "two swings"
-    fields = ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "frequency")
+    fields = (
+        *("velocity", "acceleration", "angular_velocity", "angular_acceleration", "frequency"),
+        *("second_velocity", "second_acceleration", "second_angular_velocity", "second_angular_acceleration"),
+        "second_frequency",
+    )
     fits = {
         "two oscillations": ("v", "a", "pace", "v2", "a2", "pace2"),
         "two oscillations, rocking": ("v", "a", "pace", "v2", "a2", "pace2", "w", "eps", "w2", "eps2"),

@@ -616,3 +616,32 @@ def test_a_channel_without_keys_starts_the_new_motion_at_its_current_value(blend
     mug.location[2] = 0.3
     blender.ops.r5dgs.re_extrapolate()
     assert motions.curves(mug)["location", 2].evaluate(LAST) == pytest.approx(0.3)
+
+
+def test_rates_of_single_kinds_are_edited_in_seconds_and_kept(blender, loaded, mug):
+    physics, state = importlib.import_module("r5dgs.r5dgs_addon.motion.physics"), mug.r5dgs_motion
+    factor = blender.context.scene.render.fps / state.frames_per_unit  # units of time per second
+    learned = physics.model(mug)
+    for kind, name, value, stored in (
+        ("drag", "damping", 0.5, 0.5 / factor),
+        ("friction", "stop_time", 2.0, 2.0 * factor),
+        ("bounce", "bounce_time", 0.5, 0.5 * factor),
+        ("bounce", "restitution", 0.8, 0.8),
+        ("precession", "precession", (0.1, 0.2, 0.3), np.array((0.1, 0.2, 0.3)) / factor),
+        ("two_oscillations", "second_velocity", (1, 0, 0), np.array((1, 0, 0)) / factor),
+        ("two_oscillations", "second_frequency", 1.0, 2 * np.pi / factor),
+    ):
+        before = physics.is_written(mug)
+        state.kind = kind
+        setattr(state, name, value)
+        np.testing.assert_allclose(getattr(physics.model(mug), name), stored, rtol=1e-6)
+        np.testing.assert_allclose(getattr(state, name), value, rtol=1e-6)
+        assert name in physics.edited(state) and not physics.is_written(mug)
+        assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"} and physics.is_written(mug)
+        assert blender.ops.r5dgs.reset_motion() == {"FINISHED"} and not physics.edited(state)
+        assert physics.model(mug).kind == learned.kind and before
+        blender.ops.r5dgs.re_extrapolate()
+    state.restitution = 7.0
+    assert state.restitution == 1.0
+    state.damping = -1.0
+    assert state.damping == 0.0
