@@ -28,6 +28,8 @@ VARIANTS: dict[str, dict[str, str]] = {
     },
     "tracks": {"train.representation": "tracks", **_PLACED},
 }
+# Settings of a variant that ``--set`` overrides.
+DEFAULTS = {"r5dgs_extra": {"losses.rigid_form": "squared"}}
 # `5dgs` is trained like `r5dgs` and differs only in playback, so its row comes from the checkpoint of `r5dgs`.
 DEFAULT_VARIANTS = ("r5dgs", "r5dgs_extra", "from_tracks", "tracks")
 # Keys that variants leave to a preset: `paper` has the paper's weights.
@@ -45,11 +47,15 @@ def settings(variant: str, preset: str | None) -> dict[str, str]:
 
 
 def suited(variant: str, preset: str | None) -> dict[str, str]:
-    """Return defaults for preset keys that suit the field but not a variant with tracks; ``--set`` overrides them."""
+    """Return defaults of a variant, and of preset keys that suit the field but not a variant with tracks.
+
+    ``--set`` overrides them.
+    """
     given: dict[str, Any] = PRESETS.get(preset or "", {})
+    found = dict(DEFAULTS.get(variant, {}))
     if given.get("train.representation") != "field":
-        return {}
-    defaults, found = configs.Config().to_dict(), {}
+        return found
+    defaults = configs.Config().to_dict()
     for name in given:
         section, _, key = name.partition(".")
         if {name, section} & set(UNSUITED.get(variant, ())):

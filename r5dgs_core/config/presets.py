@@ -41,6 +41,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rates.decay_floor_appearance": 1.0,
         "rates.decay_from": 0.0,
         "losses.rigid": 0.5,
+        "losses.rigid_form": "squared",
         "losses.rigid_start": 0.25,
         "curriculum.start": "first",
         "curriculum.first": 3000,

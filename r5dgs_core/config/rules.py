@@ -12,7 +12,7 @@ from .sections.densification import STRATEGIES
 from .sections.identity import IDENTITY_TRAINING, INCLUDE_SELF
 from .sections.motion import FIELD_SIZES, MOVERS, VARIANTS
 from .sections.needs import NEEDS, NeedsSection
-from .sections.training import BACKGROUNDS, CURRICULA, PLACEMENTS, REPRESENTATIONS
+from .sections.training import BACKGROUNDS, CURRICULA, PLACEMENTS, REPRESENTATIONS, RIGID_FORMS
 
 
 def _check_writable(name: str, value: object) -> None:
@@ -96,6 +96,7 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "field.trd_every": _SHARE,
     "field.tracks_share": (lambda value: 0 <= value < 1, "0 to less than 1, as the rest of the run is the field's"),
     "field.chunk": _AT_LEAST_1,
+    "losses.rigid_form": (lambda value: value in RIGID_FORMS, " or ".join(RIGID_FORMS)),
     "losses.rigid_start": _SHARE,
     "identity.training": (lambda value: value in IDENTITY_TRAINING, " or ".join(IDENTITY_TRAINING)),
     "identity.every": _AT_LEAST_1,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 REPRESENTATIONS = ("tracks", "field")
 BACKGROUNDS = ("auto", "learned", "white", "black")
 PLACEMENTS = ("scene", "random")
+RIGID_FORMS = ("absolute", "squared")
 CURRICULA = ("best", "first")
 
 
@@ -142,12 +143,14 @@ class LossSection:
         roughness: Weight of the mean squared second difference of the tracks.
         rigid: Weight of the rigidity loss, the change of each Gaussian's distance to the representative of its object
             (variant ``r5dgs_extra`` only).
+        rigid_form: ``absolute`` (mean absolute change) or ``squared`` (mean squared change, Eq. 8 of the paper).
         rigid_start: Share of the run after which the rigidity loss is active.
     """
 
     ssim: float = 0.2
     roughness: float = 0.02
     rigid: float = 0.5
+    rigid_form: str = "absolute"
     rigid_start: float = 0.25
 
 

@@ -196,7 +196,8 @@ class FieldRepresentation(Representation):
         if self._config.field.variant == "r5dgs_extra" and losses.rigid > 0 and started:
             opacities = gaussians.opacity_logits.detach()[moved.rows].sigmoid()
             anchors = rigidity.anchors(moved.before, labels()[moved.rows], opacities)
-            terms.append(losses.rigid * rigidity.rigidity(moved.before, moved.before + moved.offsets, anchors))
+            after = moved.before + moved.offsets
+            terms.append(losses.rigid * rigidity.rigidity(moved.before, after, anchors, losses.rigid_form))
         return sum(terms[1:], terms[0]) if terms else None
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:

@@ -1,4 +1,5 @@
-"""Rigidity of objects under a deformation: L_rigid of the paper, and the distance from a group's best rigid motion.
+"""Rigidity of objects under a deformation: L_rigid of the paper and its absolute form, and the distance from a group's
+best rigid motion.
 
 Notation: N Gaussians, C classes, class 0 the background; -1 for none.
 """
@@ -56,20 +57,23 @@ def anchors(means: Tensor, labels: Tensor, opacities: Tensor) -> Tensor:
     return torch.where(labels > 0, rows[labels.clamp(min=0)], -1)
 
 
-def rigidity(before: Tensor, after: Tensor, anchor_rows: Tensor) -> Tensor:
-    """Return the mean change of the members' distances to the representative of their object, L_rigid.
+def rigidity(before: Tensor, after: Tensor, anchor_rows: Tensor, form: str) -> Tensor:
+    """Return the mean change of the members' distances to the representative of their object.
 
     Args:
         before: Canonical centres; no gradient reaches them. [N, 3]
         after: Centres at another time. [N, 3]
         anchor_rows: Row of the representative of each Gaussian, -1 for none; representatives and Gaussians without one
             do not count. [N] int64
+        form: ``squared``, the paper's L_rigid, or ``absolute``; see `losses.rigid_form`.
 
     Returns:
-        The mean absolute change, a scalar in the unit of the centres; 0 if no Gaussian counts. Rigid motions of each
-        object cost nothing. Its gradient is finite everywhere, even if a member coincides with its representative.
+        The mean squared or absolute change, a scalar in the unit of the centres or its square; 0 if no Gaussian counts.
+        Rigid motions of each object cost nothing. Its gradient is finite everywhere, even if a member coincides with
+        its representative.
 
-    Source: R5DGS (Gridusov, Popov, Kolyubin), Eq. 8; "before" is the canonical state, which the paper leaves open.
+    Source: R5DGS (Gridusov, Popov, Kolyubin), Eq. 8, for ``squared``; "before" is the canonical state, which the paper
+        leaves open. ``absolute`` is ours.
     """
     rows = torch.arange(len(anchor_rows), device=anchor_rows.device)
     members = rows[(anchor_rows >= 0) & (anchor_rows != rows)]
@@ -77,7 +81,8 @@ def rigidity(before: Tensor, after: Tensor, anchor_rows: Tensor) -> Tensor:
         return after.sum() * 0
     centers = anchor_rows[members]
     was, now = (x.index_select(0, members) - x.index_select(0, centers) for x in (before.detach(), after))
-    return (_lengths(now) - _lengths(was)).abs().mean()
+    change = _lengths(now) - _lengths(was)
+    return (change.square() if form == "squared" else change.abs()).mean()
 
 
 def stiffness(before: Tensor, after: Tensor, quats: Tensor, log_scales: Tensor, groups: Tensor) -> Tensor:

@@ -250,6 +250,7 @@ def test_every_preset_can_be_benchmarked_and_the_method_is_the_same_in_all(tiny,
         scale = 1.0 if preset == "paper" else 0.05
         assert (identity.weight, identity.spatial) == (scale, 2 * scale), name
     assert found["r5dgs_extra"].identity.majority == 0.5 * scale
+    assert found["r5dgs_extra"].losses.rigid_form == "squared"
     for name in ("from_tracks", "tracks"):
         config = found[name]
         assert (config.init.placement, config.curriculum.start, config.curriculum.stages) == ("scene", "best", 0)
@@ -267,6 +268,12 @@ def test_user_overrides_win_over_the_exceptions_of_a_preset_for_tracks(tiny, tmp
     found = {case.variant: configs.load(None, case.overrides, "paper") for case in made}
     assert not found["tracks"].train.shading and found["tracks"].identity.training == "off"
     assert found["r5dgs"].identity.training == "joint" and found["r5dgs"].identity.weight == 0.3
+
+
+def test_the_user_can_benchmark_the_absolute_form_of_the_rigidity_loss(tiny, tmp_path):
+    plan = cases.Plan((tiny.root,), tmp_path, ("r5dgs_extra",), overrides=("losses.rigid_form=absolute",))
+    (case,) = cases.make(plan)
+    assert configs.load(None, case.overrides, None).losses.rigid_form == "absolute"
 
 
 @pytest.mark.parametrize("name", ["5dgs", "r5dgs", "r5dgs_extra"])

@@ -51,7 +51,7 @@ def test_the_last_of_two_overrides_wins_and_whole_numbers_serve_as_decimals():
     [
         ("losses.sim=0.1", "losses.sim: unknown key; did you mean 'ssim'?"),
         ("loses.ssim=0.1", r"\[loses\]: unknown section; did you mean 'losses'?"),
-        ("losses.zzzz=1", "losses.zzzz: unknown key; known are rigid, rigid_start, roughness, ssim"),
+        ("losses.zzzz=1", "losses.zzzz: unknown key; known are rigid, rigid_form, rigid_start, roughness, ssim"),
         ("train.iterations=1.5", "train.iterations: expected int, got 1.5"),
         ("train.iterations=true", "train.iterations: expected int, got True"),
         ("train.shading=1", "train.shading: expected bool, got 1"),

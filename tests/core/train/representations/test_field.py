@@ -228,6 +228,18 @@ def test_each_loss_of_the_paper_changes_the_run_that_has_it(tiny, off, still):
     assert all(not torch.equal(a[name], b[name]) for name in changed)
 
 
+def test_the_form_of_the_rigidity_loss_changes_the_run_and_is_absolute_by_default(tiny):
+    extra = ("field.variant='r5dgs_extra'", "losses.rigid_start=0", "train.iterations=50")
+    default, absolute, squared = (
+        make(tiny, *extra, *form) for form in ((), ("losses.rigid_form=absolute",), ("losses.rigid_form=squared",))
+    )
+    for _ in range(4):
+        for trainer in (default, absolute, squared):
+            trainer.step()
+    default, absolute, squared = (t.state().tensors["field.layers.0.weight"] for t in (default, absolute, squared))
+    assert torch.equal(default, absolute) and not torch.equal(absolute, squared)
+
+
 def test_variants_differ_by_one_key(tiny):
     plain, extra = (
         make(tiny, f"field.variant='{name}'", "losses.rigid_start=0", "train.iterations=50")

@@ -63,52 +63,61 @@ def test_anchors_name_the_representative_of_each_member():
         assert anchor == (-1 if label < 1 else rows[label])
 
 
-def test_rigid_motions_of_the_objects_are_free_whatever_the_background_does():
+FORMS = pytest.mark.parametrize("form", ["absolute", "squared"])
+
+
+@FORMS
+def test_rigid_motions_of_the_objects_are_free_whatever_the_background_does(form):
     means, labels, opacities = cloud()
     anchors = rigidity.anchors(means, labels, opacities)
     moved = rigid_motion(means, labels)
     assert float((moved - means).norm()) > 1
-    assert float(rigidity.rigidity(means, moved, anchors)) == pytest.approx(0, abs=1e-12)
+    assert float(rigidity.rigidity(means, moved, anchors, form)) == pytest.approx(0, abs=1e-12)
 
 
-def test_growth_costs_the_mean_change_of_distance():
+@pytest.mark.parametrize(("form", "power"), [("absolute", 1), ("squared", 2)])
+def test_growth_costs_the_mean_power_of_the_change_of_distance(form, power):
     means, labels, opacities = cloud()
     anchors = rigidity.anchors(means, labels, opacities)
     members = [i for i, a in enumerate(anchors.tolist()) if a not in (-1, i)]
     distances = [float((means[i] - means[anchors[i]]).norm()) for i in members]
     for factor in (1.25, 0.5):
-        cost = float(rigidity.rigidity(means, factor * means, anchors))
-        assert cost == pytest.approx(abs(factor - 1) * sum(distances) / len(members), rel=1e-9)
+        cost = float(rigidity.rigidity(means, factor * means, anchors, form))
+        expected = sum((abs(factor - 1) * distance) ** power for distance in distances) / len(members)
+        assert cost == pytest.approx(expected, rel=1e-9)
 
 
-def test_slopes_are_those_of_the_value_and_reach_only_the_later_state():
+@FORMS
+def test_slopes_are_those_of_the_value_and_reach_only_the_later_state(form):
     means, labels, opacities = cloud(14, classes=3)
     anchors = rigidity.anchors(means, labels, opacities)
     assert len(set(anchors.tolist())) == 3
     after = (means + 0.3 * cloud(14, seed=1)[0]).requires_grad_(True)
-    assert torch.autograd.gradcheck(lambda x: rigidity.rigidity(means, x, anchors), (after,))
+    assert torch.autograd.gradcheck(lambda x: rigidity.rigidity(means, x, anchors, form), (after,))
     before = means.clone().requires_grad_(True)
-    rigidity.rigidity(before, after, anchors).backward()
+    rigidity.rigidity(before, after, anchors, form).backward()
     assert before.grad is None and (after.grad[anchors >= 0] != 0).any() and not after.grad[anchors < 0].any()
 
 
+@FORMS
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("collapsed", ["before", "after", "both"])
-def test_members_on_their_representative_have_finite_slopes(dtype, collapsed):
+def test_members_on_their_representative_have_finite_slopes(dtype, collapsed, form):
     means, labels, opacities = cloud(12, classes=3)
     anchors = rigidity.anchors(means, labels, opacities)
     points = torch.zeros(12, 3, dtype=dtype)
     before = points if collapsed != "after" else means.to(dtype)
     after = (points if collapsed != "before" else means.to(dtype)).clone().requires_grad_(True)
-    loss = rigidity.rigidity(before, after, anchors)
+    loss = rigidity.rigidity(before, after, anchors, form)
     loss.backward()
     assert torch.isfinite(loss) and torch.isfinite(after.grad).all()
 
 
-def test_without_members_there_is_no_loss_and_no_slope():
+@FORMS
+def test_without_members_there_is_no_loss_and_no_slope(form):
     for anchors in (torch.full((5,), -1), torch.arange(5), torch.zeros(0, dtype=torch.int64)):
         after = torch.randn(len(anchors), 3, requires_grad=True)
-        loss = rigidity.rigidity(after.detach() + 1, after, anchors)
+        loss = rigidity.rigidity(after.detach() + 1, after, anchors, form)
         loss.backward()
         assert float(loss.detach()) == 0 and not after.grad.any()
 
@@ -121,11 +130,11 @@ def test_the_loss_holds_an_object_together_that_something_else_pulls_apart(weigh
     after = means.clone().requires_grad_(True)
     optimizer = torch.optim.Adam([after], lr=0.02)
     for _ in range(300):
-        loss = 0.05 * (after - target).square().mean() + weight * rigidity.rigidity(means, after, anchors)
+        loss = 0.05 * (after - target).square().mean() + weight * rigidity.rigidity(means, after, anchors, "absolute")
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    left = float(rigidity.rigidity(means, after.detach(), anchors))
+    left = float(rigidity.rigidity(means, after.detach(), anchors, "absolute"))
     assert left < 0.04 if weight else left > 0.15
 
 
