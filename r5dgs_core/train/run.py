@@ -127,8 +127,7 @@ def _train(
         trainer.restore(state)
         began -= state.seconds
     step_log.clean_up(folder / checkpoint.LOG_FILE, trainer.iteration)
-    before = step_log.cpu_seconds(folder / checkpoint.LOG_FILE)
-    began_cpu = None if before is None else began_cpu - before
+    began_cpu = step_log.processor_start(folder / checkpoint.LOG_FILE, began_cpu)
     pictures = learning_curves.Curves(run.folder)
     _plan(trainer, progress)
     _optimise(trainer, run, began, began_cpu, go_on, progress, probe, pictures)

@@ -59,8 +59,10 @@ def clean_up(path: Path, iteration: int) -> None:
         raise CheckpointError(f"{path}: cannot be written: {error}") from error
 
 
-def cpu_seconds(path: Path) -> float | None:
-    """Return the processor time in the last line of a log: 0 without lines, None if the line has none.
+def processor_start(path: Path, now: float) -> float | None:
+    """Return a reading of the processor clock minus the processor time of earlier sessions in a log.
+
+    The result is None if the last line has no processor time, as in logs of older versions.
 
     Raises:
         CheckpointError: The file cannot be read.
@@ -70,7 +72,7 @@ def cpu_seconds(path: Path) -> float | None:
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {error}") from error
     event = _parse(lines[-1]) if lines else {"cpu_seconds": 0.0}
-    return None if event is None else event.get("cpu_seconds")
+    return now - event["cpu_seconds"] if event and "cpu_seconds" in event else None
 
 
 def _parse(line: bytes) -> dict[str, Any] | None:

@@ -19,6 +19,7 @@ from r5dgs_core.error_vs_time import (
     training_task,
 )
 from r5dgs_core.error_vs_time.report_rows import Row
+from r5dgs_core.train import step_log
 
 
 def row(error=1.0, ms=1.0, kind="position", name="m", task="poses", spread=0.0, **more):
@@ -156,6 +157,13 @@ def test_a_log_without_processor_time_is_shown_as_wall_time_and_named(tmp_path):
     (only,), absent = training_task.measure(run)
     assert only.clock == "wall" and only.ms == 2e4 and math.isnan(only.ms_cpu)
     assert "wall times only" in absent[0] and "train again" in absent[0]
+
+
+def test_the_processor_time_of_a_resumed_run_goes_on_unless_the_log_has_none(tmp_path):
+    old = write_run(tmp_path / "old", {"iteration": 1, "seconds": 2.0}) / "log.jsonl"
+    new = write_run(tmp_path / "new", {"iteration": 1, "seconds": 2.0, "cpu_seconds": 1.5}) / "log.jsonl"
+    assert step_log.processor_start(tmp_path / "none", 10.0) == 10.0
+    assert step_log.processor_start(new, 10.0) == 8.5 and step_log.processor_start(old, 10.0) is None
 
 
 @pytest.mark.parametrize("kept", [False, True])
