@@ -53,7 +53,7 @@ _KEYS_BY_UNIT = {
         discovery.fewest identity.neighbours identity.samples
     """,
     "count": """
-        train.threads train.probe_views init.sweep_depths curriculum.stages residual.nodes
+        field.width train.threads train.probe_views init.sweep_depths curriculum.stages residual.nodes
     """,
     "degree": "train.sh_degree",
     "integer": "train.seed",

@@ -90,6 +90,7 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "train.representation": (lambda value: value in REPRESENTATIONS, " or ".join(REPRESENTATIONS)),
     "field.variant": (lambda value: value in VARIANTS, " or ".join(VARIANTS)),
     "field.size": (lambda value: value in FIELD_SIZES, " or ".join(FIELD_SIZES)),
+    "field.width": (lambda value: value <= 4096, "at most 4096"),
     "field.movers": (lambda value: value in MOVERS, " or ".join(MOVERS)),
     "field.gate": _SHARE,
     "field.trd_share": _SHARE,

@@ -93,6 +93,7 @@ def _short(config: Config, last: float) -> Config:
             "densify.strategy": "share",
             "densify.max_gaussians": min(cap, CAP) if cap else 0,
             "field.size": "small",
+            "field.width": 0,
             "field.horizon": max(round(last, 9), 0.0),
             "field.trd_share": 0.0,
             "field.trd_steps": 0,

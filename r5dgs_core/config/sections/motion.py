@@ -18,6 +18,7 @@ class FieldSection:
             extrapolates objects rigidly, ``r5dgs_extra`` also trains with the rigidity and majority losses.
         size: Depth and width of field and TRD: ``complex`` (8 x 256 and 10 x 256, as in the paper), ``light`` (6 x 128
             and 8 x 128) or ``small`` (4 x 128 and 5 x 64, for CPUs).
+        width: Width of the hidden layers of both networks, at the depth of ``size``. 0 takes that of ``size``.
         horizon: Last scene time of the deformation field; later observed frames train the extrapolation. 0 leaves out
             the last fifteenth of the observed span (0.70 of 0.75 in NVFi).
         step: Time that the TRD bridges in a training step: a scene time if all times lie in [0, 1], else a share of the
@@ -47,6 +48,7 @@ class FieldSection:
 
     variant: str = "r5dgs"
     size: str = "small"
+    width: int = 0
     horizon: float = 0.0
     step: float = 0.0
     warm_up: int = 0

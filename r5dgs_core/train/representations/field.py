@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -273,9 +273,13 @@ def _motion_of(times: np.ndarray, config: Config) -> Motion:
             f"got {section.horizon:g}"
         )
     generator = torch.Generator().manual_seed(config.train.seed)
+    field_shape, trd_shape = deformation.SHAPES[section.size], TRD_SHAPES[section.size]
+    if section.width:
+        field_shape = replace(field_shape, width=section.width)
+        trd_shape = replace(trd_shape, width=section.width)
     return Motion(
-        deformation.DeformationField(deformation.SHAPES[section.size], generator),
-        TRD(TRD_SHAPES[section.size], generator),
+        deformation.DeformationField(field_shape, generator),
+        TRD(trd_shape, generator),
         clock,
         first,
         min(section.horizon or first + HORIZON * (last - first), last),

@@ -240,6 +240,16 @@ def test_the_form_of_the_rigidity_loss_changes_the_run_and_is_absolute_by_defaul
     assert torch.equal(default, absolute) and not torch.equal(absolute, squared)
 
 
+@pytest.mark.parametrize("size", ["complex", "light", "small"])
+def test_the_width_replaces_that_of_all_hidden_layers_at_the_same_depth(size):
+    times = np.linspace(0, 0.75, 6)
+    usual = field._motion_of(times, tiny_datasets.settings(*FIELD, f"field.size='{size}'"))
+    other = field._motion_of(times, tiny_datasets.settings(*FIELD, f"field.size='{size}'", "field.width=48"))
+    for ours, theirs in ((other.field, usual.field), (other.trd, usual.trd)):
+        assert len(ours.layers) == len(theirs.layers)
+        assert {layer.out_features for layer in ours.layers} == {48}
+
+
 def test_variants_differ_by_one_key(tiny):
     plain, extra = (
         make(tiny, f"field.variant='{name}'", "losses.rigid_start=0", "train.iterations=50")
