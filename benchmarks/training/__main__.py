@@ -6,6 +6,7 @@
     step            time of one step
     memory          peak memory by phase
     held_out_times  quality between the observed times
+    full_length     tables of finished benchmarks of several networks and lengths
 
 Results: docs/results/training.md.
 """
