@@ -23,7 +23,7 @@ def test_turns_go_forth_and_back_over_all_calls(monkeypatch):
 def test_times_add_up_and_scale_and_one_clock_is_that_of_the_rows():
     one, two = (timing.Times(k * np.array([0.5, 1, 2, 3]), k * np.array([3.5, 4, 5, 6])) for k in (1, 2))
     columns = (one + two).scaled(0.5).columns("cpu")
-    assert columns == {"ms": 7.5, "ms_low": 6.0, "ms_high": 9.0, "ms_wall": 3.0, "ms_cpu": 7.5}
+    assert columns == {"clock": "cpu", "ms": 7.5, "ms_low": 6.0, "ms_high": 9.0, "ms_wall": 3.0, "ms_cpu": 7.5}
     assert one.columns()["ms"] == one.ms() == 2.0 and one.ms("cpu") == 5.0
 
 
