@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from . import image_task, pareto_front, pose_task
+from . import image_task, pareto_front, pose_task, run_spread
 from .pareto_front import Line
 from .report_rows import Row
 from .run_spread import Key
@@ -23,6 +24,7 @@ class Goal:
         form: Formats an error.
         loss: Formats a difference of errors.
         seconds: True if times are in seconds.
+        worst_object: True if the object with the largest error counts. A median hides one object that moves on wrongly.
     """
 
     kind: str
@@ -30,6 +32,7 @@ class Goal:
     form: Callable[[float], str]
     loss: Callable[[float], str]
     seconds: bool = False
+    worst_object: bool = False
 
 
 def _percent(value: float) -> str:
@@ -46,8 +49,8 @@ def _levels(value: float) -> str:
 
 GOALS = {
     "dynamics": Goal("position", 1e-4, _percent, _percent),
-    "poses": Goal("position", 1e-3, _percent, _percent),
-    "family": Goal("position", 1e-3, _percent, _percent),
+    "poses": Goal("position", 1e-3, _percent, _percent, worst_object=True),
+    "family": Goal("position", 1e-3, _percent, _percent, worst_object=True),
     "images": Goal("psnr", 0.3, _decibels, _decibels),
     "raster": Goal("difference", 0.5, _levels, _levels),
     "training": Goal("psnr@val", 0.3, _decibels, _decibels, seconds=True),
@@ -58,8 +61,9 @@ CLOCKS = {"wall": "wall", "cpu": "processor"}
 def of(rows: Sequence[Row], lines: Mapping[Key, Line]) -> list[dict[str, Any]]:
     """Return a recommendation for each task with timed rows of one scene.
 
-    The fastest method whose mean loss against the best is at most `Goal.slack` is recommended. Motion models that are
-    used for all objects take no part, since only the truth shows which of them is best.
+    The fastest method whose mean loss against the best is at most `Goal.slack` is recommended. Poses and families are
+    judged by the object with the largest error. Motion models that are used for all objects take no part, since only
+    the truth shows which of them is best.
 
     Args:
         rows: Rows of the scene, combined over its runs.
@@ -71,10 +75,12 @@ def of(rows: Sequence[Row], lines: Mapping[Key, Line]) -> list[dict[str, Any]]:
     """
     found = []
     for task, goal in GOALS.items():
-        usable = [r for r in rows if r.task == task and r.error_kind == goal.kind and _selectable(r)]
+        chosen = [r for r in rows if r.task == task and r.error_kind == goal.kind and _selectable(r)]
+        judged = [_judged(r, lines[task, r.mode, r.method, r.setting, r.error_kind], goal) for r in chosen]
+        own = {id(row): line for row, line in judged}
+        usable = [row for row, _ in judged if math.isfinite(row.error)]
         if not usable:
             continue
-        own = {id(r): lines[task, r.mode, r.method, r.setting, r.error_kind] for r in usable}
         sign = -1 if usable[0].kind.more_is_better else 1
         best = min(usable, key=lambda r: sign * r.error)
 
@@ -95,8 +101,15 @@ def of(rows: Sequence[Row], lines: Mapping[Key, Line]) -> list[dict[str, Any]]:
 
 
 def _selectable(row: Row) -> bool:
-    timed = math.isfinite(row.ms) and math.isfinite(row.error)
-    return timed and not (row.task == "poses" and row.setting == pose_task.ALONE)
+    return math.isfinite(row.ms) and not (row.task == "poses" and row.setting == pose_task.ALONE)
+
+
+def _judged(row: Row, line: Line, goal: Goal) -> tuple[Row, Line]:
+    """Return a combined row and its line with the errors that the goal counts."""
+    if not goal.worst_object:
+        return row, line
+    worst = {run: dataclasses.replace(r, error=r.error_worst) for run, r in line.items()}
+    return dataclasses.replace(run_spread.median(list(worst.values())), scene=row.scene), worst
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -108,6 +121,7 @@ def _text(goal: Goal, pick: Row, best: Row, loss: float, own: Mapping[int, Line]
     spread = f" ({goal.form(pick.error_min)} to {goal.form(pick.error_max)} in {pick.runs} runs)"
     text = f"{pick.task}: {_name(pick)}, {_time(goal, pick)}, {goal.form(pick.error)}"
     text += spread if pick.runs > 1 else ""
+    text += f" for the worst object ({pick.worst_name})" if goal.worst_object else ""
     if pick is best:
         return f"{text}; the best measured"
     same = not pareto_front.is_better(own[id(best)], own[id(pick)])

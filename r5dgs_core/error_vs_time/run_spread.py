@@ -41,12 +41,13 @@ def combine(runs: Sequence[Sequence[Row]], scene: str = "") -> list[Row]:
         groups.setdefault((key[0], key[-1]), {})[key] = line
     best = set().union(*(pareto_front.front(group) for group in groups.values()))
     return [
-        dataclasses.replace(_median(list(line.values())), scene=scene, pareto=key in best)
+        dataclasses.replace(median(list(line.values())), scene=scene, pareto=key in best)
         for key, line in by_key.items()
     ]
 
 
-def _median(rows: Sequence[Row]) -> Row:
+def median(rows: Sequence[Row]) -> Row:
+    """Return the medians over the runs of one row, with the worst object of all runs."""
     if len(rows) == 1:
         return rows[0]
     values: dict[str, Any] = {name: _of([getattr(row, name) for row in rows], np.median) for name in _MEDIANS}

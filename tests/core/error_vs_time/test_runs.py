@@ -123,9 +123,23 @@ def test_the_fastest_nearly_best_method_is_recommended_with_its_margin():
 
 
 def test_a_model_that_only_the_truth_can_choose_is_not_recommended():
-    alone = Row("poses", "rigid/fitted", "hinge", pose_task.ALONE, "position", 0.0, 0.1)
-    (found,) = recommend([alone, row(0.01, 1.0, name="chosen")])
+    alone = Row("poses", "rigid/fitted", "hinge", pose_task.ALONE, "position", 0.0, 0.1, error_worst=0.0)
+    (found,) = recommend([alone, row(0.01, 1.0, name="chosen", error_worst=0.01)])
     assert found["method"] == "chosen"
+
+
+@pytest.mark.parametrize("task", ["poses", "family"])
+def test_a_method_that_loses_one_object_is_not_recommended(task):
+    def run(more):
+        fast = row(0.01, 1.0, name="few", task=task, error_worst=0.5 + more, worst_name="ball")
+        return [fast, row(0.02, 9.0, name="all", task=task, error_worst=0.03 + more, worst_name="cup")]
+
+    (found,) = recommend(run(0.0), run(0.01))
+    assert (found["method"], round(found["error"], 6)) == ("all", 0.035)
+    assert (
+        "3.5 % of the size (3 % of the size to 4 % of the size in 2 runs) for the worst object (cup)" in found["text"]
+    )
+    assert "costs 47 % of the size" in found["text"]
 
 
 # Training.
