@@ -22,11 +22,13 @@ class Keys:
     Attributes:
         low: Smallest depth with a key of its own.
         high: Largest one.
+        near: Depth at which a perspective view begins.
         parallel: True for orthographic views.
     """
 
     low: float
     high: float
+    near: float
     parallel: bool
 
     @classmethod
@@ -35,13 +37,16 @@ class Keys:
         low, high = float(depths.min()), float(depths.max())
         if parallel:
             margin = (MARGIN - 1) * max(high - low, 1e-6)
-            return cls(low - margin, high + margin, True)
+            return cls(low - margin, high + margin, near, True)
         low = max(low, near)
-        return cls(low / MARGIN, max(high, low) * MARGIN, False)
+        return cls(max(low / MARGIN, near), max(high, low) * MARGIN, near, False)
 
     def hold(self, depths: np.ndarray) -> bool:
-        """Return True if no depth is beyond the far end. Nearer ones are culled or sorted last. [n]"""
-        return float(depths.max()) <= self.high and (not self.parallel or float(depths.min()) >= self.low)
+        """Return True if all visible depths have keys of their own. [n]"""
+        low = float(depths.min())
+        if not self.parallel and low < self.near:  # culled
+            low = float(depths.min(where=depths >= self.near, initial=np.inf))
+        return low >= self.low and float(depths.max()) <= self.high
 
     def __call__(self, depths: np.ndarray) -> np.ndarray:
         """Convert float32 depths, which are overwritten, to keys. [n] uint16"""
@@ -78,6 +83,7 @@ class DepthOrder:
 
     def __init__(self, positions: np.ndarray, starts: Sequence[int]):
         self._positions, self._starts = positions, starts
+        self._view: tuple[float, bool] | None = None
         self._planes: dict[int, bytes] = {}
         self._still: _Sorted | None = None
 
@@ -92,13 +98,15 @@ class DepthOrder:
         Returns:
             Rows of the Gaussians, from far to near. [n] int64
         """
+        if self._view != (near, parallel):  # keys of the other depths may be missing
+            self._view, self._planes, self._still = (near, parallel), {}, None
         now = {group: plane.tobytes() for group, plane in planes.items()}
         unmoved = frozenset(group for group, plane in now.items() if self._planes.get(group) == plane)
         self._planes = now
         moved = now.keys() - unmoved
         if not moved and self._still is not None and self._still.groups == now.keys():
             return self._still.rows
-        if self._still is None or not self._still.groups <= unmoved or self._still.keys.parallel != parallel:
+        if self._still is None or not self._still.groups <= unmoved:
             self._still = self._sort(planes, unmoved, near, parallel) if self._count(unmoved) else None
         total = self._count(now)
         if self._still is not None and self._count(self._still.groups) >= WORTHWHILE * total:
@@ -127,7 +135,7 @@ class DepthOrder:
     def _sort(self, planes: dict[int, np.ndarray], groups: frozenset[int], near: float, parallel: bool) -> _Sorted:
         depths, rows = self._depths(planes, sorted(groups))
         if not len(rows):
-            return _Sorted(groups, Keys(near, near, False), np.empty(0, np.uint16), rows)
+            return _Sorted(groups, Keys(near, near, near, False), np.empty(0, np.uint16), rows)
         conversion = Keys.of(depths, near, parallel)
         keys = conversion(depths)
         order = np.argsort(keys, kind="stable")

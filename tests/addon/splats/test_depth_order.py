@@ -71,6 +71,23 @@ def test_what_leaves_the_range_of_depths_is_sorted_too(module):
         assert_sorted(rows, depths_of(positions, starts, planes), False)
 
 
+def test_what_comes_near_is_sorted_among_itself(module):
+    positions = np.random.default_rng(3).normal(size=(200, 3)).astype(np.float32)
+    order, starts = module.DepthOrder(positions, [0, 150, 200]), [0, 150, 200]
+    for distance in (40.0, 30.0, 5.0, 4.0):
+        planes = {0: np.array([0, 0, 1.0, 40.0]), 1: np.array([0, 0, 1.0, distance])}
+        assert_sorted(order.update(planes, 0.01, False), depths_of(positions, starts, planes), False)
+
+
+@pytest.mark.parametrize("views", [((0.01, False), (0.01, True)), ((3.0, False), (0.01, False))])
+def test_another_projection_or_clip_range_is_sorted_again(module, views):
+    positions = np.random.default_rng(4).normal(size=(300, 3)).astype(np.float32) * 2
+    order, planes = module.DepthOrder(positions, [0, 300]), {0: np.array([0, 0, 1.0, 1.0])}
+    for near, parallel in views:
+        rows = order.update(planes, near, parallel)
+        assert_sorted(rows, depths_of(positions, [0, 300], planes), parallel, near)
+
+
 def test_nothing_visible_is_no_error(module):
     order = module.DepthOrder(np.zeros((3, 3), np.float32), [0, 3])
     assert len(order.update({}, 0.01, False)) == 0
