@@ -7,6 +7,7 @@
     memory          peak memory by phase
     held_out_times  quality between the observed times
     full_length     tables of finished benchmarks of several networks and lengths
+    network_playback  frame rate with the networks in the loop
 
 Results: docs/results/training.md.
 """

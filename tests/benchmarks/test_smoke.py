@@ -6,13 +6,15 @@ import sys
 
 import pytest
 
+from r5dgs_core.train import run
 from tests.support import benchmark_modules, encoder_folders, tiny_datasets
 
 pytestmark = pytest.mark.heavy
 
 ONCE = ("--threads", "1", "--repeats", "1")
 SHORT = tuple(word for text in (*tiny_datasets.SETTINGS, "identity.iterations=5") for word in ("--set", text))
-# Arguments by program; {data} and {run} are the tiny data set and a finished run on it, {encoder} a sentence model.
+# Arguments by program: {data} is the tiny data set, {run} and {field} are finished runs on it, {encoder} is a sentence
+# model.
 PROGRAMS = {
     "extrapolation.appearance": ("{data}", "--run", "{run}"),
     "association.synthetic": ("--scenes=two", "--cases=A", "--errors=0.7", "--models=drift", "--seeds=1"),
@@ -29,6 +31,7 @@ PROGRAMS = {
     "raster.error": ("--workloads", "W0", "--groups", "resolution", "--repeats", "1"),
     "raster.extreme": ("--case", "duplicates at one place"),
     "training.step": ("{data}", "--gaussians", "400", "--steps", "2", "--variants", "tracks"),
+    "training.network_playback": ("{field}", "--turns", "1"),
     "training.curve": ("{data}", "--iterations", "10", *SHORT),
     "raster.workloads": ("--workloads", "W0"),
     "words": ("--encoder", "{encoder}"),
@@ -39,6 +42,7 @@ LONG = (  # more than five seconds each
     "raster.first_frame",
     "training.curve",
     "training.held_out_times",
+    "training.network_playback",
     "words",
 )
 
@@ -55,7 +59,10 @@ def test_a_benchmark_prints_a_table_and_writes_finite_figures(name, tiny, traine
     if name == "words":
         pytest.importorskip("transformers", reason="needs transformers, which is not installed")
         encoder_folders.sentences(encoder)
-    given = [text.format(data=tiny.root, run=trained.folder, encoder=encoder) for text in PROGRAMS[name]]
+    field = tmp_path / "field"
+    if name == "training.network_playback":
+        run.train(tiny.root, field, tiny_datasets.settings("train.representation='field'", "train.iterations=40"))
+    given = [text.format(data=tiny.root, run=trained.folder, encoder=encoder, field=field) for text in PROGRAMS[name]]
     target = tmp_path / "rows.json"
     if name == "association.synthetic":
         given += ["--out", str(target.with_suffix(""))]
