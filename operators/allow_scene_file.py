@@ -31,7 +31,7 @@ class R5DGS_OT_allow_scene_file(polls.NeedsScene, bpy.types.Operator):
             preferences.trust(str(found.asked.parent))
         exact_mode.refresh()
         status_bar.redraw()
-        self.report({"INFO"}, f"{found.asked}: may be read")
+        self.report({"INFO"}, f"{found.asked}: reading allowed")
         return {"FINISHED"}
 
 

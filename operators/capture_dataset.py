@@ -37,15 +37,15 @@ class R5DGS_OT_capture_dataset(stepwise_operator.Running, bpy.types.Operator):
         name="View Transform", description="Standard is plain sRGB; empty keeps the scene's", default="Standard"
     )
     device: EnumProperty(name="Device", items=[("CPU", "CPU", ""), ("GPU", "GPU", "As set in the preferences")])
-    frame_start: IntProperty(name="First Frame", description="Frame of t = 0; the scene's if not set")
-    frame_end: IntProperty(name="Last Frame", description="Frame of t = 1; the scene's if not set")
+    frame_start: IntProperty(name="First Frame", description="Frame of t = 0; the scene's start frame if not set")
+    frame_end: IntProperty(name="Last Frame", description="Frame of t = 1; the scene's end frame if not set")
     frame_step: IntProperty(
         name="Frame Step", description="Number of frames from one captured frame to the next", default=1, min=1
     )
     t_max: FloatProperty(name="t_max", description="Last observed time", default=0.75, min=0.0, max=1.0)
     val_every: IntProperty(
         name="Val Every",
-        description="Interval of the observed times that are rendered from novel views",
+        description="Render every n-th observed time from novel views",
         default=4,
         min=1,
     )
@@ -53,10 +53,13 @@ class R5DGS_OT_capture_dataset(stepwise_operator.Running, bpy.types.Operator):
         name="Val Between", description="Render novel views half-way between observed times, too", default=True
     )
     test_every: IntProperty(
-        name="Test Every", description="Interval of the later times that are rendered", default=1, min=1
+        name="Test Every", description="Render every n-th time after the last observed one", default=1, min=1
     )
     test_views: IntProperty(
-        name="Test Views", description="Observed views in test, in addition to novel ones", default=4, min=0
+        name="Test Views",
+        description="Number of observed views in the test split, in addition to the novel ones",
+        default=4,
+        min=0,
     )
     observed: StringProperty(
         name="Observed", description="Names of observed cameras (patterns) or their collection; empty for all"

@@ -29,7 +29,10 @@ class R5DGS_OT_extrapolate_until(polls.NeedsScene, bpy.types.Operator):
         collection = loaded_scenes.active_collection(context)
         t_end = self.t_end if self.properties.is_property_set("t_end") else collection.r5dgs.t_end
         if t_end < collection.r5dgs.t_max:
-            self.report({"WARNING"}, f"Before the last observed time, {collection.r5dgs.t_max:g}: nothing extrapolated")
+            self.report(
+                {"WARNING"},
+                f"Nothing extrapolated: {t_end:g} is before the last observed time {collection.r5dgs.t_max:g}",
+            )
         try:
             written, kept = extrapolate.extrapolate_until(context, collection, t_end, self.fit_timeline)
         except errors.R5dgsError as error:
@@ -37,7 +40,7 @@ class R5DGS_OT_extrapolate_until(polls.NeedsScene, bpy.types.Operator):
             return {"CANCELLED"}
         if kept:
             names = ", ".join(anchor.name for anchor in kept)
-            self.report({"WARNING"}, f"Their later keys were edited by hand and stay: {names}; Re-Extrapolate them")
+            self.report({"WARNING"}, f"Kept later keys edited by hand: {names}; Re-Extrapolate replaces them")
         too_fast = physics.too_fast(written)
         if too_fast:
             self.report({"WARNING"}, too_fast)

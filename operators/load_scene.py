@@ -89,7 +89,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             cls.poll_message_set("Switch to Object Mode first")
             return False
         if context.scene.library is not None:
-            cls.poll_message_set("This Blender scene is linked from another file: switch to one of your own first")
+            cls.poll_message_set("This Blender scene is linked from another file: switch to a local scene first")
             return False
         return True
 

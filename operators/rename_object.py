@@ -36,7 +36,7 @@ class R5DGS_OT_rename_object(polls.OfObject, bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         if name != self.new_name.strip():
-            self.report({"WARNING"}, f"Renamed to {name}: another object has that name, or it was too long")
+            self.report({"WARNING"}, f"Renamed to {name}: the given name was taken or too long")
         return {"FINISHED"}
 
 

@@ -48,17 +48,17 @@ class R5DGS_OT_select_by_prompt(polls.Selects, bpy.types.Operator):
             return {"CANCELLED"}
         if answer.nothing:
             selection.select(context, [], self.mode)
-            self.report({"INFO"}, "No object is asked for")
+            self.report({"INFO"}, "The prompt selects no objects")
             return {"FINISHED"}
         if not answer.matches:
             self.report({"WARNING"}, prompt.explain_nothing(prompt.scope(context), text, answer))
             return {"CANCELLED"}
         missed = selection.select(context, answer.objects, self.mode)
-        said = ", ".join(f"{match.name} ({match.score:.2f})" for match in answer.matches)
+        found = ", ".join(f"{match.name} ({match.score:.2f})" for match in answer.matches)
         if missed:
-            self.report({"WARNING"}, f"{said}; hidden and therefore not selected: {', '.join(missed)}")
+            self.report({"WARNING"}, f"{found}; hidden and therefore not selected: {', '.join(missed)}")
         else:
-            self.report({"INFO"}, ". ".join([said, *answer.notes]))
+            self.report({"INFO"}, ". ".join([found, *answer.notes]))
         return {"FINISHED"}
 
 

@@ -34,7 +34,7 @@ class R5DGS_OT_simplify_keys(bpy.types.Operator):
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{plural.of(before, 'key')} became {after:,}")
+        self.report({"INFO"}, f"Reduced {plural.of(before, 'key')} to {after:,}")
         return {"FINISHED"}
 
 

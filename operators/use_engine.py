@@ -5,7 +5,7 @@ import bpy
 from ..r5dgs_addon.color import display_to_linear, inverse_loss
 from ..r5dgs_addon.engine import engine
 
-REMEDY = "'Show Colors as Trained' in the render properties sets Standard, which shows all"
+REMEDY = "'Show Colors as Trained' in the render properties sets the view transform to Standard, which shows all colors"
 
 
 class R5DGS_OT_use_engine(bpy.types.Operator):

@@ -17,7 +17,9 @@ class R5DGS_OT_view_as_trained(polls.NeedsScene, bpy.types.Operator):
         if loaded_scenes.is_own(collection) and collection.r5dgs.display != viewport_display.SPLATS:
             viewport_display.show(collection, viewport_display.SPLATS)
         if loaded_scenes.VIEW not in collection:
-            self.report({"WARNING"}, f"{collection.r5dgs.scene_name}: no captured camera is known; load the file again")
+            self.report(
+                {"WARNING"}, f"{collection.r5dgs.scene_name}: no captured camera is stored; load the file again"
+            )
         elif not first_view.show(context, collection) and not bpy.app.background:
             self.report({"WARNING"}, "Every 3D view looks through a camera or is locked")
         return {"FINISHED"}

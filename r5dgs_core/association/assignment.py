@@ -12,10 +12,10 @@ from scipy import optimize
 
 from . import leave_one_out, segment_stack
 
-PASSES = 3  # most rounds of `refine`
-STAY = 1.5  # factor by which the score of a segment's previous object is multiplied
-LOWEST = 0.3  # smallest score, relative to the object's usual IoU
-PART = 0.6  # smallest share of a part inside its object, relative to the usual share
+PASSES = 3  # maximum number of passes of `refine`
+STAY = 1.5  # factor on the score of a segment's previous object
+LOWEST = 0.3  # minimum score, relative to the object's usual IoU
+PART = 0.6  # minimum share of a part inside its object, relative to the usual share
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Assignment:
 
     Attributes:
         labels: Object of each segment, 0 = background, -1 = none. [S]
-        scores: Leave-one-out IoU with the object, relative to its usual IoU, averaged with that of the segment's run,
-            and with a bonus for keeping the object; 0 without an object. [S]
+        scores: Leave-one-out IoU with the object, relative to its usual IoU, averaged with the mean over its tracklet,
+            times a bonus for the previous object; 0 without an object. [S]
         plain: Scores without the average over the tracklet and without the bonus. [S]
         margins: Score divided by the sum of it and the next best object's score; 0.5 is a tie. [S]
         agreement: Mean leave-one-out IoU per object pixel; the measure for comparing assignments.
@@ -44,7 +44,7 @@ def refine(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, cou
     """Repeat `assign` until the labels are stable, at most `PASSES` times.
 
     Args:
-        runs: Run of each segment, -1 for background. [S]
+        runs: Tracklet of each segment, -1 for background. [S]
         labels: Initial objects. [S]
         count: Number of objects.
     """
@@ -58,7 +58,7 @@ def refine(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, cou
 
 
 def assign(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, count: int) -> Assignment:
-    """Assign each segment to an object by the votes of ``labels``; arguments as in `refine`."""
+    """Reassign each segment by the votes of segments with the given labels; arguments as in `refine`."""
     found = list(leave_one_out.overlaps(stack, labels, count))
     ious = np.concatenate([overlap.ious for overlap in found])
     shares = np.concatenate([overlap.shares for overlap in found])
@@ -70,7 +70,7 @@ def assign(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, cou
         mine = ious[own[labels[own] == k], k]
         usual[k] = (mine.sum() + 2 * usual[0]) / (len(mine) + 2)
     plain = ious / np.maximum(usual, 1e-6)
-    # The lower the usual IoU, the more the mean over the run counts.
+    # A lower usual IoU gives more weight to the mean over the tracklet.
     scores = usual[0] * plain + (1 - usual[0]) * _run_means(plain, runs, stack.pixels)
     scores[own, labels[own]] *= STAY
     scores[:, 0] = 0.0
@@ -131,7 +131,7 @@ def _joint_iou(overlap: leave_one_out.Overlaps, rows: np.ndarray, k: int) -> flo
 
 
 def _run_means(scores: np.ndarray, runs: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Mean over the segments of each run, weighted by their sizes. [S, K + 1]"""
+    """Mean over the segments of each tracklet, weighted by their sizes. [S, K + 1]"""
     out = np.zeros_like(scores)
     rows = np.flatnonzero(runs >= 0)
     if len(rows):

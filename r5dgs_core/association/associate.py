@@ -1,9 +1,9 @@
 """Association of the segments of all images to objects: identities that survive tracking errors.
 
 Geometry and motion are trained first, so each segment is a weighted bag of Gaussians, and overlaps of bags replace the
-tracker's guesses: between views, between times and across gaps. Runs of segments on which tracker and geometry agree
-(`tracklets`) are joined to objects (`clustering`). Each image's segments are then assigned to objects by the votes of
-the other images (`assignment`). Incoming ids count as much as they prove to be reliable.
+tracker's guesses: between views, between times and across gaps. Tracklets, on which tracker and geometry agree
+(`tracklets`), are joined to objects (`clustering`). Each image's segments are then assigned to objects by the votes of
+the other images (`assignment`). Incoming ids are weighted by their measured reliability.
 
 If the result explains the images no better than the incoming ids, all incoming ids are kept. Single segments with weak
 evidence also keep theirs, translated to the new numbering.
@@ -24,14 +24,14 @@ from scipy import optimize, sparse
 from ..data import masks
 from . import assignment, clustering, leave_one_out, segment_stack, supergaussians, tracklets
 
-GAIN = 0.5  # smallest mean gain per changed pixel, relative to the usual IoU,
-FEW = 4  # doubled at this number of images, as little evidence agrees with a wrong result by chance
-SHOWN = 0.03  # smallest share of the images that show an object, bounded to 2 to 4 images
-MOST = 60_000  # Gaussians; above it, neighbours are first grouped to patches
-CERTAIN = 0.25  # smallest share of object pixels assigned with certainty; below it, all incoming ids are kept
-DOUBTFUL = 0.55  # smallest margin of a certain assignment, see `assignment.Assignment.margins`
+GAIN = 0.5  # minimum mean gain per changed pixel, relative to the usual IoU, for many images
+FEW = 4  # number of images at which the minimum gain is doubled, because little evidence can agree by chance
+SHOWN = 0.03  # minimum share of the images that show an object, clamped to 2 to 4 images
+MOST = 60_000  # number of Gaussians above which neighbours are first grouped into patches
+CERTAIN = 0.25  # minimum share of object pixels assigned with certainty; below it, all incoming ids are kept
+DOUBTFUL = 0.55  # minimum margin of a certain assignment, see `assignment.Assignment.margins`
 
-_NOBODY = -2  # temporary id of segments that get no name
+_NOBODY = -2  # temporary id of segments without an object
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Row:
         usual_id: Outgoing id of most pixels with the same incoming id in the same view.
         pixels: Size.
         score: Leave-one-out IoU with the object, relative to the usual IoU; 0 without an object.
-        done: ``kept`` for the usual id, also if there is too little evidence; ``relabelled`` if an id switch was
-            corrected; ``unknown`` if there is no id.
+        done: ``kept``: usual id, confirmed or for lack of evidence; ``relabelled``: corrected id switch; ``unknown``:
+            no id.
     """
 
     image: int
@@ -107,7 +107,7 @@ def associate(
         neighbours: Nearest Gaussians of each Gaussian; if None, Gaussians above ``most`` are dropped at random instead
             of being grouped. [N, k]
         paths: Positions of the Gaussians at some times; Gaussians that move apart are not grouped. [N, T, 3]
-        most: Number of Gaussians above which neighbours are first grouped to patches.
+        most: Number of Gaussians above which neighbours are first grouped into patches.
     """
     if not images:
         raise ValueError("expected at least one image")
@@ -138,8 +138,7 @@ def _objects(stack: segment_stack.Stack, runs: np.ndarray) -> tuple[np.ndarray, 
     """Initial objects [S], 0 = background, -1 = none, and their number K."""
     of_runs = clustering.cluster(clustering.gather(stack, runs))
     labels = np.where(runs >= 0, of_runs[runs] + 1, 0)
-    # Repeat with lower weights for Gaussians that show several objects, because errors of the geometry placed them off
-    # their object.
+    # Repeat with lower weights for Gaussians that several objects share, because they are misplaced.
     cast = sparse.csc_matrix(leave_one_out.cast(stack, labels, int(labels.max())))
     total = np.asarray(cast.sum(axis=1)).ravel()
     best = sparse.csr_matrix(cast[:, 1:].max(axis=1)).toarray().ravel()

@@ -1,11 +1,11 @@
-"""Clustering of runs into objects: greedy agglomeration, best pairs first, except runs seen side by side in an image.
+"""Clustering of tracklets into objects: greedy agglomeration, best pairs first, except pairs seen side by side.
 
 The overlap of two views of one object depends on the accuracy of the geometry and on the commonly visible part, so a
-fixed threshold fails. The usual IoU between two views is measured first, from runs that are mutual best matches; all
-thresholds are relative to it. Incoming ids are weighted the same way: by how often runs of one object share an id,
-compared with other runs.
+fixed threshold fails. The usual IoU between two views is measured first, from tracklets that are mutual best matches;
+all thresholds are relative to it. Incoming ids are weighted by the frequency at which tracklets of one object share an
+id, compared with other tracklets.
 
-Notation: T runs, I images, V views.
+Notation: T tracklets, I images, V views.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from scipy import sparse
 
 from . import segment_stack
 
-SAME = 0.3  # smallest affinity to join two groups, relative to the usual IoU
-SIDE_BY_SIDE = 0.08  # largest share of the shorter group's images in which both may appear separately
-PRIOR = 5.0  # weight, in tracklet pairs, of the usual IoU over all views when the usual IoU of two views is estimated
-PART = 0.6  # smallest share of a part inside a larger group, relative to the usual share of a group in itself
+SAME = 0.3  # minimum affinity to join two groups, relative to the usual IoU
+SIDE_BY_SIDE = 0.08  # maximum share of the shorter group's images in which both may appear separately
+PRIOR = 5.0  # weight of the usual IoU over all views in the estimate for two views, in tracklet pairs
+PART = 0.6  # minimum share of a part inside a larger group, relative to the usual share of a group in itself
 HINT = 4.0  # largest factor on the affinity for equal ids, and largest divisor for different ids
-THIN = 0.1  # share of the smaller run's pixels below which common evidence is weak
+THIN = 0.1  # share of the smaller tracklet's pixels below which common evidence is weak
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Overlap of runs, summed over the pairs of their images.
+    """Overlap of tracklets, summed over the pairs of their images.
 
     Attributes:
-        common: Weight of Gaussians in both runs. [T, T]
+        common: Weight of Gaussians in both tracklets. [T, T]
         seen: Weight of the row's tracklet that is visible in the images of the column's tracklet. [T, T]
         together: Number of images that show both. [T, T]
-        lengths: Number of images of each run. [T]
-        pixels: Mean segment size of each run. [T]
-        views: View of each run. [T]
-        ids: Incoming id of each run. [T]
+        lengths: Number of images of each tracklet. [T]
+        pixels: Mean segment size of each tracklet. [T]
+        views: View of each tracklet. [T]
+        ids: Incoming id of each tracklet. [T]
     """
 
     common: np.ndarray
@@ -49,12 +49,12 @@ class Evidence:
 
     @property
     def union(self) -> np.ndarray:
-        """Weight in either run that is visible in the other's images. [T, T]"""
+        """Weight in either tracklet that is visible in the other's images. [T, T]"""
         return self.seen + self.seen.T - self.common
 
 
 def gather(stack: segment_stack.Stack, runs: np.ndarray) -> Evidence:
-    """Sum the overlaps of segments over their runs."""
+    """Sum the overlaps of segments over their tracklets."""
     rows = np.flatnonzero(runs >= 0)
     count = int(runs.max(initial=-1)) + 1
     member = sparse.csr_matrix((np.ones(len(rows), np.float32), (runs[rows], rows)), (count, len(runs)))
@@ -76,10 +76,10 @@ def gather(stack: segment_stack.Stack, runs: np.ndarray) -> Evidence:
 
 
 def cluster(evidence: Evidence) -> np.ndarray:
-    """Join runs to objects.
+    """Join tracklets to objects.
 
     Returns:
-        Object of each run, numbered by descending total number of pixels. [T]
+        Object of each tracklet, numbered by descending total number of pixels. [T]
     """
     count = len(evidence.lengths)
     if not count:
@@ -97,15 +97,15 @@ def cluster(evidence: Evidence) -> np.ndarray:
 
 
 def _mutual(evidence: Evidence) -> np.ndarray:
-    """Mask of run pairs that are mutual best matches in each other's view. [T, T] bool"""
+    """Mask of tracklet pairs that are mutual best matches in each other's view. [T, T] bool"""
     ious = np.where(evidence.together > 0, 0.0, evidence.common / np.maximum(evidence.union, 1e-9))
     views, at = np.unique(evidence.views, return_inverse=True)
-    best = np.stack([ious[:, at == v].max(axis=1) for v in range(len(views))], axis=1)  # of each run in each view
+    best = np.stack([ious[:, at == v].max(axis=1) for v in range(len(views))], axis=1)  # of each tracklet in each view
     return (ious > 0) & (ious >= best[:, at]) & (ious >= best[:, at].T)
 
 
 def _usual(evidence: Evidence, mutual: np.ndarray) -> np.ndarray:
-    """Usual IoU of runs of one object between the views of any two runs. [T, T]"""
+    """Usual IoU of tracklets of one object between the views of any two tracklets. [T, T]"""
     views, at = np.unique(evidence.views, return_inverse=True)
     rows, columns = np.nonzero(mutual)
     if not len(rows):

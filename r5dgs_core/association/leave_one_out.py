@@ -16,7 +16,7 @@ from scipy import sparse
 
 from . import segment_stack
 
-LEAST = 1e-3  # smallest weight of a voting Gaussian in other images, pixels
+LEAST = 1e-3  # minimum weight of a voting Gaussian in other images, pixels
 
 
 @dataclass(frozen=True)

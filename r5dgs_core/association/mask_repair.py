@@ -23,7 +23,7 @@ from ..scene.scene import Scene
 from . import associate, mending, render_segments, render_votes
 
 NEIGHBOURS = 8
-TIMES = 16  # most times at which positions of the Gaussians are compared
+TIMES = 16  # maximum number of times at which positions of the Gaussians are compared
 BACKEND = "associate"  # name in masks.json
 SEGMENTS, SUMMARY = "segments.csv", "association.json"
 
@@ -89,8 +89,8 @@ def repair(
     incoming = tuple(mask for view in views if (mask := datasets.load_mask(view)) is not None)
     if not any(((mask > 0) & (mask != masks.UNKNOWN)).any() for mask in incoming):
         raise errors.DatasetError(
-            f"{dataset.mask_folder}: expected objects in the masks, found background and unknown pixels alone; are "
-            "they the right ones? Name others with --masks"
+            f"{dataset.mask_folder}: expected objects in the masks, found only background and unknown pixels; "
+            "name other masks with --masks"
         )
     progress({"event": "draw", "done": 0, "total": len(views)})
     images = render_segments.draw(

@@ -1,7 +1,7 @@
 """Pixel repair beyond relabelling: objects that the tracker missed or merged with others.
 
 The votes of the other images are rendered into the image. Outlines stay, except for objects that the votes show but
-that have no segment: these gain pixels of the one segment, or background, that contains most of them.
+that have no segment: these take pixels from the segment or background that contains most of them.
 
 Notation: H, W pixels, K objects, N Gaussians.
 """
@@ -15,9 +15,9 @@ import numpy as np
 from ..data import masks
 from . import associate, leave_one_out, segment_stack
 
-TRUSTED = 0.3  # smallest usual IoU of segments and votes; below it, outlines of votes are too inaccurate
-WITHIN = 0.5  # smallest share of an object's voted pixels inside the segment that it takes pixels from
-LEAST = 0.1  # smallest number of voted pixels, relative to the object's usual segment size
+TRUSTED = 0.3  # minimum usual IoU of segments and votes; below it, outlines of votes are too inaccurate
+WITHIN = 0.5  # minimum share of an object's voted pixels inside the segment that loses pixels to it
+LEAST = 0.1  # minimum number of voted pixels, relative to the object's usual segment size
 
 
 def shares(

@@ -15,7 +15,7 @@ from ..render import scene_renderer, segment_weights
 from ..scene.scene import Scene
 from . import segment_stack
 
-LEAST = 0.02  # smallest weight of a Gaussian in a segment's bag, pixels
+LEAST = 0.02  # minimum weight of a Gaussian in a segment's bag, pixels
 
 
 def draw(

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-APART = 0.1  # largest change of the distance of two neighbours in a patch, as a share of their travel
-ROUNDS = 12  # most rounds of seeding
+APART = 0.1  # maximum change of the distance of two neighbours in a patch, as a share of their travel
+ROUNDS = 12  # maximum number of seeding rounds
 
 
 def group(count: int, neighbours: np.ndarray | None, paths: np.ndarray | None, most: int) -> np.ndarray:

@@ -1,9 +1,9 @@
-"""Runs of segments (tracklets) on which tracker and geometry agree.
+"""Tracklets: sequences of segments on which tracker and geometry agree.
 
 Within a view, an incoming id is followed from image to image as long as the Gaussians agree. Otherwise a new tracklet
 begins. An id switch therefore splits a tracklet, but never mixes two objects.
 
-Notation: S segments, T runs (tracklets), I images.
+Notation: S segments, T tracklets, I images.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import numpy as np
 
 from . import segment_stack
 
-FAINTEST = 0.02  # smallest IoU of consecutive segments of a run
+FAINTEST = 0.02  # minimum IoU of consecutive segments of a tracklet
 
 
 def link(stack: segment_stack.Stack) -> np.ndarray:
-    """Number the runs.
+    """Assign segments to tracklets.
 
     A segment continues the last segment with its id in its view if both are mutual best matches among the objects of
     the two images. The id may be missing in images between them.
 
     Returns:
-        Run of each segment, -1 for background. [S]
+        Tracklet of each segment, -1 for background. [S]
     """
     runs = np.full(len(stack.ids), -1)
     count = 0

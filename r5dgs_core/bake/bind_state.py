@@ -27,7 +27,7 @@ _COLUMNS = ("means", "quats", "sh", "shading", "rest")  # of `Cloud`
 
 
 def bind(observed: Observed, context: Context) -> Bound:
-    """Bring the Gaussians of a checkpoint to the bind state."""
+    """Transform the Gaussians of a checkpoint to the bind state."""
     cloud, motion, norm, wanted = observed.cloud, observed.motion, context.norm, context.wanted
     names = {int(i): context.dataset.object_names.get(int(i), f"object {i}") for i in context.tensors["object_ids"]}
     means, quats, sh, shading, rest = (getattr(cloud, name).copy() for name in _COLUMNS)

@@ -43,7 +43,7 @@ class Context:
 
     @property
     def wanted(self) -> NeedsSection:
-        """The user's overrides of the needs table."""
+        """User's overrides of the needs table."""
         return self.run.config.needs
 
     @property
@@ -131,8 +131,8 @@ class Need:
     Attributes:
         name: Feature of the scene.
         value: Measured value.
-        threshold: Value from which the scene needs the feature.
-        on: True if the scene has the feature.
+        threshold: Minimum value at which the scene needs the feature.
+        on: True if the scene gets the feature.
         reason: Meaning of the value.
         learned: True if the run has learned the feature.
     """
@@ -170,7 +170,7 @@ class Draft:
 
     Attributes:
         scene: The scene so far.
-        observed: What was read from the checkpoint.
+        observed: Content of the checkpoint.
         bound: The same in the bind state.
         order: Training row of each row of the scene. [N]
         bent: The row "residuals" of the needs table; `point_motion` measures it.

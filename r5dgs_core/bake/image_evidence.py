@@ -40,14 +40,15 @@ STEP = 0.02  # change of the poses for finite differences of the images, rad or 
 
 @dataclass(frozen=True)
 class Support:
-    """Statistics of how the images change if a group's motion is simplified.
+    """Statistics of the change of the images by a simplification of a group's motion.
 
     Attributes:
         sigmas: Distance of the simpler motion from the best fit to the images, in standard deviations; negative if it
             fits better than the trained motion.
         clusters: Number of independent parts in the estimate of the deviation.
         level: Root mean square change of the pixels that show the group, colours in [0, 1].
-        shape: Share of shape and texture in the change of the images; the rest is colours that turn with the group.
+        shape: Share of shape and texture in the change of the images; the rest is due to colours that turn with the
+            group.
     """
 
     sigmas: float

@@ -35,7 +35,7 @@ def _turn(poses: np.ndarray) -> float:
 
 
 def apply(draft: Draft, context: Context) -> Draft:
-    """Write the needs table, drop shading that is not needed, and add the identities if they are."""
+    """Write the needs table, drop unneeded shading, and add the identities if they are needed."""
     cloud, scene = draft.bound.cloud, draft.scene
     table = decide(
         scene.groups,
@@ -114,17 +114,17 @@ def decide(
         Need("sky_gradient", sky_bases, 2, sky, "spherical harmonics bases of the sky", sky),
         Need("classifier", len(bodies), 1, classified, "objects with masks", classified),
         residuals,
-        Need("regrouping", moved_over, 1, moved_over > 0, _said(moves), moved_over > 0),
+        Need("regrouping", moved_over, 1, moved_over > 0, _summary(moves), moved_over > 0),
     )
     return tuple(need.overridden(getattr(wanted, need.name)) for need in rows)
 
 
-def _said(moves: Moves | None) -> str:
+def _summary(moves: Moves | None) -> str:
     """Summary of the regrouping, for the reason of its row."""
     if moves is None:
-        return "each Gaussian goes with the group that it was made for"
-    said = (
+        return "each Gaussian moves with its initial group"
+    text = (
         f"of {moves.moving} Gaussians that move, {moves.to_bodies} went to another body, {moves.to_shadows} to a "
         f"shadow, {moves.to_rest} to rest"
     )
-    return said + (f"; {moves.resting_shadows} shadows rest" if moves.resting_shadows else "")
+    return text + (f"; {moves.resting_shadows} shadows rest" if moves.resting_shadows else "")

@@ -1,7 +1,7 @@
 """Motion of single Gaussians as stored in a scene: residuals relative to the rigid motion of their groups.
 
 Notation: R Gaussians with states x_s at the knots s, last knot T. Their group moves the bind state x_T to Q_s (x_T - p)
-+ p + D_s. A residual is the change of the bind state that the group's motion takes to x_s.
++ p + D_s. A residual is the change of the bind state that the group's motion maps to x_s.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from ..train.observed_motion import PointMotion
 from ..train.representations import registry
 from .draft import Context, Draft, Need
 
-AT_ONCE = 8192  # Gaussians per block; bounds memory
-VISIBLE = 1e-4  # smallest residual that is stored: offset / scene size, angle in rad, or change of log scale
+BLOCK = 8192  # Gaussians per block, which bounds memory
+VISIBLE = 1e-4  # minimum residual to store: offset / scene size, angle in rad, or change of log scale
 
 
 def apply(draft: Draft, context: Context) -> Draft:
-    """Add the motion of single Gaussians to the scene, and measure if it is needed."""
+    """Add the motion of single Gaussians to the scene, with the measurement of its need."""
     scene, bound, points = draft.scene, draft.bound, draft.observed.motion.points
     bends, own = None, None
     if points is not None and context.wanted.tracks != "off":
@@ -75,7 +75,7 @@ def members(
         )
     rank = np.argsort(order)[points.rows]
     parts = []
-    for chosen in np.array_split(np.argsort(rank), max(1, -(-len(rank) // AT_ONCE))):  # in the scene's order
+    for chosen in np.array_split(np.argsort(rank), max(1, -(-len(rank) // BLOCK))):  # in the scene's order
         ids = motion_ids[points.rows[chosen]]
         offsets, turns, growths = _relative(points, chosen, norm, track_poses[ids], pivots[ids])
         seen = np.abs(offsets).max((1, 2), initial=0.0) > VISIBLE * extent

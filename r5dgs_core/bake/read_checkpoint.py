@@ -31,7 +31,7 @@ def open_context(run: checkpoint.Run, dataset: Dataset | None) -> Context:
 
 
 def observe(context: Context) -> Observed:
-    """Return the Gaussians and the observed motion of a checkpoint, without what the user switched off."""
+    """Return the Gaussians and the observed motion of a checkpoint, without the features that the user disabled."""
     tensors, wanted, norm = context.tensors, context.wanted, context.norm
     state, config = context.state, context.config
     g = {n.removeprefix("gaussians."): t.numpy() for n, t in tensors.items() if n.startswith("gaussians.")}

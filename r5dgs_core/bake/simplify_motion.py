@@ -1,18 +1,17 @@
-"""Simplification of the motion of a scene's bodies: turns, paths and bends that are noise are dropped.
+"""Simplification of the motion of a scene's bodies: rotations, paths and bends that are noise are dropped.
 
-The motion of a body has two parts, its turn and its path. The turn may be dropped, and the path may be replaced by a
-fixed place or by a straight line. Each of these is done if and only if
+The motion of a body has two parts, rotation and path. The rotation may be dropped, and the path may be replaced by a
+fixed place or a straight line. Each simplification is applied if and only if
 
 - the poses do not change by more than their noise: the training images do not distinguish the simpler motion from the
-  trained one (`image_evidence`), by an F test at `LEVEL`; or the body's pixels change by less than 8 bits show; or a
-  turn serves colours rather than shape (`SHAPE`); and
+  trained one (`image_evidence`), by an F test at `LEVEL`; or the pixels of the body change by less than half a level of
+  8 bits; or a rotation mainly changes colours, not shape (`SHAPE`); and
 - all simplifications of the scene together lower the PSNR of the training views by at most `LOSS`.
 
-A part that only the colours of the images need, such as a turn by which shading imitates a shadow, is kept in the
-observed time, but the motion past t_max is fitted without it.
+A part that only improves colours, such as a rotation by which shading imitates a shadow, is kept in the observed time,
+but the motion past t_max is fitted without it.
 
-Notation: G groups, S poses. Until `bind_state.rebind`, poses are relative to the bind state that the scene was given
-with.
+Notation: G groups, S poses. Until `bind_state.rebind`, poses are relative to the bind state of the given scene.
 """
 
 from __future__ import annotations
@@ -36,9 +35,9 @@ from . import bind_state, falling_bodies, image_evidence, needs, track_checks
 from .draft import Context, Draft, Need
 from .image_evidence import ImageEvidence
 
-LEVEL = 0.01  # significance level: probability that noise is taken for motion
-LOSS = 0.03  # largest loss of PSNR on the training views by all simplifications together, dB
-SHAPE = 0.5  # share of shape in a turn's effect on the images, below which the turn serves colours (passing shadows)
+LEVEL = 0.01  # significance level: probability of taking noise for motion
+LOSS = 0.03  # maximum loss of PSNR on the training views by all simplifications together, dB
+SHAPE = 0.5  # share of shape in a rotation's effect on the images, below which it only fits colours (passing shadows)
 CLEARLY = 3.0  # change / allowed change above which one view per cluster decides
 LARGEST = 0.05  # spread (rad or diameters) above which motion is kept without comparing images
 
@@ -53,9 +52,9 @@ class _Part:
             place) or "curved_path" (its path is straight).
         poses: Simplified poses of the body. [S, 7]
         spread: Root mean square per component of the dropped motion, rad or world units.
-        value: The same, rad or diameters.
-        change: The same in units of its noise.
-        allowed: Largest change that counts as noise.
+        value: Spread in rad or diameters.
+        change: Spread in units of its noise.
+        allowed: Maximum change that counts as noise.
         why: Basis of the noise estimate, in words.
         kept: True if the user keeps the part.
         seen: True if the noise was measured in the images.
@@ -102,7 +101,7 @@ def apply(draft: Draft, context: Context) -> Draft:
 def simplify(
     scene: Scene, observed: np.ndarray, evidence: ImageEvidence | None, wanted: NeedsSection | None = None
 ) -> Simplified:
-    """Drop turns, paths and bends that are noise, and fit the motion past t_max.
+    """Drop rotations, paths and bends that are noise, and fit the motion past t_max.
 
     Args:
         scene: The scene with trained poses and static models that hold the groups' radii.
@@ -128,9 +127,9 @@ def simplify(
         if np.any(future[:, 1:] != 0):
             track_checks.warn_of_aliasing(names[g.object_id], scene.tracks.times, future)
             fits[g.id] = _fit(bound, g.id, observed[g.id], future, mine)
-        said = _said(fits[g.id][1] if g.id in fits else None)
+        description = _describe(fits[g.id][1] if g.id in fits else None)
         travel = float(np.linalg.norm(bound.tracks.poses[g.id, :, 4:], axis=1).max()) / (2 * g.model.radius)
-        found = [_row(part, part in dropped, losses.get(id(part)), said, travel) for part in mine]
+        found = [_row(part, part in dropped, losses.get(id(part)), description, travel) for part in mine]
         rows += [{"object": names[g.object_id], **row} for row in found]
     shared = falling_bodies.share_gravity(fits, scene.world_convention)
     models = {index: fit.model for index, fit in shared.items()}
@@ -147,7 +146,7 @@ def simplify(
 def _parts(
     scene: Scene, group: int, observed: np.ndarray, evidence: ImageEvidence | None, wanted: NeedsSection
 ) -> list[_Part]:
-    """Return the candidate simplifications of a body: of its turn, and of its path to a place or else a line."""
+    """Return the candidate simplifications of a body: of its rotation, and of its path to a place or else a line."""
     poses, weights = scene.tracks.poses[group], observed.astype(np.float64)
     weights = weights if weights.any() else np.ones(len(poses))
     mean = rotations.normalize(weights @ rotations.make_continuous(poses[:, :4]))
@@ -198,11 +197,11 @@ def _judged(
             allowed = float(np.sqrt(stats.f.ppf(1 - LEVEL, free, max(support.clusters - 1, 1))))
             if change > CLEARLY * allowed:
                 break
-        why = f"{change:.2g} times its noise, of which {allowed:.2g} may be"
+        why = f"{change:.2g} times its noise, at most {allowed:.2g} is noise"
         if support.level <= needs.SHADING_LEVEL:
             allowed, why = max(allowed, change), f"the images do not show it ({255 * support.level:.2g} levels of 255)"
         elif support.shape < SHAPE:
-            allowed, why = max(allowed, change), f"it serves colours (shape is {support.shape:.0%} of its effect)"
+            allowed, why = max(allowed, change), f"it only fits colours (shape is {support.shape:.0%} of its effect)"
     return _Part(group, name, poses, spread, spread / unit, float(change), allowed, why, kept, seen)
 
 
@@ -251,7 +250,7 @@ def _followed(scene: Scene, poses: np.ndarray) -> np.ndarray:
 
 
 def _future(poses: np.ndarray, parts: Sequence[_Part]) -> np.ndarray:
-    """Return the poses for the fit past t_max: without noise, even if the images need it, relative to t_max. [S, 7]"""
+    """Return the poses for the fit past t_max: relative to t_max, without noise even if the images need it. [S, 7]"""
     result = poses.copy()
     for part in parts:
         if part.noise and part.name == "rotation":
@@ -286,32 +285,32 @@ def _fit(
     return track, fit
 
 
-def _said(fit: model_selection.Fit | None) -> str:
+def _describe(fit: model_selection.Fit | None) -> str:
     """Description of a body's motion past t_max."""
     if fit is None:
         return "static"
-    said = f"came to rest, {fit.chosen}" if fit.rested else fit.chosen
+    text = f"came to rest, {fit.chosen}" if fit.rested else fit.chosen
     more = fit.history.text()
-    return f"{said}; {more}" if more else said
+    return f"{text}; {more}" if more else text
 
 
 _SPREADS = {
-    "rotation": "spread of its turns, rad",
+    "rotation": "spread of its rotations, rad",
     "motion": "spread of its places, diameters",
     "curved_path": "distance from a straight path, diameters",
 }
 
 
-def _row(part: _Part, dropped: bool, loss: float | None, said: str, travel: float) -> dict[str, Any]:
-    """Row of the needs table for a part; its threshold is the largest spread that counts as noise."""
+def _row(part: _Part, dropped: bool, loss: float | None, future: str, travel: float) -> dict[str, Any]:
+    """Row of the needs table for a part; its threshold is the maximum spread that counts as noise."""
     threshold = part.value * part.allowed / part.change if part.change > 0 else LARGEST
     why = part.why
     if loss is not None:
         why += f"; without it the training views lose {loss:.3f} dB"
-        why += "" if dropped else f", more than is left of {LOSS:g}; it ends at t_max"
+        why += "" if dropped else f", more than the remaining share of {LOSS:g} dB; it ends at t_max"
     if part.kept:
         why = f"set on by the user; {why}"
     text = f"{_SPREADS[part.name]}: {why}"
     if part.name == "motion":
-        text += f"; goes {travel:.3g} diameters; past t_max: {said}"
+        text += f"; goes {travel:.3g} diameters; past t_max: {future}"
     return Need(part.name, part.value, threshold, not dropped, text).row()

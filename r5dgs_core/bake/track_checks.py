@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 
 def sound(group: GroupTrack, name: str) -> GroupTrack:
-    """Return the group; if its track is not finite, warn and return it at rest.
+    """Return the group, or log a warning and return it at rest if its track is not finite.
 
     Args:
         group: A motion group.

@@ -97,7 +97,7 @@ def run_case(plan: Plan, case: Case, remeasure: bool, progress: Progress) -> lis
         "trained_on": measured.get("trained_on"),
         "train": cases.cost(record["sittings"]),
     }
-    shared["machine"] = None  # for measurements of earlier versions, which did not record the machine
+    shared["machine"] = None  # default for records of earlier versions, which lack the machine
     return [{**shared, "mode": mode, **measured["modes"][mode]} for mode in plan.modes if mode in measured["modes"]]
 
 
@@ -113,7 +113,7 @@ def _train(plan: Plan, case: Case, progress: Progress) -> None:
         arguments += ["--config", str(plan.config_path)] if plan.config_path else []
         arguments += [text for override in case.overrides for text in ("--set", override)]
     before = record["sittings"]
-    # Write a session of unknown cost first, so that a kill is recorded.
+    # Write a record of unknown cost first, so that a killed session is recorded.
     cases.write_record(case, {"sittings": [*before, {"status": None}]})
     log_path = case.beside(".log")
 

@@ -14,8 +14,8 @@ from ..playback import scene_player
 from ..render import scene_renderer
 from ..scene.scene import Scene
 
-LEAST_FRAMES = 60  # per mode, unless time runs out
-PATIENCE_S = 20.0  # time limit per mode, seconds
+LEAST_FRAMES = 60  # per mode, unless the time limit is reached
+TIME_LIMIT_S = 20.0  # per mode
 
 
 def measure(
@@ -46,8 +46,8 @@ def measure(
             _draw(player, view, backend)
     began = time.monotonic()
     for taken in itertools.count():
-        patient = time.monotonic() - began < PATIENCE_S * len(modes)
-        if taken * len(ordered) >= LEAST_FRAMES or (taken and not patient):
+        in_time = time.monotonic() - began < TIME_LIMIT_S * len(modes)
+        if taken * len(ordered) >= LEAST_FRAMES or (taken and not in_time):
             break
         for mode, found in times.items():
             found += [_draw(players[mode], view, backend) for view in ordered]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-# The system's peak size of a forked process includes its parent's, so the child reports its own.
+# The operating system's peak size of a forked process includes its parent's, so the child reports its own.
 _CHILD = """
 import sys
 from r5dgs_core.cli import main as cli
@@ -21,7 +21,7 @@ from r5dgs_core.bench import process
 try:
     status = cli.main(sys.argv[1:])
 finally:
-    process.tell_peak()
+    process.print_peak()
 sys.exit(status)
 """
 STOPPED = 130
@@ -56,8 +56,8 @@ def train(
 ) -> Sitting:
     """Run ``r5dgs ARGUMENTS --progress json`` in a separate process and wait for it.
 
-    On an exception, such as KeyboardInterrupt, the process is asked to save its state and end; the exception is raised
-    again afterwards.
+    On an exception, such as KeyboardInterrupt, the process gets SIGTERM, saves its state and ends; the exception is
+    then raised again.
 
     Args:
         arguments: Arguments of the command line.
@@ -98,7 +98,7 @@ def train(
     return sitting
 
 
-def tell_peak() -> None:
+def print_peak() -> None:
     """Print the peak memory of this process as an event."""
     event: dict[str, Any] = {"event": "peak", "peak_mb": _peak_mb(), "peak_gpu_mb": None}
     torch = sys.modules.get("torch")

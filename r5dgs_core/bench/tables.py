@@ -1,8 +1,7 @@
 """Tables of a benchmark, as in the paper: for the terminal, as Markdown, and as rows for other programs.
 
-Notation: a record is one case in one mode (docs/user/bench.md). A table row summarises the seeds of one scene, variant
-    and
-mode by their mean and, if there are several, half of their range behind a plus-minus sign.
+Notation: a record is one case in one mode (docs/user/bench.md). A table row shows the mean over the seeds of one scene,
+variant and mode and, if there are several seeds, plus or minus half their range.
 """
 
 from __future__ import annotations
@@ -228,7 +227,7 @@ def paper_row(variant: str, mode: str, variants: Iterable[str]) -> str:
 
 def _where(records: Sequence[Record]) -> str:
     """Describe the machine of the timings, or the properties that differ between records."""
-    found = {key: sorted({_said(record["machine"], key) for record in records}) for key in _MACHINE}
+    found = {key: sorted({_format(record["machine"], key) for record in records}) for key in _MACHINE}
     differ = [f"{_MACHINE[key]} {' / '.join(said)}" for key, said in found.items() if len(said) > 1]
     if differ:
         return f"not all measured alike, see tables.md: {', '.join(differ)}"
@@ -245,7 +244,7 @@ def _machines(records: Sequence[Record]) -> list[str]:
     for task, where in (("trained", "trained_on"), ("measured", "machine")):
         ran: dict[str, dict[str, None]] = {}
         for record in records:
-            text = ", ".join(f"{word} {_said(record[where], key)}" for key, word in _MACHINE.items())
+            text = ", ".join(f"{word} {_format(record[where], key)}" for key, word in _MACHINE.items())
             mode = f" {record['mode']}" if where == "machine" else ""
             who = f"{record['scene']} {record['variant']}{mode} seed {record['seed']}"
             ran.setdefault(text if record[where] else UNKNOWN, {})[who] = None
@@ -257,7 +256,7 @@ def _machines(records: Sequence[Record]) -> list[str]:
     return lines
 
 
-def _said(machine: dict[str, Any] | None, key: str) -> str:
+def _format(machine: dict[str, Any] | None, key: str) -> str:
     """Format a property of a machine."""
     value = (machine or {}).get(key, UNKNOWN)
     if isinstance(value, dict):

@@ -37,7 +37,7 @@ CODES: dict[str, Code] = {
     "D43": Code(WARNING, "all training images of one time", "give times, unless the scene is static"),
     "D44": Code(WARNING, "no frame has a time", "give each frame its 'time', unless they are evenly spaced"),
     "D45": Code(WARNING, "times of a camera not in order", "check that images and times belong together"),
-    "D46": Code(WARNING, "camera looks away from what the others see", "use camera to world, y up, looking along -z"),
+    "D46": Code(WARNING, "camera looks away from the scene", "use camera to world, y up, looking along -z"),
     "D47": Code(WARNING, "few views", "add cameras, or move the camera around the scene"),
     "D48": Code(WARNING, "masks for some training images only", "make the missing masks with 'r5dgs masks'"),
     "D49": Code(WARNING, "id in masks without a name in objects.json", "name it, or correct the masks"),

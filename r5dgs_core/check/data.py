@@ -18,7 +18,7 @@ from .codes import CODES
 
 FEWEST_CAMERAS, FEWEST_IMAGES = 3, 3
 LEAST_SPACE = 1 << 30  # bytes
-_PARALLEL = 1e-6  # smallest eigenvalue per camera below which all optical axes are parallel
+_PARALLEL = 1e-6  # minimum eigenvalue per camera; below it, all optical axes are parallel
 _LISTED = 5  # names per finding
 _OF_ALL_TRAINING_IMAGES = {"D41", "D42", "D43", "D47"}
 
@@ -83,7 +83,7 @@ def _check_splits(found: Dataset, collect: Collector) -> None:
 def _check_times(found: Dataset, collect: Collector) -> None:
     first, last = float(found.times[0]), found.t_max
     if first == last:
-        collect.add("D43", f"{found.root}: all training images are of the time {first:g}")
+        collect.add("D43", f"{found.root}: all training images have the time {first:g}")
     for view in found.val:
         if not first <= view.t <= last:
             collect.add("D41", f"{view.image_path}: time {view.t:g}, expected {first:g} to {last:g}")

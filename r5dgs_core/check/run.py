@@ -75,4 +75,4 @@ def _check_data(run: Run, collect: Collector) -> None:
         collect.add("R10", f"{root}: the data set of the run has faults, which are listed too")
         return
     if found.digest != run.digest:
-        collect.add("R11", f"{root}: expected the data set that the run was trained on, found another state of it")
+        collect.add("R11", f"{root}: expected the data set that the run was trained on, but the data have changed")

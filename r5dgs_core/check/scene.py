@@ -16,9 +16,9 @@ from .codes import CODES
 
 LAST_FRAME = 1_048_574  # Blender's last frame
 _AHEAD = 1 / 3  # extrapolated share of the observed span; Blender's default in the add-on
-_SEEN = 1 / 255  # lowest opacity that is drawn
+_SEEN = 1 / 255  # minimum opacity that is drawn
 _FEW_SEEN = 0.05  # share of visible Gaussians below which S16 is reported
-_MOST_STEPS = 1 << 16  # integration steps per motion
+_MOST_STEPS = 1 << 16  # maximum number of integration steps per motion
 
 
 def check(path: Path) -> list[Finding]:

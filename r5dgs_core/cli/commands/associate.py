@@ -12,7 +12,7 @@ from .. import inputs, options
 if TYPE_CHECKING:
     from ...association.mask_repair import Repair
 
-SHOWN = 12  # largest number of changes to print
+SHOWN = 12  # maximum number of changes to print
 
 
 NAME = "associate"
@@ -97,11 +97,11 @@ def run_associate(
         if progress_kind == "json":
             progress({"event": "associated", "path": str(folder), **summary})
     if progress_kind != "json":
-        _tell(done, summary, folder, dataset.root)
+        _print_summary(done, summary, folder, dataset.root)
     return folder
 
 
-def _tell(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> None:
+def _print_summary(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> None:
     """Print a summary of the changes and the next step."""
     from ...association import mask_repair
 
@@ -114,21 +114,21 @@ def _tell(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> No
     if summary["mended"]:
         print(f"in {summary['mended']} images, objects without a segment were filled in from the other images")
     print(
-        f"segments agree with what other images show of their objects to {summary['agreement']:.2f} (IoU); "
-        f"with the incoming ids to {summary['agreement_before']:.2f}"
+        f"mean IoU of segments with their objects in other images: {summary['agreement']:.2f}; "
+        f"with the incoming ids: {summary['agreement_before']:.2f}"
     )
     if summary["fallback"]:
-        print("the incoming ids stay: the evidence is too weak, or new ids would not agree better")
+        print("the incoming ids are kept: the evidence is too weak, or new ids would not agree better")
     changed = mask_repair.switches(done)
     for row in changed[:SHOWN]:
-        said = "unknown here" if row.done == "unknown" else f"object {row.new_id} here"
+        new = "unknown here" if row.done == "unknown" else f"object {row.new_id} here"
         usual = f", mostly object {row.usual_id} in its video" if row.usual_id > 0 else ""
         figures = f"{row.pixels} pixels, score {row.score:.2f}"
-        print(f"  {done.views[row.image].name}: id {row.old_id} is {said}{usual} ({figures})")
+        print(f"  {done.views[row.image].name}: id {row.old_id} is {new}{usual} ({figures})")
     if len(changed) > SHOWN:
         print(f"  and {len(changed) - SHOWN} more in {folder / mask_repair.SEGMENTS}")
     print(f"written: {folder}")
     if done.numbering == "scene":
         print(f"Next: r5dgs train {root} --masks {folder} --out RUN")
     else:
-        print("ids are valid within single videos only and cannot be trained with: try a longer run, or more images")
+        print("the ids are valid only within single videos, so training cannot use them: train longer, or add images")

@@ -125,5 +125,5 @@ def _read_words(path: Path) -> list[str]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError) as error:
-        raise errors.ConfigError(f"--words {path}: expected text that can be read: {error}") from error
+        raise errors.ConfigError(f"--words {path}: cannot be read as text: {error}") from error
     return [line.strip() for line in lines if line.strip()]

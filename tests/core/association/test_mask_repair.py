@@ -159,7 +159,7 @@ def test_ids_of_videos_that_stay_are_not_called_those_of_the_scene(trained, tiny
     monkeypatch.setattr(associate, "GAIN", 1e9)
     out = cli_associate.run_associate(trained.folder, masks=tmp_path / "videos", out=tmp_path / "out")
     said = capsys.readouterr().out
-    assert "the incoming ids stay" in said and "within single videos" in said and "r5dgs train" not in said
+    assert "the incoming ids are kept" in said and "within single videos" in said and "r5dgs train" not in said
     assert mask_notes.read(out).videos == videos
     with pytest.raises(errors.DatasetError, match="are valid per video only"):
         datasets.read(tiny.root, str(out)).require_one_numbering()
@@ -213,5 +213,5 @@ def test_a_stop_leaves_no_masks_of_two_numberings(trained, tiny, switched, tmp_p
 @pytest.mark.parametrize("value", [0, masks.UNKNOWN])
 def test_masks_without_any_object_are_an_error(baked, tiny, tmp_path, value):
     rewrite(tiny.root, tmp_path / "masks", lambda view, ids: np.full_like(ids, value))
-    with pytest.raises(errors.DatasetError, match="expected objects in the masks, found background and unknown"):
+    with pytest.raises(errors.DatasetError, match="expected objects in the masks, found only background and unknown"):
         mask_repair.repair(baked, datasets.read(tiny.root, str(tmp_path / "masks")))

@@ -110,7 +110,7 @@ def test_a_turn_that_carries_a_shadow_is_kept_while_it_is_seen_and_not_foretold(
     carrier = truth.with_arrays(track_poses=poses, shading=vectors, light_direction=light)
     scene, rows = simplified(carrier, data, shown=carrier)
     row = rows["rotation"]
-    assert row["decision"] == "on" and "serves colours" in row["reason"] and "dB" in row["reason"]
+    assert row["decision"] == "on" and "only fits colours" in row["reason"] and "dB" in row["reason"]
     np.testing.assert_allclose(scene.tracks.poses[BRICK], poses[BRICK], atol=1e-12)
     later = scene_player.group_poses(scene, 2 * truth.t_max)
     assert scene.groups[BRICK].model.kind == "static"
