@@ -91,8 +91,8 @@ def _plan(anchor: bpy.types.Object, t_end: float | None, most: int) -> Plan:
     tails, too_fast = {}, False
     if times.t_end > times.t_max:
         allowed, reach = physics.key_error(anchor)
-        sample = _sampler(anchor, location, quat, times, most)
-        future = keyframes.few(sample, times.t_max, times, allowed, reach, most)
+        sample, model = _sampler(anchor, location, quat, times, most)
+        future = keyframes.few(sample, times.t_max, times, allowed, reach, most, model)
         too_fast = not future.followed
         tails = {
             "location": fcurves.frames(future.location, times),
@@ -129,8 +129,10 @@ def times_of(anchor: bpy.types.Object, t_end: float | None = None) -> timeline.T
 
 def _sampler(
     anchor: bpy.types.Object, location: np.ndarray, quat: np.ndarray, times: timeline.Times, most: int
-) -> reduction.Sampler:
-    """Sampler of the poses past t_max, continuing the pose at t_max. Quaternions keep its norm, as keys may have any.
+) -> tuple[reduction.Sampler, models.MotionModel]:
+    """Sampler of the poses past t_max, continuing the pose at t_max, and its model.
+
+    Quaternions keep the norm of that pose, as keys may have any.
 
     Raises:
         ConfigError: The motion is invalid, or would take minutes to integrate.
@@ -159,7 +161,7 @@ def _sampler(
             slopes,
         )
 
-    return sample
+    return sample, model
 
 
 def extrapolate_until(

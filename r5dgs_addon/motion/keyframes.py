@@ -11,7 +11,7 @@ import math
 import bpy
 import numpy as np
 
-from ...r5dgs_core.motion import cubic_curves, rotations
+from ...r5dgs_core.motion import cubic_curves, models, rotations
 from ...r5dgs_core.motion import key_reduction as reduction
 from ...r5dgs_core.motion.cubic_curves import Curves, Keys
 from ...r5dgs_core.playback import scene_player
@@ -81,8 +81,8 @@ def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float
     if times.t_end <= scene.t_max:
         return observed
     most = share(len(scene.groups))
-    sample = _future(scene, motion_id, most)
-    return cubic_curves.join(observed, few(sample, scene.t_max, times, allowed, reach, most))
+    sample, model = _future(scene, motion_id, most)
+    return cubic_curves.join(observed, few(sample, scene.t_max, times, allowed, reach, most, model))
 
 
 def share(objects: int) -> int:
@@ -91,7 +91,13 @@ def share(objects: int) -> int:
 
 
 def few(
-    sample: reduction.Sampler, start: float, times: timeline.Times, allowed: float, reach: float, most: int
+    sample: reduction.Sampler,
+    start: float,
+    times: timeline.Times,
+    allowed: float,
+    reach: float,
+    most: int,
+    model: models.MotionModel,
 ) -> Curves:
     """Reduced keys from a scene time to the end.
 
@@ -102,10 +108,12 @@ def few(
         allowed: Maximum error of reduced keys at the members, world units.
         reach: Largest distance of a member from the pivot, world units.
         most: Maximum number of intervals between keys, from `share`.
+        model: Motion behind the samples since ``start``, whose kinks become keys.
     """
+    kinks = start + models.kinks(model, times.t_end - start)
     frames = reduction.FrameTimes(times.time(0.0), 1 / times.frames_per_unit)
     nearest = NEAREST / times.frames_per_unit
-    return reduction.reduce(sample, start, times.t_end, allowed, reach, nearest=nearest, frames=frames, most=most)
+    return reduction.reduce(sample, start, times.t_end, allowed, reach, kinks.tolist(), nearest, frames, most)
 
 
 def reaches(scene: Scene) -> np.ndarray:
@@ -177,12 +185,13 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
     return False
 
 
-def _future(scene: Scene, motion_id: int, most: int) -> reduction.Sampler:
-    """Sampler past t_max: the group's own model, or the leader's as in `scene_player.group_poses`."""
+def _future(scene: Scene, motion_id: int, most: int) -> tuple[reduction.Sampler, models.MotionModel]:
+    """Sampler past t_max and its model: the group's own, or the leader's as in `scene_player.group_poses`."""
     group = scene.groups[motion_id]
     if group.follows is None or group.follow_matrix is None:
-        return reduction.model_sampler(group.model, scene.t_max, most)
-    leader = reduction.model_sampler(scene.groups[group.follows].model, scene.t_max, most)
+        return reduction.model_sampler(group.model, scene.t_max, most), group.model
+    model = scene.groups[group.follows].model
+    leader = reduction.model_sampler(model, scene.t_max, most)
     follow = np.asarray(group.follow_matrix, np.float64)
 
     def sample(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -190,7 +199,7 @@ def _future(scene: Scene, motion_id: int, most: int) -> reduction.Sampler:
         quats = rotations.identity(len(at))
         return quats, displacements @ follow.T, np.zeros_like(quats), velocities @ follow.T
 
-    return sample
+    return sample, model
 
 
 def _cubic(keys: Keys, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

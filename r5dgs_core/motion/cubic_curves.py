@@ -114,19 +114,17 @@ def join(first: Curves, second: Curves) -> Curves:
     """
 
     def chain(a: Keys, b: Keys, flip: float) -> Keys:
-        if len(a.times) == 1 and a.times[0] < b.times[0]:
-            if len(b.times) == 1:
+        if a.times[-1] < b.times[0]:  # a ends with a rest, which is one key
+            if len(a.times) == len(b.times) == 1:
                 return a
-            still = np.zeros_like(a.values[[0, 0]])
-            a = Keys(np.array([a.times[0], b.times[0]]), a.values[[0, 0]], still, still)
-        values, left, right = b.values * flip, b.left_slopes * flip, b.right_slopes * flip
-        if a.times[-1] != b.times[0]:
-            return Keys(
-                np.concatenate([a.times, b.times]),
-                np.concatenate([a.values, values]),
-                np.concatenate([a.left_slopes, left]),
-                np.concatenate([a.right_slopes, right]),
+            still = np.zeros_like(a.values[:1])
+            a = Keys(
+                np.append(a.times, b.times[0]),
+                np.concatenate([a.values, a.values[-1:]]),
+                np.concatenate([a.left_slopes, still]),
+                np.concatenate([a.right_slopes, still]),
             )
+        values, left, right = b.values * flip, b.left_slopes * flip, b.right_slopes * flip
         return Keys(
             np.concatenate([a.times, b.times[1:]]),
             np.concatenate([a.values, values[1:]]),

@@ -5,6 +5,7 @@ Location and rotation have their own key times.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -16,8 +17,11 @@ from . import cubic_curves, models, rotations
 
 MAX_STEP_RAD = math.radians(120.0)
 MAX_FRAME_TURN_RAD = math.radians(160.0)  # per frame; near half a turn, frames no longer show the direction
-FEWEST_INTERVALS = 64  # first grid between two forced times
+FEWEST_INTERVALS = 64  # first grid between two kinks
 MOST_INTERVALS = 1 << 15
+FEWEST_KINKS = 16  # lowest limit of the number of kinks
+_BESIDE = 1e-7  # distance from a kink at which its slopes are sampled, as a fraction of the time between two kinks
+_REST = 1e-3  # largest change of a curve that rests, as a fraction of the tolerance
 _FINER = 4  # checking grid points per candidate key time
 _PER_FRAME = 4  # candidate key times
 _STEPS_PER_SAMPLE, _STEPS_PER_INTERVAL = 4, 16  # integration steps
@@ -56,7 +60,7 @@ def reduce(
     t1: float,
     tolerance: float,
     radius: float,
-    forced_times: Sequence[float] = (),
+    kinks: Sequence[float] = (),
     nearest: float = 0.0,
     frames: FrameTimes | None = None,
     most: int = MOST_INTERVALS,
@@ -68,12 +72,13 @@ def reduce(
 
     Args:
         sample: Function of times [S] that gives quaternions [S, 4], displacements [S, 3] and their slopes per unit of
-            time [S, 4], [S, 3]. It should be smooth between t0 and t1; at a kink, reduce both sides and `join` them.
+            time [S, 4], [S, 3]. It should be smooth between t0 and t1, except at the kinks.
         t0: First time.
         t1: Last time, > t0.
         tolerance: Largest allowed position error of any point, world units, > 0.
         radius: Largest distance of a point from the pivot, world units.
-        forced_times: Times inside (t0, t1) that always get a key.
+        kinks: Increasing times at which slopes jump. Those inside (t0, t1) get a key with the slopes of both sides, but
+            not those within ``nearest`` of the previous one, and no more than one per `FEWEST_INTERVALS` of ``most``.
         nearest: Least time between candidate keys, for editors that merge closer keys.
         frames: Frames of the editor. A curve that four keys per frame do not reproduce gets one key per frame; so does
             a rotation of more than `MAX_FRAME_TURN_RAD` per frame.
@@ -94,51 +99,69 @@ def reduce(
             f"tolerance, radius, nearest, most: expected > 0, >= 0, >= 0 and >= {FEWEST_INTERVALS}, got {tolerance}, "
             f"{radius}, {nearest} and {most}"
         )
-    bounds = [t0, *sorted({float(t) for t in forced_times if t0 < t < t1}), t1]
-    curves, followed, intervals = _sampled(sample, bounds, tolerance, radius, nearest, frames, most)
-    possible = np.arange(0, len(curves[0].times), _FINER)
-    every_frame = None if all(followed) or frames is None else _at_frames(sample, t0, t1, frames, nearest, most)
+    bounds, most_kinks = [t0], max(FEWEST_KINKS, most // FEWEST_INTERVALS)
+    for kink in kinks:
+        if bounds[-1] + nearest < kink < t1 - nearest and len(bounds) <= most_kinks:
+            bounds.append(float(kink))
+    rest = tolerance if len(bounds) == 1 else _REST * tolerance
+    limits = _Limits(tolerance, radius, rest, nearest, frames, most)
+    pieces = [
+        _smooth(_between(sample, a, b, a > t0, b < t1), a, b, limits) for a, b in itertools.pairwise([*bounds, t1])
+    ]
+    return functools.reduce(cubic_curves.join, pieces)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Arguments of `reduce`; ``rest`` is the largest error of a curve of one key."""
+
+    tolerance: float
+    radius: float
+    rest: float
+    nearest: float
+    frames: FrameTimes | None
+    most: int
+
+
+def _between(sample: Sampler, start: float, stop: float, after_kink: bool, before_kink: bool) -> Sampler:
+    """Sampler between two times, with one-sided slopes at kinks."""
+    beside = _BESIDE * (stop - start)
+    low, high = start + after_kink * beside, stop - before_kink * beside
+    return (lambda times: sample(np.clip(times, low, high))) if after_kink or before_kink else sample
+
+
+def _smooth(sample: Sampler, t0: float, t1: float, limits: _Limits) -> cubic_curves.Curves:
+    """`reduce` between two kinks."""
+    curves, followed = _sampled(sample, t0, t1, limits)
+    every_frame = None
+    if limits.frames is not None and not all(followed):
+        every_frame = _at_frames(sample, t0, t1, limits.frames, limits.nearest, limits.most)
     keys = [
-        framed if framed is not None and not holds else curve.greedy(possible, possible[::intervals])
+        framed if framed is not None and not holds else curve.greedy(np.arange(0, len(curve.times), _FINER))
         for curve, holds, framed in zip(curves, followed, every_frame or (None, None), strict=True)
     ]
     return cubic_curves.Curves(keys[0], keys[1], all(followed))
 
 
-def _sampled(
-    sample: Sampler,
-    bounds: Sequence[float],
-    tolerance: float,
-    radius: float,
-    nearest: float,
-    frames: FrameTimes | None,
-    most: int,
-) -> tuple[tuple[_Curve, _Curve], tuple[bool, bool], int]:
+def _sampled(sample: Sampler, t0: float, t1: float, limits: _Limits) -> tuple[tuple[_Curve, _Curve], tuple[bool, bool]]:
     """Sample on ever finer grids until single intervals are within the tolerance, or the limits of `reduce` are met.
 
-    Args:
-        bounds: First time, forced times and last time.
-
     Returns:
-        Location and rotation; for each, True if single intervals follow it; number of intervals between two bounds.
+        Location and rotation; for each, True if single intervals follow it.
     """
-    t0, t1 = bounds[0], bounds[-1]
-    shortest = min(b - a for a, b in itertools.pairwise(bounds))
-    intervals = min(FEWEST_INTERVALS, max(1, int(shortest / nearest))) if nearest > 0 else FEWEST_INTERVALS
-    limit = most
+    nearest, frames, limit = limits.nearest, limits.frames, limits.most
+    intervals = min(FEWEST_INTERVALS, max(1, int((t1 - t0) / nearest))) if nearest > 0 else FEWEST_INTERVALS
     if frames is not None:
         limit = int(min(limit, max(FEWEST_INTERVALS, _PER_FRAME * (t1 - t0) / frames.duration)))
     while True:
-        grid = np.concatenate(
-            [np.linspace(a, b, intervals * _FINER + 1)[:-1] for a, b in itertools.pairwise(bounds)] + [np.array([t1])]
-        )
-        location, rotation = _Curve.pair(sample(grid), grid, tolerance, radius)
+        grid = np.linspace(t0, t1, intervals * _FINER + 1)
+        location, rotation = _Curve.pair(sample(grid), grid, limits)
         possible = np.arange(0, len(grid), _FINER)
         too_fast = frames is not None and rotation.turn(min(frames.duration, t1 - t0)) > MAX_FRAME_TURN_RAD
         followed = location.holds_steps(possible), not too_fast and rotation.holds_steps(possible)
         settled = followed[0] and (followed[1] or too_fast)
-        if settled or 2 * intervals > limit or shortest < 2 * intervals * nearest:
-            return (location, rotation), followed, intervals
+        if settled or 2 * intervals > limit or t1 - t0 < 2 * intervals * nearest:
+            return (location, rotation), followed
         intervals *= 2
 
 
@@ -162,25 +185,21 @@ def _at_frames(
 class _Curve:
     """Samples of one curve on the checking grid, with its tolerance."""
 
-    def __init__(
-        self, times: np.ndarray, values: np.ndarray, slopes: np.ndarray, tolerance: float, radius: float | None
-    ):
-        self.times, self.values, self.slopes = times, values, slopes
-        self.tolerance, self.radius = tolerance, radius
-        self.constant = bool((self.error(self.values[:1], self.values) <= tolerance).all())
+    def __init__(self, times: np.ndarray, values: np.ndarray, slopes: np.ndarray, radius: float | None):
+        self.times, self.values, self.slopes, self.radius = times, values, slopes, radius
+        self.tolerance, self.constant = 0.0, False
+        self.change = float(self.error(self.values[:1], self.values).max())
 
     @staticmethod
-    def pair(samples: Samples, times: np.ndarray, tolerance: float, radius: float) -> tuple[_Curve, _Curve]:
+    def pair(samples: Samples, times: np.ndarray, limits: _Limits) -> tuple[_Curve, _Curve]:
         """Location and rotation curves. Each gets half the tolerance, or all of it if the other is constant."""
         quats, displacements, quat_slopes, displacement_slopes = (np.asarray(x, np.float64) for x in samples)
         signs = np.where((rotations.make_continuous(quats) * quats).sum(-1) < 0, -1.0, 1.0)[:, None]
-        arguments = (
-            (displacements, displacement_slopes, None),
-            (quats * signs, quat_slopes * signs, radius),
-        )
-        still = [_Curve(times, v, s, 1e-3 * tolerance, r).constant for v, s, r in arguments]
-        shares = [tolerance if other else 0.5 * tolerance for other in still[::-1]]
-        location, rotation = (_Curve(times, v, s, x, r) for (v, s, r), x in zip(arguments, shares, strict=True))
+        location = _Curve(times, displacements, displacement_slopes, None)
+        rotation = _Curve(times, quats * signs, quat_slopes * signs, limits.radius)
+        for curve, other in ((location, rotation), (rotation, location)):
+            curve.tolerance = (1.0 if other.change <= _REST * limits.tolerance else 0.5) * limits.tolerance
+            curve.constant = curve.change <= min(curve.tolerance, limits.rest)
         return location, rotation
 
     def error(self, values: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -209,15 +228,14 @@ class _Curve:
             good &= (self.values[start] * self.values[stop]).sum(-1) >= math.cos(0.5 * MAX_STEP_RAD)
         return good
 
-    def greedy(self, possible: np.ndarray, forced: np.ndarray) -> cubic_curves.Keys:
+    def greedy(self, possible: np.ndarray) -> cubic_curves.Keys:
         """Greedy keys: each is as far as possible from the previous one, found by galloping and bisection.
 
         If no interval is within the tolerance, the next key is one candidate step away.
         """
         chosen = [0]
         if not self.constant:
-            for start, stop in itertools.pairwise((forced // _FINER).tolist()):
-                chosen.extend(possible[self._walk(start, stop)].tolist())
+            chosen.extend(possible[self._walk(0, len(possible) - 1)].tolist())
         rows = np.array(chosen)
         slopes = np.zeros_like(self.slopes[rows]) if self.constant else self.slopes[rows]
         return cubic_curves.Keys(self.times[rows], self.values[rows].copy(), slopes.copy(), slopes.copy())

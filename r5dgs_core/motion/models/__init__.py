@@ -3,7 +3,7 @@
 import importlib
 
 from .base import BLOCKS, Block, MotionKind, Rates, clocks
-from .evaluation import Stack, curve, evaluate, evaluate_all, evaluate_with_rates, steps_needed
+from .evaluation import Stack, curve, evaluate, evaluate_all, evaluate_with_rates, kinks, steps_needed
 from .motion_model import EXTRA_RATES, KINDS, RATES, SCALARS, VECTORS, MotionModel
 
 # Each kind is the module of its name. Append new ones: .blend files store the position in Blender's menu.
@@ -41,5 +41,6 @@ __all__ = [
     "evaluate",
     "evaluate_all",
     "evaluate_with_rates",
+    "kinks",
     "steps_needed",
 ]

@@ -228,6 +228,10 @@ class MotionKind:
         """Kinds of the events in the window and their times, each [..., 1], from values of free blocks."""
         return []
 
+    def kinks(self, model: MotionModel, end: float) -> np.ndarray:
+        """Times since t_max, in (0, end], at which the velocity or the acceleration jumps, increasing. [K]"""
+        return np.zeros(0)
+
     def steps_needed(self, model: MotionModel, tau: np.ndarray) -> np.ndarray:
         """Number of integration steps for each pose. [S] -> [S]"""
         return np.ones(len(tau), np.int64)

@@ -121,6 +121,19 @@ class Bounce(MotionKind):
         numbers = range(int(first) + 1, int(min(last, first + 50)) + 1)
         return [("impact", parts["bounce"] + _start(np.array(float(k)), speed, gravity, rho)) for k in numbers]
 
+    def kinks(self, model: MotionModel, end: float) -> np.ndarray:
+        """Impacts, and the time from which the body rests on the floor."""
+        g, up = _gravity(model.acceleration)
+        rho, down = model.restitution, -float((model.velocity + model.acceleration * model.bounce_time) @ up)
+        if not (g > 0 and down >= 0):
+            return np.zeros(0)
+        numbers = np.arange(_RESTING)
+        since = _start(numbers, np.array(rho * down), g, np.array(rho))[rho**numbers > _LOW * (1 - rho)]
+        if rho < 1:
+            since = np.append(since, 2 * rho * down / g * (1 / (1 - rho) - _LOW))
+        times = np.unique(model.bounce_time + since)
+        return times[(times > 0) & (times <= end)]
+
     def moves(self, model: MotionModel) -> bool:
         return bool(model.velocity.any() or model.acceleration.any() or model.angular_velocity.any())
 
@@ -129,6 +142,7 @@ class Bounce(MotionKind):
 
 
 _RESTING = 1000.0  # number of bounces after which a body rests on the floor
+_LOW = 1e-3  # share of the speed after the first bounce, times 1 - rho, below which a body rests
 
 
 def _gravity(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -168,15 +182,15 @@ def _flight(since: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray
         number = np.where(
             steady, np.floor(flights), np.floor(np.log(np.maximum(rest, _LEAST)) / np.log(np.maximum(rho, _LEAST)))
         )
-    number = np.where((rest <= 1e-3 * (1 - rho)) | (first <= _LEAST) & (since >= 0), _RESTING, number)
+    number = np.where((rest <= _LOW * (1 - rho)) | (first <= _LEAST) & (since >= 0), _RESTING, number)
     number = np.clip(number, -60.0, _RESTING)
-    return number, np.where(number < _RESTING, _start(np.minimum(number, 400.0), speed, g, rho), 0.0)
+    return number, np.where(number < _RESTING, _start(number, speed, g, rho), 0.0)
 
 
 def _heights(since: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Height over the floor and its rate at a time since bounce 0, after which the body flies up at ``speed``."""
     number, start = _flight(since, speed, g, rho)
-    rising = speed * rho ** np.minimum(number, 400.0)
+    rising = speed * rho**number
     y = since - start
     resting = number >= _RESTING
     return np.where(resting, 0.0, rising * y - 0.5 * g * y**2), np.where(resting, 0.0, rising - g * y)

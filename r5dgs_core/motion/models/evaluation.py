@@ -138,6 +138,11 @@ def curve(model: MotionModel, tau: float | np.ndarray, most_steps: int | None = 
     return KINDS[model.kind].curve(model, np.asarray(tau, np.float64), most_steps)
 
 
+def kinks(model: MotionModel, end: float) -> np.ndarray:
+    """Times since t_max, in (0, end], at which the velocity or the acceleration jumps, increasing. [K]"""
+    return KINDS[model.kind].kinks(model, end)
+
+
 def steps_needed(model: MotionModel, tau: np.ndarray) -> np.ndarray:
     """Number of integration steps for each pose; 1 for kinds with a closed form. [S] -> [S]"""
     return KINDS[model.kind].steps_needed(model, tau)

@@ -74,6 +74,9 @@ class Friction(MotionKind):
         stop = window.first + np.exp(np.clip(parts["log_stop"], -4.0, 4.0))
         return [("stop", stop)] if stop.reshape(-1)[0] < 0 else []
 
+    def kinks(self, model: MotionModel, end: float) -> np.ndarray:
+        return np.array([model.stop_time] if 0 < model.stop_time <= end else [])
+
     def spins(self, model: MotionModel) -> bool:
         return bool(model.angular_velocity.any())
 

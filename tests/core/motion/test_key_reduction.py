@@ -67,7 +67,7 @@ def test_constant_curves_have_one_key():
     curves = reduced(MOTIONS["ballistic"][0])
     assert len(curves.location.times) == 2
     assert len(curves.rotation.times) == 1
-    assert len(reduced(MotionModel(), forced_times=(0.5, 1.0)).location.times) == 1
+    assert len(reduced(MotionModel(), kinks=(0.5, 1.0)).location.times) == 1
 
 
 def test_keys_lie_on_the_motion_and_ends_are_exact():
@@ -120,11 +120,87 @@ def test_keys_are_never_nearer_than_is_allowed(t1):
     np.testing.assert_array_equal(curves.location.values, displacements)
 
 
-def test_forced_times_get_a_key():
-    curves = reduced(MOTIONS["ballistic, spinning"][0], forced_times=(0.3, 1.7, 5.0))
-    for keys in (curves.location, curves.rotation):
-        assert {0.3, 1.7} <= set(keys.times.tolist())
-        assert 5.0 not in keys.times
+BOUNCE = MotionModel(
+    "bounce",
+    velocity=[0.5, 0.1, 0.6],
+    acceleration=[0, 0, -9],
+    angular_velocity=[1, 2, 0.5],
+    bounce_time=0.2,
+    restitution=0.7,
+    offset_rotvec=[0.03, 0, 0.02],
+    offset_displacement=[0.01, 0.02, 0],
+    radius=RADIUS,
+)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.3, 0.7, 0.95, 1.0])
+@pytest.mark.parametrize("tolerance", [TOLERANCE, 1e-5 * SIZE])
+def test_bounces_keep_their_velocity_jumps(restitution, tolerance):
+    model = dataclasses.replace(BOUNCE, restitution=restitution)
+    kinks = models.kinks(model, 2.0)
+    frames = key_reduction.FrameTimes(0.0, 1 / 60)
+    curves = reduced(model, tolerance, kinks=kinks.tolist(), nearest=0.011 / 60, frames=frames)
+    beside = (kinks + np.array([[-1e-4], [-1e-7], [0], [1e-7], [1e-4]])).ravel()
+    times = np.concatenate([np.linspace(0, 2, 2311), np.clip(beside, 0, 2)])
+    assert curves.followed and largest_error(curves, model, times) <= 1.001 * tolerance
+    first = int(np.argmin(np.abs(curves.location.times - 0.2)))
+    assert curves.location.times[first] == 0.2
+    before, after = curves.location.left_slopes[first, 2], curves.location.right_slopes[first, 2]
+    offset = model.offset_displacement[2] * np.exp(-0.2 / model.fade_time) / model.fade_time
+    np.testing.assert_allclose([before - offset, after - offset], [-1.2, 1.2 * restitution], atol=1e-4)
+
+
+def test_kinks_are_where_a_motion_is_not_smooth():
+    fall = 2 * 1.2 / 9
+    impacts = 0.2 + fall * np.array([0, 0.7, 0.7 + 0.49, 0.7 + 0.49 + 0.343])
+    np.testing.assert_allclose(models.kinks(BOUNCE, 0.65), impacts)
+    assert models.kinks(BOUNCE, 0.15).tolist() == []
+    resting = models.kinks(BOUNCE, 100.0)[-1]
+    _, _, _, velocities = models.evaluate_with_rates(BOUNCE, np.array([resting + 1e-6, resting + 1]))
+    np.testing.assert_allclose(velocities[:, 2], 0, atol=1e-2)
+    assert models.kinks(dataclasses.replace(BOUNCE, acceleration=np.zeros(3)), 9.0).tolist() == []
+    assert models.kinks(dataclasses.replace(BOUNCE, velocity=[0, 0, 9.0]), 9.0).tolist() == []  # away from the floor
+    assert models.kinks(MotionModel("friction", velocity=[1, 0, 0], stop_time=0.4), 1.0).tolist() == [0.4]
+    assert models.kinks(MotionModel("friction", velocity=[1, 0, 0]), 1.0).tolist() == []
+    assert models.kinks(HARD, 9.0).tolist() == []
+
+
+def test_endless_bounces_stay_above_the_floor():
+    model = dataclasses.replace(BOUNCE, velocity=[0, 0, 0.009], bounce_time=0.002, restitution=1.0)
+    _, d = models.evaluate(model, np.linspace(0.002, 1.9, 5000))
+    assert (d[:, 2] > -1e-2).all()
+
+
+def test_more_kinks_than_can_be_keyed_give_keys_at_frames():
+    model = dataclasses.replace(
+        BOUNCE, velocity=[0.5, 0, 0], acceleration=[0, 0, -60], bounce_time=0.05, restitution=1.0
+    )
+    kinks = models.kinks(model, 2.0).tolist()
+    frames = key_reduction.FrameTimes(0.0, 1 / 60)
+    few = key_reduction.FEWEST_INTERVALS
+    options = {"nearest": 0.011 / 60, "frames": frames, "most": few}
+    assert len(kinks) > key_reduction.FEWEST_KINKS
+    curves = reduced(model, 1e-5 * SIZE, kinks=kinks, **options)
+    assert not curves.followed
+    for kink in kinks[: key_reduction.FEWEST_KINKS]:
+        assert kink in curves.location.times
+
+
+def test_a_rest_between_two_motions_is_held():
+    moving = MotionModel("translation", velocity=[1, 0, 0])
+    pieces = [moving, MotionModel("translation"), moving]
+    curves, start = None, 0.0
+    for k, piece in enumerate(pieces):
+
+        def sample(times, k=k, piece=piece, start=start):
+            quats, d, rates, slopes = key_reduction.model_sampler(piece, float(k))(times)
+            return quats, d + [start, 0, 0], rates, slopes
+
+        found = key_reduction.reduce(sample, k, k + 1, TOLERANCE, RADIUS)
+        curves = found if curves is None else cubic_curves.join(curves, found)
+        start += float(piece.velocity[0])
+    places = cubic_curves.evaluate(curves.location, np.array([0.5, 1.0, 1.3, 1.7, 2.0, 2.5]))
+    np.testing.assert_allclose(places[:, 0], [0.5, 1, 1, 1, 1, 1.5], atol=1e-12)
 
 
 def test_joined_curves_keep_the_kink_and_both_sides():
