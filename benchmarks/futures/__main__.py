@@ -1,8 +1,9 @@
-"""Benchmarks of motion past t_max on simulated tracks.
+"""Benchmarks of motion past t_max, on simulated tracks and on rendered scenes.
 
     python -m benchmarks.futures COMMAND [OPTIONS]
 
     accuracy  error, confidence band, events and run time of the fit, for each kind of motion
+    rendered  tracks and predictions of scenes that are rendered, trained and baked
 
 Results: docs/results/motion.md.
 """

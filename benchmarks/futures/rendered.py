@@ -1,0 +1,133 @@
+"""Tracks and futures of trained scenes: error of every object, seen and predicted.
+
+    python -m benchmarks.futures rendered [--scenes NAME ...] [--seeds 0 1] [--set SECTION.KEY=VALUE] [--json FILE]
+
+Renders each scene of `rendered_scenes`, trains and bakes it. Columns, per object:
+
+    place      largest error of its place at the observed times, in % of its size
+    turn       median and largest error of its rotation there, degrees; of the body whose rotation is best known if
+               several bodies have its id
+    future     error of its place at t = 1 in % of its size, and of its rotation, degrees
+    warning    reason why its motion is reported as not predictable, if it is
+
+and per scene the PSNR of val and of test, of test with true poses, and the processor time of the training.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r5dgs_core.bake import bake
+from r5dgs_core.config import config
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.data.dataset import Dataset
+from r5dgs_core.error_vs_time import image_task
+from r5dgs_core.evaluation import evaluate, ground_truth_poses, metrics
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import warm_up
+from r5dgs_core.scene.scene import Scene
+from r5dgs_core.train import run
+
+from . import rendered_scenes
+
+SETTINGS = (  # small images need few Gaussians
+    "train.iterations=1000",
+    "train.probe_every=0",
+    "identity.iterations=20",
+    "init.background_points=1500",
+    "init.object_points=300",
+    "init.shadow_points=20",
+    "init.sweep_depths=48",
+)
+
+
+def object_rows(scene: Scene, dataset: Dataset) -> list[dict[str, Any]]:
+    """Errors of each object of a scene with true poses."""
+    assert dataset.ground_truth is not None
+    rows = []
+    for body in ground_truth_poses.bodies(scene, dataset.ground_truth):
+        predicted = ground_truth_poses.motion(scene, [body.group], body.times)[0]
+        places, turns = metrics.pose_errors(predicted, body.motion, body.group.pivot)
+        first, last = body.group.seen or (-np.inf, np.inf)
+        seen = (body.times <= min(scene.t_max, last) + 1e-9) & (body.times >= first - 1e-9)
+        places = 100 * places / body.size
+        rows.append(
+            {
+                "object": body.name,
+                "place": float(places[seen].max()),
+                "turn": float(np.median(turns[seen])),
+                "worst_turn": float(turns[seen].max()),
+                "future": float(places[-1]),
+                "future_turn": float(turns[-1]),
+                "warning": body.group.history.warning(),
+            }
+        )
+    return rows
+
+
+def scene_row(scene: Scene, dataset: Dataset) -> dict[str, float]:
+    """PSNR of a scene, with its own motion and with true poses."""
+    play = scene_player.Player(scene).frame
+    oracle, why = image_task.true_move(scene, dataset, [view.t for view in dataset.test])
+    assert oracle is not None, why
+    plan = {"val": (dataset.val, play), "test": (dataset.test, play), "oracle": (dataset.test, oracle)}
+    return {name: float(evaluate.measure(scene, views, move)["psnr"]) for name, (views, move) in plan.items()}
+
+
+def measure(data: Path, settings: config.Config) -> dict[str, Any]:
+    """Train a data set, and measure the scene."""
+    dataset = datasets.read(data)
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.process_time()
+        trained = run.train(data, Path(folder) / "run", settings)
+        seconds = time.process_time() - began
+        scene = bake.bake(trained)
+    return {**scene_row(scene, dataset), "seconds": seconds, "objects": object_rows(scene, dataset)}
+
+
+def _lines(name: str, seed: int, found: dict[str, Any]) -> str:
+    """Rows of the table of one scene, one per object."""
+    quality = " | ".join(f"{found[key]:.2f}" for key in ("val", "test", "oracle"))
+    return "\n".join(
+        f"| {name} | {seed} | {one['object']} | {one['place']:.1f} | {one['turn']:.1f}, {one['worst_turn']:.1f} "
+        f"| {one['future']:.1f} | {one['future_turn']:.1f} | {quality} | {found['seconds']:.0f} | {one['warning']} |"
+        for one in found["objects"]
+    )
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description="Tracks and futures of trained scenes.")
+    parser.add_argument("--scenes", nargs="+", choices=rendered_scenes.SCENES, default=list(rendered_scenes.SCENES))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument("--data", type=Path, help="keep the data sets in this folder, and use those that are there")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    warm_up.warm_up()
+    settings = config.load(None, [*SETTINGS, *args.set])
+    print("| scene | seed | object | place % | turn, worst | future % | turn | val | test | oracle | s | warning |")
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in args.scenes:
+            for seed in args.seeds:
+                data = (args.data or Path(folder)) / f"{name}_{seed}"
+                if not data.exists():
+                    rendered_scenes.write(data, name, seed)
+                found = measure(data, settings)
+                rows.append({"scene": name, "seed": seed, **found})
+                print(_lines(name, seed, found), flush=True)
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=2))
+
+
+if __name__ == "__main__":
+    main()
