@@ -47,6 +47,7 @@ def _vector(name: str):
 
     def write(state, values):
         factor = units_per_second(state) ** power
+        state.clamped = ""
         setattr(state, f"stored_{name}", [value / factor for value in values])
 
     return {"get": read, "set": write, "size": 3, "update": write_at_once, "options": set()}
@@ -60,8 +61,11 @@ def _scalar(name: str, unit: float = 1.0, most: float = math.inf):
         return getattr(state, f"stored_{name}") * units_per_second(state) ** power / unit
 
     def write(state, value):
-        value = min(max(value, 0.0), most)
-        setattr(state, f"stored_{name}", value * unit / units_per_second(state) ** power)
+        used = min(max(value, 0.0), most)
+        label = state.bl_rna.properties[name].name
+        limits = "numbers >= 0" if most == math.inf else f"numbers from 0 to {most:g}"
+        state.clamped = "" if used == value else f"{label}: takes {limits}, so {value:.4g} became {used:g}"
+        setattr(state, f"stored_{name}", used * unit / units_per_second(state) ** power)
 
     return {"get": read, "set": write, "update": write_at_once, "options": set()}
 
@@ -83,6 +87,9 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     frames_per_unit: FloatProperty(name="Frames per Unit", default=60.0, options={"HIDDEN"})
     written_motion: StringProperty(
         name="Written Motion", description="Digest of the motion of the last written keys", options={"HIDDEN"}
+    )
+    clamped: StringProperty(
+        name="Clamped", description="Message about the last entered number if it was out of range", options={"HIDDEN"}
     )
     too_fast: BoolProperty(
         name="Too Fast for Keys",

@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import capture, export, motion, objects, preview, prompt, render, scene
+from . import capture, export, motion, objects, observed_motion, preview, prompt, render, scene
 
-MODULES = (scene, prompt, objects, motion, preview, export, capture, render)
+MODULES = (scene, prompt, objects, motion, observed_motion, preview, export, capture, render)
 
 
 def register():

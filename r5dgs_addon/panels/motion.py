@@ -47,12 +47,14 @@ def _physics(layout, anchor) -> None:
     if physics.follow_matrix(state) is not None:
         layout.label(text="Follows another object", icon="LINKED")
         return
-    _history(layout, anchor)
+    draw_warning(layout, anchor)
     layout.prop(state, "kind")
     if not refused:
         _pivot(layout, anchor)
     for name in models.KINDS[state.kind].fields:
         layout.prop(state, name)
+    if state.clamped:
+        status_bar.wrapped(layout, bpy.context, state.clamped, "ERROR")
     layout.prop(state, "at_once")
     if state.too_fast:
         status_bar.wrapped(layout, bpy.context, "Too fast for keys: exact only at frames", "ERROR")
@@ -64,13 +66,11 @@ def _physics(layout, anchor) -> None:
         layout.label(text="As learned", icon="CHECKMARK")
 
 
-def _history(layout, anchor) -> None:
-    """Draw the observed events, and the reason to distrust the learned prediction."""
-    found = physics.history(anchor)
-    for event in found.events:
-        layout.label(text=event.text().capitalize(), icon="MARKER")
-    if found.warning() and physics.band(anchor) is not None:
-        status_bar.wrapped(layout, bpy.context, found.warning().capitalize(), "ERROR")
+def draw_warning(layout, anchor) -> None:
+    """Draw the reason to distrust the learned prediction, if there is one."""
+    warning = physics.history(anchor).warning()
+    if warning and physics.band(anchor) is not None:
+        status_bar.wrapped(layout, bpy.context, warning.capitalize(), "ERROR")
 
 
 def _pivot(layout, anchor) -> None:

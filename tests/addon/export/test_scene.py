@@ -8,7 +8,7 @@ import pytest
 
 from r5dgs_core.motion import models
 from r5dgs_core.playback import scene_player
-from r5dgs_core.scene import scene_file
+from r5dgs_core.scene import cameras, scene_file
 from tests.support import motions, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -139,6 +139,70 @@ def test_edited_physics_are_the_model_of_the_new_file(blender, scene, loaded, tm
     assert model.kind == "translation" and model.velocity == pytest.approx((0.2, 0.4, 1.0))
     np.testing.assert_array_equal(saved.tracks.poses, scene.tracks.poses)
     assert_same_motion(blender, loaded, motions.load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
+
+
+EDITS = {
+    "drag": {"velocity": (1.5, 0.5, 0), "acceleration": (0, 0, -2), "angular_velocity": (0, 3, 1), "damping": 4.0},
+    "friction": {"velocity": (0.8, 0.4, 0), "angular_velocity": (2, 0, 1), "stop_time": 0.13},
+    "precession": {"angular_velocity": (0, 1, 9), "precession": (0, 0, 4), "center_offset": (0.1, 0, -0.2)},
+    "bounce": {
+        "velocity": (0.4, 0.1, 0.3),
+        "acceleration": (0, 0, -15),
+        "angular_velocity": (1, 2, 0),
+        "bounce_time": 0.0637,
+        "restitution": 0.7,
+    },
+    "two_oscillations": {
+        "velocity": (0.5, 0, 0),
+        "acceleration": (0, 0, 2),
+        "angular_velocity": (1, 0, 0),
+        "angular_acceleration": (0, 2, 0),
+        "frequency": 9.0,
+        "second_velocity": (0, 0.7, 0),
+        "second_acceleration": (1, 0, 0),
+        "second_angular_velocity": (0, 0, 2),
+        "second_angular_acceleration": (0, 5, 0),
+        "second_frequency": 15.0,
+    },
+}
+
+
+@pytest.mark.parametrize("kind", EDITS)
+@pytest.mark.parametrize("size", [1.0, 1.5])
+def test_an_edited_motion_of_any_kind_plays_in_the_new_file_as_in_blender(blender, scene, loaded, tmp_path, kind, size):
+    anchor = cloud(loaded, "mug").parent
+    state, units = anchor.r5dgs_motion, motions.addon("motion.motion_fields")
+    if size != 1:
+        handle = blender.data.objects.new("handle", None)
+        handle.matrix_world = MATRIX @ Matrix.Scale(size, 4)
+        blender.context.scene.collection.objects.link(handle)
+        handle.parent, anchor.parent = anchor.parent, handle
+        blender.context.view_layer.update()
+    motions.choose(blender, anchor)
+    state.kind, state.frequency = kind, 0.0
+    state.acceleration = state.angular_acceleration = state.angular_velocity = (0, 0, 0)
+    for name, value in EDITS[kind].items():
+        vector = name in units.VECTORS
+        power = units.VECTORS[name].per_time if vector else models.SCALARS[name]
+        factor = units.units_per_second(state) ** power
+        turns = 2 * np.pi if name.endswith("frequency") else 1.0
+        setattr(state, name, np.array(value) * factor if vector else value * factor / turns)
+    assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
+    saved = save(blender, tmp_path / "b.r5dgs")
+    model = saved.groups[1].model
+    assert model.kind == kind and set(models.KINDS[kind].fields) == set(EDITS[kind])
+    assert saved.groups[1].history.band is None
+    for name in set(EDITS[kind]) & set(models.SCALARS):
+        assert getattr(model, name) == pytest.approx(EDITS[kind][name], rel=1e-5)
+    kinks = scenes.T_MAX + models.kinks(model, 0.25)
+    for t in (*np.linspace(scenes.T_MAX, 1, 17), *(kinks[:5] - 0.002), *(kinks[:5] + 0.002)):
+        frame = 1 + 60 * min(t, 1.0)
+        blender.context.scene.frame_set(int(frame), subframe=float(frame % 1))
+        shown = motions.all_points(blender, loaded, len(scene.gaussians.means))
+        played = scene_player.frame(saved, min(t, 1.0)).means.astype(np.float64)
+        played = played @ cameras.WORLD_TO_BLENDER[saved.world_convention].T
+        for rows in (scene.gaussians.motion_ids == 1, scene.gaussians.motion_ids == 2):
+            np.testing.assert_allclose(played[rows], shown[rows], atol=3e-5 * scene.extent, err_msg=str(t))
 
 
 def test_names_colours_and_deletions_are_kept(blender, scene, loaded, tmp_path):

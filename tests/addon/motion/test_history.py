@@ -10,10 +10,15 @@ from r5dgs_core.scene import scene_file
 from tests.support import layouts, motions, scenes
 
 RATES = {name: (0.0, 0.0, 0.0) for name in ("velocity", "acceleration", "angular_velocity")}
+FLIGHT = {"velocity": (0.5, 0.0, 0.0), "acceleration": (0.0, 0.0, -10.0), "angular_velocity": (0.0, 2.0, 0.0)}
 BAND = Band((scenes.T_MAX, 0.9, 1.2), (0.02, 0.1, 0.7), (0.1, 0.2, 0.3), predictable_until=0.95)
 HISTORY = History(
     (Event(0.2, "start", 0.01), Event(0.5, "impact", 0.01)),
-    tuple(Segment(a, b, "static", RATES) for a, b in ((0.0, 0.2), (0.2, 0.5), (0.5, scenes.T_MAX))),
+    (
+        Segment(0.0, 0.2, "static", RATES),
+        Segment(0.2, 0.5, "ballistic_spin", FLIGHT),
+        Segment(0.5, scenes.T_MAX, "translation", {**RATES, "velocity": (0.0, -1.0, 0.0)}),
+    ),
     BAND,
 )
 
@@ -77,10 +82,39 @@ def test_history_is_kept_by_saving_and_missing_in_older_files(blender, mug, tmp_
     assert physics.history(mug) == History()
 
 
-def test_the_panel_lists_events_and_warns_until_the_motion_is_edited(blender, mug):
+def test_the_panel_lists_segments_and_events_and_warns_until_the_motion_is_edited(blender, mug):
     panel = motions.addon("panels.motion").R5DGS_PT_motion
-    drawn = str(layouts.draw(blender, panel))
-    assert "Set off at 0.20" in drawn and "Hit at 0.50" in drawn and "Not predictable past 0.95" in drawn
+    observed = motions.addon("panels.observed_motion").R5DGS_PT_observed_motion
+    motions.choose(blender, mug)
+    assert observed.poll(blender.context)
+    listed = layouts.draw(blender, observed)
+    expected = ["1 to 13: Still", "Frame 13.0 ± 0.6: start", "13 to 31: Throw and Spin"]
+    expected += ["moves at 0.2 m/s", "accelerates by 1.6 m/s²", "turns by 45.8°/s"]
+    expected += ["Frame 31.0 ± 0.6: impact", "31 to 46: Slide", "moves at 0.4 m/s"]
+    assert listed[:-1] == expected
+    for drawn in (str(layouts.draw(blender, panel)), listed[-1]):
+        assert "Not predictable past 0.95 (hit at 0.50)" in drawn
     mug.r5dgs_motion.velocity = (5, 0, 0)
-    drawn = str(layouts.draw(blender, panel))
-    assert "Hit at 0.50" in drawn and "Not predictable" not in drawn
+    assert "Not predictable" not in str(layouts.draw(blender, panel))
+    assert layouts.draw(blender, observed) == expected
+
+
+def test_an_object_without_events_has_no_panel_of_segments(blender, loaded):
+    motions.choose(blender, blender.data.objects["red apple anchor"])
+    assert not motions.addon("panels.observed_motion").R5DGS_PT_observed_motion.poll(blender.context)
+
+
+def test_numbers_out_of_range_are_named_in_the_panel(blender, mug):
+    panel, state = motions.addon("panels.motion").R5DGS_PT_motion, mug.r5dgs_motion
+    motions.choose(blender, mug)
+    state.kind = "bounce"
+    state.restitution = 1.5
+    message = "Restitution: takes numbers from 0 to 1, so 1.5 became 1"
+    assert state.restitution == 1.0 and message in " ".join(layouts.draw(blender, panel))
+    state.bounce_time = -0.2
+    assert "Next Bounce: takes numbers >= 0, so -0.2 became 0" in " ".join(layouts.draw(blender, panel))
+    state.restitution = 0.5
+    assert state.clamped == ""
+    state.damping = -1.0
+    state.velocity = (1.0, 0.0, 0.0)
+    assert state.clamped == ""
