@@ -39,13 +39,14 @@ class VisibleCloud(Instance):
 
 
 def instances(
-    depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None
+    depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None, edits: bool = True
 ) -> tuple[tuple[bpy.types.Collection, ...], tuple[VisibleCloud, ...]]:
     """Loaded scenes in the view layer and their visible point clouds.
 
     Args:
         depsgraph: Evaluated depsgraph.
         space: 3D view whose local view is respected.
+        edits: True to compare the points with the scene file; otherwise point clouds count as unedited.
 
     Returns:
         Collections of the visible point clouds, or all that are not excluded if none is visible; and the instances.
@@ -68,7 +69,7 @@ def instances(
             world = matrix @ np.linalg.solve(own, world)
         tint, number = tuple(obj.r5dgs_look.tint), scenes.index(collection)
         t = timeline.of_collection(collection).time(frame) if collection.r5dgs_exact.enabled else None
-        edit = evaluated_points.of(obj, depsgraph, collection.r5dgs.gaussians).edit
+        edit = evaluated_points.of(obj, depsgraph, collection.r5dgs.gaussians).edit if edits else None
         count = obj.r5dgs.count if edit is None else len(edit.points.rows)
         t = None if edit is not None and edit.bent else t
         if not count:
@@ -104,10 +105,12 @@ def world_of(collection: bpy.types.Collection, depsgraph: bpy.types.Depsgraph | 
 
 
 def flat(matrices: list[np.ndarray]) -> np.ndarray:
-    """Mask of transforms that are singular within single precision; such objects are invisible. [n]"""
+    """Mask of transforms that are not finite or singular within single precision; such objects are invisible. [n]"""
     if not matrices:
         return np.zeros(0, bool)
-    scales = np.linalg.svd(np.stack(matrices)[:, :3, :3], compute_uv=False)
+    stacked = np.stack(matrices)
+    usable = np.isfinite(stacked).all((1, 2), keepdims=True)
+    scales = np.linalg.svd(np.where(usable, stacked, 0)[:, :3, :3], compute_uv=False)
     return scales[:, 2] <= FLAT * scales[:, 0]
 
 

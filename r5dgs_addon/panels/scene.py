@@ -46,8 +46,8 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
         row = layout.row(align=True)
         for value, name, *_ in viewport_display.ITEMS:
             row.operator("r5dgs.set_display", text=name, depress=state.display == value).display = value
-        if viewport_splats.message():
-            status_bar.wrapped(layout, context, viewport_splats.message(), "ERROR")
+        if viewport_splats.message(context):
+            status_bar.wrapped(layout, context, viewport_splats.message(context), "ERROR")
         row = layout.split(factor=0.33)  # beside the field, Blender would truncate the name
         row.label(text="Scene File")
         row.prop(state, "filepath", text="")

@@ -2,10 +2,27 @@
 
 from __future__ import annotations
 
+import functools
+
 import gpu
 
-WIDTH = 4096  # texels of a row of the table, at most
-POSE_TEXELS = 6  # of each group: three rows of its matrix to the camera, tint, change of the light, viewpoint
+from ...r5dgs_core import errors
+
+WIDEST = 16384  # texels of a row of a texture, at most
+# Texels of each group: three rows of its matrix to the camera; tint, or with a fourth component of 1 the color itself;
+# change of the light; viewpoint.
+POSE_TEXELS = 6
+
+
+class CompileError(errors.R5dgsError):
+    """A shader does not compile on this graphics card."""
+
+
+@functools.cache
+def width() -> int:
+    """Texels of a row of a texture. It is the same for all tables, so that one shader serves them all."""
+    return min(gpu.capabilities.max_texture_size_get(), WIDEST)
+
 
 _HARMONICS = """
 /* Color of harmonics in the direction d, from coefficients packed in texels of COEFFICIENTS from `at` on. */
@@ -45,16 +62,17 @@ _SPLAT_VERTEX = (
 void main()
 {
   int place_of = gl_InstanceID;
-  int id = int(texelFetch(order, ivec2(place_of % ORDER_WIDTH, place_of / ORDER_WIDTH), 0).r);
-  ivec2 first = ivec2((id % PER_ROW) * TEXELS, id / PER_ROW);
+  int id = int(texelFetch(order, ivec2(place_of % WIDTH, place_of / WIDTH), 0).r);
+  ivec2 first = ivec2((id % (WIDTH / TEXELS)) * TEXELS, id / (WIDTH / TEXELS));
   vec4 place = texelFetch(table, first, 0);
   vec4 s0 = texelFetch(table, first + ivec2(1, 0), 0);
   vec4 s1 = texelFetch(table, first + ivec2(2, 0), 0);
   vec4 base = texelFetch(table, first + ivec2(3, 0), 0);
-  int group = int(place.w);
-  vec4 r0 = texelFetch(poses, ivec2(0, group), 0);
-  vec4 r1 = texelFetch(poses, ivec2(1, group), 0);
-  vec4 r2 = texelFetch(poses, ivec2(2, group), 0);
+  int number = int(place.w);
+  ivec2 pose = ivec2((number % (WIDTH / POSE_TEXELS)) * POSE_TEXELS, number / (WIDTH / POSE_TEXELS));
+  vec4 r0 = texelFetch(poses, pose, 0);
+  vec4 r1 = texelFetch(poses, pose + ivec2(1, 0), 0);
+  vec4 r2 = texelFetch(poses, pose + ivec2(2, 0), 0);
   vec4 h = vec4(place.xyz, 1.0);
   vec3 p = vec3(dot(r0, h), dot(r1, h), dot(r2, h));  /* camera space, looking along -z */
   vec4 clip = projection * vec4(p, 1.0);
@@ -87,7 +105,7 @@ void main()
   depths = vec3(-p.z, conic.x * along.x + conic.y * along.y, conic.y * along.x + conic.z * along.y);
   vec3 color = 0.5 + 0.28209479177387814 * base.rgb;
 #if DEGREE > 0
-  vec4 eye = texelFetch(poses, ivec2(5, group), 0);  /* viewpoint, or with w = 0 the line of sight */
+  vec4 eye = texelFetch(poses, pose + ivec2(5, 0), 0);  /* viewpoint, or with w = 0 the line of sight */
   vec3 sight = eye.w * place.xyz - eye.xyz;
   float far_off = length(sight);
   if (far_off > 0.0) { color += harmonics(first + ivec2(TEXELS - REST, 0), sight / far_off, DEGREE); }
@@ -95,9 +113,10 @@ void main()
   color = max(color, 0.0);
 #if SHADED > 0
   vec4 light = texelFetch(table, first + ivec2(4, 0), 0);
-  color *= max(light.w + dot(light.xyz, texelFetch(poses, ivec2(4, group), 0).xyz), 0.0);
+  color *= max(light.w + dot(light.xyz, texelFetch(poses, pose + ivec2(4, 0), 0).xyz), 0.0);
 #endif
-  paint = vec4(color * texelFetch(poses, ivec2(3, group), 0).rgb, base.a);
+  vec4 tint = texelFetch(poses, pose + ivec2(3, 0), 0);
+  paint = vec4(tint.a > 0.5 ? tint.rgb : color * tint.rgb, base.a);
   float reach = 2.0 * log(base.a * 255.0);  /* alpha is 1/255 where the exponent is this */
   delta = corner * sqrt(reach * vec2(a, c));
   gl_Position = clip + vec4(2.0 * delta / view.xy * clip.w, 0.0, 0.0);
@@ -132,33 +151,37 @@ void main()
 {
   ivec2 at = ivec2(gl_FragCoord.xy);
   vec4 c = texelFetch(splats, at, 0);
+  float hole = has_holes > 0 ? texelFetch(holes, at, 0).r : 0.0;  /* of hold-outs, also in the sky */
   bool open = meshes_drawn < 1 || texelFetch(meshes, at, 0).r >= 1.0;  /* nothing solid in this pixel */
+  float cover = c.a - hole;
   if (sky_degree >= 0 && open) {
     vec4 ray = to_world * vec4(uv, 1.0, 1.0);
     vec3 d = normalize(ray.xyz);
     vec3 sky = 0.5 + 0.28209479177387814 * texelFetch(sky_terms, ivec2(0, 0), 0).rgb;
     if (sky_degree > 0) { sky += harmonics(ivec2(1, 0), d, sky_degree); }
-    picture = vec4(pow(clamp(c.rgb + clamp(sky, 0.0, 1.0) * (1.0 - c.a), 0.0, 1.0), vec3(2.2)), 1.0);
-    return;
+    c.rgb += clamp(sky, 0.0, 1.0) * (1.0 - c.a);
+    cover = 1.0 - hole;
   }
-  if (c.a <= 0.0) { discard; }
-  vec3 s = clamp(c.rgb / c.a, 0.0, 1.0);
+  if (cover <= 1e-6) { discard; }
+  vec3 s = clamp(c.rgb / cover, 0.0, 1.0);
   vec3 below = open ? behind : vec3(0.5);
-  vec3 b = pow(below, vec3(2.2)) * (1.0 - c.a);
-  picture = vec4(max(pow(s * c.a + below * (1.0 - c.a), vec3(2.2)) - b, vec3(0.0)), c.a);
+  vec3 b = pow(below, vec3(2.2)) * (1.0 - cover);
+  picture = vec4(max(pow(s * cover + below * (1.0 - cover), vec3(2.2)) - b, vec3(0.0)), cover);
 }
 """
 )
 
 
-def splats(degree: int, shaded: bool, texels: int, order_width: int) -> gpu.types.GPUShader:
+def splats(degree: int, shaded: bool, texels: int) -> gpu.types.GPUShader:
     """Compile the shader that draws Gaussians.
 
     Args:
         degree: Degree of the harmonics in the table.
         shaded: True if the table has shading.
         texels: Texels of each Gaussian.
-        order_width: Width of the texture of rows.
+
+    Raises:
+        CompileError: The graphics card's driver refuses it.
     """
     info = _info(_SPLAT_VERTEX, _SPLAT_FRAGMENT, ("table", "poses", "order", "meshes"))
     for kind, name in (("MAT4", "projection"), ("VEC4", "view"), ("VEC4", "slopes")):
@@ -169,24 +192,36 @@ def splats(degree: int, shaded: bool, texels: int, order_width: int) -> gpu.type
     between.flat("VEC4", "paint")
     between.flat("VEC3", "depths")
     info.vertex_out(between)
-    rest = texels - 4 - shaded
     info.define("COEFFICIENTS", "table")
-    defines = {"DEGREE": degree, "SHADED": int(shaded), "TEXELS": texels, "REST": rest, "ORDER_WIDTH": order_width}
-    for name, value in {**defines, "PER_ROW": WIDTH // texels}.items():
+    defines = {"DEGREE": degree, "SHADED": int(shaded), "TEXELS": texels, "REST": texels - 4 - shaded}
+    for name, value in {**defines, "WIDTH": width(), "POSE_TEXELS": POSE_TEXELS}.items():
         info.define(name, str(value))
-    return gpu.shader.create_from_info(info)
+    return _compile(info)
 
 
 def paste() -> gpu.types.GPUShader:
-    """Compile the shader that draws the buffer into a viewport."""
-    info = _info(_PASTE_VERTEX, _PASTE_FRAGMENT, ("splats", "meshes", "sky_terms"))
-    for kind, name in (("MAT4", "to_world"), ("VEC3", "behind"), ("INT", "sky_degree"), ("INT", "meshes_drawn")):
+    """Compile the shader that draws the buffer into a viewport.
+
+    Raises:
+        CompileError: The graphics card's driver refuses it.
+    """
+    info = _info(_PASTE_VERTEX, _PASTE_FRAGMENT, ("splats", "holes", "meshes", "sky_terms"))
+    for kind, name in (("MAT4", "to_world"), ("VEC3", "behind")):
         info.push_constant(kind, name)
+    for name in ("sky_degree", "meshes_drawn", "has_holes"):
+        info.push_constant("INT", name)
     between = gpu.types.GPUStageInterfaceInfo("r5dgs_paste")
     between.smooth("VEC2", "uv")
     info.vertex_out(between)
     info.define("COEFFICIENTS", "sky_terms")
-    return gpu.shader.create_from_info(info)
+    return _compile(info)
+
+
+def _compile(info: gpu.types.GPUShaderCreateInfo) -> gpu.types.GPUShader:
+    try:
+        return gpu.shader.create_from_info(info)
+    except Exception as error:  # Blender has no narrower class for this
+        raise CompileError(str(error)) from error
 
 
 def _info(vertex: str, fragment: str, textures: tuple[str, ...]) -> gpu.types.GPUShaderCreateInfo:

@@ -11,11 +11,14 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
 
+from ...r5dgs_core import errors
 from ...r5dgs_core.scene import cameras
 from . import gaussian_table, shaders
 from .depth_order import DepthOrder
 
 SLACK = 0.3  # the rasterizer's `frustum_slack`
+LARGEST = 1e15  # entry of a matrix to the camera; larger ones overflow in the shader
+EXACT = 1 << 24  # integers that a float32 holds
 CORNERS = {"corner": [(-1, -1), (1, -1), (-1, 1), (1, 1)]}
 _shader = functools.cache(shaders.splats)
 
@@ -29,12 +32,14 @@ class Group:
         matrix: Affine map from the group's frame to Blender's world. [4, 4]
         tint: Factors on the color.
         light_change: Change of the light's direction as seen from the group. [3]
+        holdout: True if the group cuts a hole into what is behind it.
     """
 
     number: int
     matrix: np.ndarray
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     light_change: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    holdout: bool = False
 
 
 @dataclass(frozen=True)
@@ -46,19 +51,23 @@ class View:
         projection: Camera to clip space, OpenGL. [4, 4]
         width: Pixels.
         height: Pixels.
-        near: Depth below which a perspective view culls Gaussians.
     """
 
     view_matrix: np.ndarray
     projection: np.ndarray
     width: int
     height: int
-    near: float = 0.01
 
     @property
     def parallel(self) -> bool:
         """True if the view is orthographic."""
         return cameras.is_parallel(self.projection)
+
+    @property
+    def near(self) -> float:
+        """Depth of the near plane, below which a perspective view culls Gaussians."""
+        p = self.projection
+        return 0.0 if self.parallel else float(p[2, 3] / (p[2, 2] - 1))
 
 
 def texture(values: np.ndarray, width: int, format: str) -> gpu.types.GPUTexture:
@@ -75,37 +84,52 @@ class SplatTable:
 
     Args:
         table: The Gaussians.
+
+    Raises:
+        ConfigError: There are more Gaussians or groups than the textures hold.
     """
 
     def __init__(self, table: gaussian_table.Table):
         self.positions, self.starts = table.positions, table.starts
         count, texels = table.texels.shape[:2]
-        per_row = shaders.WIDTH // texels
-        self.order_width = min(max(count, 1), shaders.WIDTH)
-        self.shader = _shader(table.degree, table.shaded, texels, self.order_width)
+        width = shaders.width()
+        holds = min(width // texels * width, EXACT)
+        if count > holds or len(self.starts) > width // shaders.POSE_TEXELS * width:
+            raise errors.ConfigError(
+                f"{count} Gaussians in {len(self.starts) - 1} clouds: expected at most {holds} as splats, which the "
+                "textures of this graphics card hold; hide objects, or show a scene as points"
+            )
+        self.shader = _shader(table.degree, table.shaded, texels)
         self.quads = batch_for_shader(self.shader, "TRI_STRIP", CORNERS)
-        self.texture = texture(table.texels.reshape(-1, 4), per_row * texels, "RGBA32F")
+        self.texture = texture(table.texels.reshape(-1, 4), width // texels * texels, "RGBA32F")
 
 
 class SplatBuffer:
     """Picture of splats for one view: display-referred colors, premultiplied, and coverage. Kept until drawn again."""
 
     def __init__(self):
-        self._offscreen: gpu.types.GPUOffScreen | None = None
+        self._picture: gpu.types.GPUOffScreen | None = None
+        self._holes: gpu.types.GPUOffScreen | None = None
         self._table: SplatTable | None = None
         self._order: DepthOrder | None = None
         self._rows: np.ndarray | None = None
         self._rows_texture: gpu.types.GPUTexture | None = None
+        self._poses: list[gpu.types.GPUTexture] = []  # a texture has to live until it is drawn with
 
     @property
     def texture(self) -> gpu.types.GPUTexture:
         """Texture of the picture."""
-        return self._offscreen.texture_color
+        return self._picture.texture_color
+
+    @property
+    def holes(self) -> gpu.types.GPUTexture | None:
+        """Texture whose red channel is the visible share of hold-outs, or None if there are none."""
+        return None if self._holes is None else self._holes.texture_color
 
     def draw(
         self, table: SplatTable, groups: Sequence[Group], view: View, meshes: gpu.types.GPUTexture | None = None
     ) -> None:
-        """Draw groups of a table.
+        """Draw groups of a table. Those with values that are too large or not finite are left out.
 
         Args:
             table: The Gaussians.
@@ -113,14 +137,17 @@ class SplatBuffer:
             view: The view.
             meshes: Depth buffer of what is solid, as large as the picture; None if nothing is.
         """
-        size = (view.width, view.height)
-        if self._offscreen is None or (self._offscreen.width, self._offscreen.height) != size:
-            self._offscreen = gpu.types.GPUOffScreen(*size, format="RGBA32F")
+        groups = [group for group in groups if _is_drawable(group, view)]
         rows = self._sorted(table, groups, view)
-        with self._offscreen.bind():
-            gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
-            if len(rows):
-                self._draw(table, groups, view, meshes, len(rows))
+        self._picture = _target(self._picture, view)
+        self._poses = [_poses(groups, len(table.starts) - 1, view)]
+        self._draw(self._picture, self._poses[0], table, view, meshes, len(rows))
+        if any(group.holdout for group in groups):
+            self._holes = _target(self._holes, view)
+            self._poses.append(_poses(groups, len(table.starts) - 1, view, holes=True))
+            self._draw(self._holes, self._poses[1], table, view, meshes, len(rows))
+        else:
+            self._holes = None
 
     def _sorted(self, table: SplatTable, groups: Sequence[Group], view: View) -> np.ndarray:
         """Rows of the visible Gaussians, from far to near, as an array and as a texture."""
@@ -130,27 +157,49 @@ class SplatBuffer:
         rows = self._order.update(planes, view.near, view.parallel)
         if rows is not self._rows:
             self._rows = rows
-            self._rows_texture = texture(rows.astype(np.float32), table.order_width, "R32F")
+            self._rows_texture = texture(rows.astype(np.float32), shaders.width(), "R32F")
         return rows
 
     def _draw(
-        self, table: SplatTable, groups: Sequence[Group], view: View, meshes: gpu.types.GPUTexture | None, count: int
+        self,
+        target: gpu.types.GPUOffScreen,
+        poses: gpu.types.GPUTexture,
+        table: SplatTable,
+        view: View,
+        meshes: gpu.types.GPUTexture | None,
+        count: int,
     ) -> None:
-        shader = table.shader
-        poses = _poses(groups, len(table.starts) - 1, view)  # a texture has to live until it is drawn with
-        gpu.state.depth_test_set("NONE")
-        gpu.state.depth_mask_set(False)
-        gpu.state.blend_set("ALPHA_PREMULT")
-        shader.bind()
-        shader.uniform_float("projection", Matrix(view.projection.tolist()))
-        shader.uniform_float("view", (view.width, view.height, view.near, float(meshes is not None)))
-        shader.uniform_float("slopes", _slopes(view.projection))
-        shader.uniform_sampler("table", table.texture)
-        shader.uniform_sampler("poses", poses)
-        shader.uniform_sampler("order", self._rows_texture)
-        shader.uniform_sampler("meshes", meshes or nothing())
-        table.quads.draw_instanced(shader, instance_count=count)
-        gpu.state.blend_set("NONE")
+        with target.bind():
+            gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
+            if not count:
+                return
+            shader = table.shader
+            gpu.state.depth_test_set("NONE")
+            gpu.state.depth_mask_set(False)
+            gpu.state.blend_set("ALPHA_PREMULT")
+            shader.bind()
+            shader.uniform_float("projection", Matrix(view.projection.tolist()))
+            shader.uniform_float("view", (view.width, view.height, view.near, float(meshes is not None)))
+            shader.uniform_float("slopes", _slopes(view.projection))
+            shader.uniform_sampler("table", table.texture)
+            shader.uniform_sampler("poses", poses)
+            shader.uniform_sampler("order", self._rows_texture)
+            shader.uniform_sampler("meshes", meshes or nothing())
+            table.quads.draw_instanced(shader, instance_count=count)
+            gpu.state.blend_set("NONE")
+
+
+def _target(known: gpu.types.GPUOffScreen | None, view: View) -> gpu.types.GPUOffScreen:
+    """Buffer of the size of a view, the known one if possible."""
+    size = (view.width, view.height)
+    if known is not None and (known.width, known.height) == size:
+        return known
+    return gpu.types.GPUOffScreen(*size, format="RGBA32F")
+
+
+def _is_drawable(group: Group, view: View) -> bool:
+    to_camera = view.view_matrix @ group.matrix
+    return bool(np.abs(to_camera).max() < LARGEST and np.isfinite((*group.tint, *group.light_change)).all())
 
 
 @functools.cache
@@ -175,17 +224,23 @@ def _slopes(p: np.ndarray) -> tuple[float, float, float, float]:
     )
 
 
-def _poses(groups: Sequence[Group], count: int, view: View) -> gpu.types.GPUTexture:
-    """Texture of what the shader needs of each group, a row each."""
+def _poses(groups: Sequence[Group], count: int, view: View, holes: bool = False) -> gpu.types.GPUTexture:
+    """Texture of what the shader needs of each group.
+
+    With ``holes``, hold-outs are white and the others black; otherwise hold-outs are black.
+    """
     rows = np.zeros((count, shaders.POSE_TEXELS, 4), np.float32)
     to_world = np.linalg.inv(view.view_matrix)
     for group in groups:
         row = rows[group.number]
         row[:3] = (view.view_matrix @ group.matrix)[:3]
-        row[3, :3], row[4, :3] = group.tint, group.light_change
+        row[3] = (*group.tint, 0.0)
+        if holes or group.holdout:
+            row[3] = (*[float(holes and group.holdout)] * 3, 1.0)
+        row[4, :3] = group.light_change
         to_group = np.linalg.inv(group.matrix)
         if view.parallel:
             row[5, :3] = to_group[:3, :3] @ to_world[:3, 2]  # towards the viewer; the line of sight is its negative
         else:
             row[5] = (*(to_group[:3, :3] @ to_world[:3, 3] + to_group[:3, 3]), 1)
-    return texture(rows.reshape(-1, 4), shaders.POSE_TEXELS, "RGBA32F")
+    return texture(rows.reshape(-1, 4), shaders.width() // shaders.POSE_TEXELS * shaders.POSE_TEXELS, "RGBA32F")

@@ -1,57 +1,35 @@
 """Splats in every 3D viewport: a draw handler that pastes the picture of each view and draws it again if it changed.
 
-Blender calls the handler for every anti-aliasing sample, so pictures are kept. A picture depends on the view, the
-poses, tints and points of the visible groups and, if anything solid is visible, on all other changes of the scene.
+Blender calls the handler for every anti-aliasing sample, so pictures are kept. A picture depends on the view, on the
+poses, tints and points of the visible groups and, if anything solid is visible, on the viewport's depth buffer.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import traceback
 
 import bpy
 import gpu
 import numpy as np
 from bpy.app.handlers import persistent
-from gpu_extras.batch import batch_for_shader
-from mathutils import Matrix
 
 from ...r5dgs_core import errors
-from ...r5dgs_core.color import srgb
-from ...r5dgs_core.playback import affine_transform, posing
-from ...r5dgs_core.scene import spherical_harmonics
-from ..engine import visible_clouds
-from ..scene import evaluated_points, loaded_scenes, render_settings, viewport_display
+from ..engine import engine
+from ..scene import loaded_scenes, render_settings, viewport_display
 from ..ui import status_bar
-from . import gaussian_table, shaders
+from . import paste, shaders, visible_splats
 from . import splat_renderer as renderer
 
 SOLID = {"MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "CURVES", "POINTCLOUD", "GPENCIL", "GREASEPENCIL"}
-KEPT = 16  # viewports whose pictures are kept
-UNKNOWN = (0.5, 0.5, 0.5)  # background that is assumed behind soft edges if its color cannot be read
-
-
-@dataclass(frozen=True)
-class Shown:
-    """Visible splats of a viewport.
-
-    Attributes:
-        table: Their Gaussians.
-        groups: The visible groups.
-        sky: Coefficients of the sky, [K, 3], or None; of the first scene.
-        world: Map from that scene's world to Blender's. [4, 4]
-    """
-
-    table: renderer.SplatTable
-    groups: tuple[renderer.Group, ...]
-    sky: np.ndarray | None
-    world: np.ndarray
 
 
 class _Picture:
     """Last picture of a viewport, and the state that it shows."""
 
     def __init__(self):
-        self.buffer, self.key, self.meshes = renderer.SplatBuffer(), None, None
+        self.buffer, self.key = renderer.SplatBuffer(), None
+        self.depth: np.ndarray | None = None  # of what is solid
+        self.meshes: gpu.types.GPUTexture | None = None  # the same
 
 
 class _State:
@@ -60,155 +38,120 @@ class _State:
     def __init__(self):
         self.handle = None
         self.failure = ""
-        self.message = ""
-        self.changes = 0
-        self.pictures: dict[int, _Picture] = {}
-        self.clouds: dict[int, gaussian_table.CloudData | None] = {}  # by `session_uid` of the object
-        self.table: tuple[tuple, renderer.SplatTable] | None = None
-        self.paste = None
-        self.solid: dict[int, tuple[int, bool]] = {}
+        self.messages: dict[visible_splats.LayerKey, str] = {}
+        self.pictures: dict[int, _Picture] = {}  # by address of the region
 
     def forget(self) -> None:
         """Release the pictures, tables and shaders."""
+        self.failure = ""
+        self.messages.clear()
         self.pictures.clear()
-        self.clouds.clear()
-        self.solid.clear()
-        self.table = self.paste = None
+        visible_splats.forget()
+        paste.forget()
         renderer.forget()
 
 
 _state = _State()
 
 
-def message() -> str:
-    """Reason why the viewports draw no splats, or ""."""
-    return _state.failure or _state.message
-
-
-def shown(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None) -> Shown | None:
-    """Return the visible splats of the loaded scenes with display *Splats*, or None if there are none.
-
-    Args:
-        depsgraph: Evaluated depsgraph.
-        space: 3D view whose local view is respected.
-
-    Raises:
-        ConfigError: A point cloud has lost points and cannot be matched with its scene file.
-    """
-    scenes, clouds = visible_clouds.instances(depsgraph, space)
-    clouds = [one for one in clouds if one.seen and one.collection.r5dgs.display == viewport_display.SPLATS]
-    data = {one.object.session_uid: _read(one.object, depsgraph) for one in clouds}
-    clouds = [one for one in clouds if data[one.object.session_uid] is not None]
-    if not clouds:
-        return None
-    slots = _slots(clouds)
-    if _state.table is None or not set(slots) <= set(_state.table[0]):
-        packed = gaussian_table.pack([data[uid] for uid, *_ in slots])
-        _state.table = slots, renderer.SplatTable(packed)
-    numbers = {slot: number for number, slot in enumerate(_state.table[0])}
-    groups = tuple(_group(numbers[slot], one) for slot, one in zip(slots, clouds, strict=True))
-    first = scenes[0]
-    return Shown(_state.table[1], groups, _sky(first), visible_clouds.world_of(first, depsgraph))
-
-
-def _slots(clouds: list[visible_clouds.VisibleCloud]) -> tuple[tuple[int, int, int], ...]:
-    """Keys of clouds in the table: object, instancer, and a number for several instances by one instancer."""
-    found: list[tuple[int, int, int]] = []
-    numbers: dict[tuple[int, int], int] = {}
-    for one in clouds:
-        key = (one.object.session_uid, 0 if one.parent is None else one.parent.session_uid)
-        numbers[key] = numbers.get(key, -1) + 1
-        found.append((*key, numbers[key]))
-    return tuple(found)
-
-
-def _read(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> gaussian_table.CloudData | None:
-    """Read an object's evaluated points, or return them from the cache."""
-    key = obj.session_uid
-    if key not in _state.clouds:
-        _state.clouds[key] = gaussian_table.read(evaluated_points.evaluated(obj, depsgraph))
-    return _state.clouds[key]
-
-
-def _group(number: int, cloud: visible_clouds.VisibleCloud) -> renderer.Group:
-    tint = (0.0, 0.0, 0.0) if cloud.holdout else cloud.tint
-    light = loaded_scenes.light(cloud.collection)
-    if light is None:
-        return renderer.Group(number, cloud.matrix, tint)
-    turn = affine_transform.nearest_rotation(cloud.matrix[:3, :3])
-    turn = affine_transform.nearest_rotation(cloud.world[:3, :3]).T @ turn
-    return renderer.Group(number, cloud.matrix, tint, tuple(posing.light_change(light, turn)))
+def message(context: bpy.types.Context) -> str:
+    """Reason why the viewports of a view layer draw no splats, or ""."""
+    return _state.failure or _state.messages.get(visible_splats.layer_key(context.scene, context.view_layer), "")
 
 
 def _draw() -> None:
     """Draw the splats of the current viewport; Blender calls this after its scene and overlays."""
-    context = bpy.context
-    if _state.failure or context.region_data is None or not loaded_scenes.scene_collections():
+    _draw_viewport(bpy.context)
+
+
+def _draw_viewport(context: bpy.types.Context) -> None:
+    if context.region_data is None:
         return
-    if context.space_data.shading.type == "RENDERED" and context.scene.render.engine == "R5DGS":
+    loaded = loaded_scenes.scene_collections()
+    if _state.failure:
+        if any(_falls_back(one) for one in loaded) and not bpy.app.timers.is_registered(_show_points):
+            bpy.app.timers.register(_show_points, first_interval=0.0)
         return
+    visible_splats.catch_up()
+    said, drawn = "", False
     try:
-        found = shown(context.evaluated_depsgraph_get(), context.space_data)
-        _state.message = ""
-        if found is not None:
-            _draw_in_region(context, found)
-    except errors.R5dgsError as error:
-        _state.message = str(error)
-    except Exception as error:  # a shader that does not compile must not print at every redraw
-        _state.failure = f"Splats cannot be drawn on this graphics card: {error}"
+        if loaded and not _is_drawn_by_engine(context):
+            found = visible_splats.shown(context.evaluated_depsgraph_get(), context.space_data)
+            drawn = found is not None
+            if drawn:
+                _draw_in_region(context, found)
+    except shaders.CompileError as error:
+        _state.forget()
+        _state.failure = f"Points are shown, because this graphics card cannot draw splats: {error}"
         bpy.app.timers.register(_show_points, first_interval=0.0)
+        return
+    except errors.R5dgsError as error:
+        said = str(error)
+    except Exception as error:
+        said = f"Splats could not be drawn: {type(error).__name__}: {error}"
+        if said != message(context):  # not at every redraw
+            traceback.print_exc()
+    if not drawn:
+        _state.pictures.pop(context.region.as_pointer(), None)
+    if said != message(context):
+        _state.messages[visible_splats.layer_key(context.scene, context.view_layer)] = said
+        status_bar.redraw("VIEW_3D")
 
 
-def _draw_in_region(context: bpy.types.Context, found: Shown) -> None:
+def _is_drawn_by_engine(context: bpy.types.Context) -> bool:
+    return context.space_data.shading.type == "RENDERED" and context.scene.render.engine == engine.ENGINE
+
+
+def _draw_in_region(context: bpy.types.Context, found: visible_splats.Shown) -> None:
     region, space, view_3d = context.region, context.space_data, context.region_data
-    picture = _picture(region.as_pointer())
+    picture = _state.pictures.setdefault(region.as_pointer(), _Picture())
     view = renderer.View(
         np.array(view_3d.view_matrix, np.float64),
         np.array(view_3d.window_matrix, np.float64),
         region.width,
         region.height,
-        space.clip_start,
     )
-    solid = _solid(context)
     key = (
-        (view.view_matrix.tobytes(), view.projection.tobytes(), view.width, view.height, view.near),
-        tuple((one.number, one.matrix.tobytes(), one.tint, one.light_change) for one in found.groups),
-        (id(found.table), solid, _state.changes if solid else 0, space.shading.type),
+        (view.view_matrix.tobytes(), view.projection.tobytes(), view.width, view.height),
+        tuple((one.number, one.matrix.tobytes(), one.tint, one.light_change, one.holdout) for one in found.groups),
+        id(found.table),  # kept by the picture's buffer, so no other table has this id
     )
-    if picture.key != key:
-        picture.meshes = _depth(region.width, region.height) if solid else None
+    depth = _depth(region.width, region.height) if _is_anything_solid(context) else None
+    if picture.key != key or not _is_equal(picture.depth, depth):
+        _drop_closed(context)
+        picture.depth, picture.meshes = depth, None if depth is None else renderer.texture(depth, region.width, "R32F")
         picture.buffer.draw(found.table, found.groups, view, picture.meshes)
         picture.key = key
     wired = space.shading.type == "WIREFRAME"
     sky = found.sky if render_settings.of(context.scene).sky and not wired else None
-    _paste(picture, view, sky, found.world, _behind(context))
+    paste.paste(picture.buffer, picture.meshes, view, sky, found.world, paste.background(context))
 
 
-def _picture(key: int) -> _Picture:
-    """Kept picture of a region; the one that was not drawn for longest is dropped beyond `KEPT`."""
-    picture = _state.pictures.pop(key, None) or _Picture()
-    _state.pictures[key] = picture
-    if len(_state.pictures) > KEPT:
-        del _state.pictures[next(iter(_state.pictures))]
-    return picture
+def _drop_closed(context: bpy.types.Context) -> None:
+    """Release the pictures of viewports that no window shows any more."""
+    areas = [area for window in context.window_manager.windows for area in window.screen.areas]
+    there = {region.as_pointer() for area in areas if area.type == "VIEW_3D" for region in area.regions}
+    for key in _state.pictures.keys() - there - {context.region.as_pointer()}:
+        del _state.pictures[key]
 
 
-def _depth(width: int, height: int) -> gpu.types.GPUTexture:
-    """Depth buffer of the viewport as a texture. Reading it waits for the graphics card."""
+def _depth(width: int, height: int) -> np.ndarray:
+    """Depth buffer of the viewport; reading it waits for the graphics card. [H * W] float32
+
+    Blender keeps the depth of the first anti-aliasing sample, so that a view at rest has the same at every sample.
+    """
     buffer = gpu.state.active_framebuffer_get().read_depth(0, 0, width, height)
     buffer.dimensions = width * height
-    return gpu.types.GPUTexture((width, height), format="R32F", data=buffer)
+    return np.array(buffer, np.float32)
 
 
-def _solid(context: bpy.types.Context) -> bool:
+def _is_equal(one: np.ndarray | None, other: np.ndarray | None) -> bool:
+    return one is other or (one is not None and other is not None and np.array_equal(one, other))
+
+
+def _is_anything_solid(context: bpy.types.Context) -> bool:
     """Return True if the viewport may show anything solid but the splats."""
-    key = context.space_data.as_pointer()
-    known = _state.solid.get(key)
-    if known is None or known[0] != _state.changes:
-        depsgraph = context.evaluated_depsgraph_get()
-        known = _state.changes, any(_is_solid(obj, context) for obj in depsgraph.objects)
-        _state.solid[key] = known
-    return known[1]
+    return any(_is_solid(obj, context) for obj in context.evaluated_depsgraph_get().objects)
 
 
 def _is_solid(obj: bpy.types.Object, context: bpy.types.Context) -> bool:
@@ -219,98 +162,37 @@ def _is_solid(obj: bpy.types.Object, context: bpy.types.Context) -> bool:
     return obj.type != "POINTCLOUD" or not viewport_display.draws_splats(obj.original)
 
 
-def _paste(picture: _Picture, view: renderer.View, sky: np.ndarray | None, world: np.ndarray, behind: tuple) -> None:
-    """Blend a picture into the active framebuffer."""
-    if _state.paste is None:
-        shader = shaders.paste()
-        _state.paste = shader, batch_for_shader(shader, "TRI_STRIP", renderer.CORNERS)
-    shader, screen = _state.paste
-    terms = renderer.nothing() if sky is None else _sky_texture(sky)  # has to live until it is drawn with
-    gpu.state.depth_test_set("NONE")
-    gpu.state.blend_set("ALPHA_PREMULT")
-    shader.bind()
-    shader.uniform_float("to_world", Matrix(_rays(view, world).tolist()))
-    shader.uniform_float("behind", behind)
-    shader.uniform_int("sky_degree", -1 if sky is None else spherical_harmonics.degree_of(len(sky)))
-    shader.uniform_int("meshes_drawn", int(picture.meshes is not None))
-    shader.uniform_sampler("splats", picture.buffer.texture)
-    shader.uniform_sampler("meshes", picture.meshes or renderer.nothing())
-    shader.uniform_sampler("sky_terms", terms)
-    screen.draw(shader)
-    gpu.state.blend_set("NONE")
-
-
-def _sky_texture(sky: np.ndarray) -> gpu.types.GPUTexture:
-    """Coefficients in one row: degree 0, then the others without gaps. [K, 3]"""
-    texels = np.zeros((1 + gaussian_table.HARMONICS[3], 4), np.float32)
-    texels[0, :3] = sky[0]
-    texels[1:].reshape(-1)[: 3 * (len(sky) - 1)] = sky[1:].ravel()
-    return renderer.texture(texels, len(texels), "RGBA32F")
-
-
-def _rays(view: renderer.View, world: np.ndarray) -> np.ndarray:
-    """Linear map from (x, y, 1, 1), x and y in [-1, 1] over the picture, to rays in the world of a scene. [4, 4]"""
-    p, rays = view.projection, np.zeros((4, 4))
-    if not view.parallel:
-        rays[0, :3], rays[1, :3] = (1 / p[0, 0], 0, p[0, 2] / p[0, 0]), (0, 1 / p[1, 1], p[1, 2] / p[1, 1])
-    rays[2, 2] = -1
-    to_scene = np.linalg.inv(view.view_matrix @ world)
-    to_scene[:3, 3] = 0
-    return to_scene @ rays
-
-
-def _sky(collection: bpy.types.Collection) -> np.ndarray | None:
-    """Coefficients of a loaded scene's sky, or None for scenes of older versions. [K, 3]"""
-    values = np.array(collection.get(loaded_scenes.SKY, ()), np.float32)
-    return values.reshape(-1, 3) if values.size in (3, 12, 27, 48) else None
-
-
-def _behind(context: bpy.types.Context) -> tuple[float, float, float]:
-    """Display-referred color behind the splats without a sky, as far as it is known."""
-    shading = context.space_data.shading
-    if shading.type == "SOLID" and shading.background_type == "VIEWPORT":
-        return tuple(srgb.from_linear(np.array(shading.background_color, np.float64)))
-    if shading.type == "SOLID" and shading.background_type == "THEME":
-        return tuple(context.preferences.themes[0].view_3d.space.gradients.high_gradient)
-    return UNKNOWN
+def _falls_back(collection: bpy.types.Collection) -> bool:
+    """Return True if a loaded scene can show points instead of splats. Linked ones cannot be changed."""
+    return collection.r5dgs.display == viewport_display.SPLATS and loaded_scenes.is_own(collection)
 
 
 def _show_points() -> None:
     """Show points instead of splats in all loaded scenes."""
-    for collection in loaded_scenes.scene_collections():
-        if collection.r5dgs.display == viewport_display.SPLATS and loaded_scenes.is_own(collection):
-            viewport_display.show(collection, viewport_display.POINTS)
+    for collection in filter(_falls_back, loaded_scenes.scene_collections()):
+        viewport_display.show(collection, viewport_display.POINTS)
     status_bar.redraw("VIEW_3D")
 
 
 @persistent
 def _follow_changes(_, depsgraph=None):
-    """Count changes of the scene, and read the point clouds again whose geometry changed."""
-    _state.changes += 1
-    if depsgraph is None:
-        return
-    updated = {one.id.original.session_uid for one in depsgraph.updates if one.is_updated_geometry}
-    stale = updated & _state.clouds.keys()
-    for key in stale:
-        del _state.clouds[key]
-    if stale:
-        _state.table = None
+    """Queue the objects and point clouds whose geometry changed. Renders have a depsgraph of their own."""
+    if depsgraph is not None and depsgraph.mode == "VIEWPORT":
+        updated = [one.id.original.session_uid for one in depsgraph.updates if one.is_updated_geometry]
+        visible_splats.queue_change(updated)
 
 
 @persistent
-def _forget_scene(*_):
-    """Forget the points, because a file was opened or a change was undone."""
-    _state.changes += 1
-    _state.clouds.clear()
-    _state.pictures.clear()
-    _state.table = None
+def _follow_reload(*_):
+    """Queue that everything is read again, because a file was opened or a change was undone."""
+    visible_splats.queue_reload()
 
 
 def _hooks():
     handlers = bpy.app.handlers
-    forgetting = (handlers.load_post, handlers.undo_post, handlers.redo_post)
+    reloading = (handlers.load_post, handlers.undo_post, handlers.redo_post)
     following = (handlers.depsgraph_update_post, handlers.frame_change_post)
-    return [*((events, _forget_scene) for events in forgetting), *((events, _follow_changes) for events in following)]
+    return [*((events, _follow_reload) for events in reloading), *((events, _follow_changes) for events in following)]
 
 
 def register():

@@ -150,7 +150,7 @@ def checks(path: str, folder: str = ""):
     space.overlay.show_overlays, space.show_gizmo = False, False
     view_3d = space.region_3d
     state = next(one.r5dgs for one in bpy.data.collections if one.r5dgs.is_scene)
-    print(f"display: {state.display}; message: {service('splats.viewport_splats').message()!r}", flush=True)
+    print(f"display: {state.display}; message: {service('splats.viewport_splats').message(bpy.context)!r}", flush=True)
     boxes = [obj.bound_box for obj in scene.objects if obj.type == "POINTCLOUD"]
     size = max((Vector(box[6]) - Vector(box[0])).length for box in boxes)
     view_3d.view_distance, space.clip_start, space.clip_end = 0.5 * size, 0.01, 1000
@@ -176,7 +176,7 @@ def checks(path: str, folder: str = ""):
         redraw()
         found, inner = shown_region(screenshot(out / f"{kind.lower()}.png"))
         print(f"{kind}: {psnr(found, expected()[inner]):.1f} dB", flush=True)
-    print("message:", service("splats.viewport_splats").message(), flush=True)
+    print("message:", service("splats.viewport_splats").message(bpy.context), flush=True)
     assert worst > LEAST_DB
 
 

@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r5dgs_core import api
+from r5dgs_core import api, errors
 from r5dgs_core.scene import scene_file
 from tests.support import motions, scenes
 
@@ -19,55 +19,71 @@ AT_LEAST_DB = 60.0
 
 
 @pytest.fixture
-def drawn(blender):
-    """Draws the visible splats from the active camera: premultiplied colors and coverage. [H, W, 4]"""
-    module = motions.addon("splats.viewport_splats")
-    import gpu
-
-    pictures = []
+def on_card(blender):
+    """Calls a function of the depsgraph with the graphics card's context, and forgets all tables and shaders."""
+    state, found = motions.addon("splats.viewport_splats")._state, []
 
     class Engine(blender.types.RenderEngine):
         bl_idname, bl_label, bl_use_gpu_context = "R5DGS_TEST_SPLATS", "Splats", True
 
         def render(self, depsgraph):
             try:
-                pictures.append(self.picture(depsgraph))
+                found.append((wanted.pop()(depsgraph), None))
             except BaseException as error:
-                pictures.append(error)
+                found.append((None, error))
             finally:
-                module._state.forget()  # this context ends with the render
-
-        def picture(self, depsgraph):
-            camera = depsgraph.scene.camera.evaluated_get(depsgraph)
-            found = module.shown(depsgraph)
-            buffer = module.renderer.SplatBuffer()
-            view = module.renderer.View(
-                np.linalg.inv(np.array(camera.matrix_world, np.float64)),
-                np.array(camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), np.float64),
-                *SIZE,
-            )
-            if found is None:
-                return np.zeros((SIZE[1], SIZE[0], 4))
-            buffer.draw(found.table, found.groups, view)
-            with buffer._offscreen.bind():
-                pixels = gpu.state.active_framebuffer_get().read_color(0, 0, *SIZE, 4, 0, "FLOAT")
-            pixels.dimensions = SIZE[0] * SIZE[1] * 4
-            return np.array(pixels, np.float32).reshape(SIZE[1], SIZE[0], 4)[::-1]
+                state.forget()  # this context ends with the render
 
     blender.utils.register_class(Engine)
-    scene = blender.context.scene
+    wanted, scene = [], blender.context.scene
 
-    def draw():
+    def call(function):
         scene.render.engine = Engine.bl_idname
         scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = *SIZE, 100
+        wanted.append(function)
         blender.ops.render.render()
-        found = pictures.pop()
-        if isinstance(found, BaseException):
-            raise found
-        return found
+        value, error = found.pop()
+        if error is not None:
+            raise error
+        return value
 
-    yield draw
+    yield call
     blender.utils.unregister_class(Engine)  # otherwise some versions crash or hang at exit
+
+
+def picture_of(depsgraph):
+    """The visible splats from the active camera: premultiplied colors, and coverage without holes. [H, W, 4]"""
+    renderer = motions.addon("splats.splat_renderer")
+    found = motions.addon("splats.visible_splats").shown(depsgraph)
+    if found is None:
+        return np.zeros((SIZE[1], SIZE[0], 4))
+    camera, buffer = depsgraph.scene.camera.evaluated_get(depsgraph), renderer.SplatBuffer()
+    view = renderer.View(
+        np.linalg.inv(np.array(camera.matrix_world, np.float64)),
+        np.array(camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), np.float64),
+        *SIZE,
+    )
+    buffer.draw(found.table, found.groups, view)
+    values = pixels(buffer._picture)
+    if buffer._holes is not None:
+        values[..., 3] -= pixels(buffer._holes)[..., 0]
+    return values
+
+
+def pixels(target):
+    """Pixels of a buffer, top row first. [H, W, 4]"""
+    import gpu
+
+    with target.bind():
+        values = gpu.state.active_framebuffer_get().read_color(0, 0, *SIZE, 4, 0, "FLOAT")
+    values.dimensions = SIZE[0] * SIZE[1] * 4
+    return np.array(values, np.float32).reshape(SIZE[1], SIZE[0], 4)[::-1]
+
+
+@pytest.fixture
+def drawn(on_card):
+    """Draws the visible splats from the active camera, see `picture_of`."""
+    return lambda: on_card(picture_of)
 
 
 def expected(blender, scene, t):
@@ -142,8 +158,14 @@ def parallel(bpy, mug):
     bpy.context.scene.camera.data.ortho_scale = 5
 
 
+def held_out(bpy, mug):
+    mug.is_holdout = True
+
+
 @pytest.mark.parametrize(
-    "change", [moved, tinted, hidden, edited, deleted_by_nodes, instanced, parallel], ids=lambda one: one.__name__
+    "change",
+    [held_out, moved, tinted, hidden, edited, deleted_by_nodes, instanced, parallel],
+    ids=lambda one: one.__name__,
 )
 def test_edits_are_drawn_as_the_worker_draws_them(blender, drawn, tmp_path, change):
     scene = scenes.make_scene(n=400, objects=3, sh_degree=1)
@@ -165,3 +187,55 @@ def test_scenes_with_another_display_are_left_out(blender, drawn, tmp_path):
     assert drawn().any()
     blender.ops.r5dgs.set_display(display="POINTS")
     assert not drawn().any() and collection.r5dgs.display == "POINTS"
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
+def test_a_transform_without_a_picture_hides_only_its_object(blender, drawn, tmp_path, value):
+    scene = scenes.make_scene(n=400, objects=3, sh_degree=1)
+    collection = motions.load(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
+    mug = next(cloud for cloud in motions.clouds(collection) if cloud.r5dgs.object_id == 1)
+    mug.hide_render = True
+    wanted = drawn()
+    mug.hide_render, mug.location.x = False, value
+    np.testing.assert_allclose(drawn(), wanted, atol=1e-6)
+
+
+def test_the_sky_is_that_of_the_first_scene_shown_as_splats(blender, on_card, tmp_path):
+    for number in range(2):
+        scene = scenes.make_scene(n=100)
+        scene = dataclasses.replace(scene, background_sh=np.full_like(scene.background_sh, number))
+        motions.load(blender, scene_file.write(scene, tmp_path / f"{number}.r5dgs"))
+    shown = motions.addon("splats.visible_splats").shown
+    first, second = blender.context.scene.collection.children[-2:]
+    assert (on_card(shown).sky == 0).all()
+    motions.addon("scene.viewport_display").show(first, "POINTS")
+    assert (on_card(shown).sky == 1).all()
+
+
+def test_one_shader_draws_tables_of_any_length(blender, on_card, tmp_path, monkeypatch):
+    shaders, renderer = motions.addon("splats.shaders"), motions.addon("splats.splat_renderer")
+    scene = scenes.make_scene(n=400, objects=3, sh_degree=2)
+    motions.load(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
+
+    def grow(depsgraph):
+        wanted = picture_of(depsgraph)
+        packed = motions.addon("splats.gaussian_table").pack
+        data = next(iter(motions.addon("splats.visible_splats")._layers.values())).clouds.values()
+        tables = [renderer.SplatTable(packed([*data] * count)) for count in (2, 50)]
+        assert tables[0].shader is tables[1].shader
+        assert renderer._shader.cache_info().misses == 1
+        return wanted
+
+    wanted = on_card(grow)
+    monkeypatch.setattr(shaders, "width", lambda: 128)  # several rows of every texture
+    np.testing.assert_array_equal(on_card(picture_of), wanted)
+    monkeypatch.setattr(shaders, "width", lambda: 16)
+    with pytest.raises(errors.ConfigError, match="400 Gaussians .* expected at most 16 as splats"):
+        on_card(picture_of)
+
+
+def test_nearer_than_the_clip_start_of_the_camera_is_nothing(blender, drawn, tmp_path):
+    motions.load(blender, scene_file.write(scenes.make_scene(n=200), tmp_path / "scene.r5dgs"))
+    assert drawn().any()
+    blender.context.scene.camera.data.clip_start = 900
+    assert not drawn().any()

@@ -1,0 +1,159 @@
+"""Visible splats of a view layer, and their Gaussians on the graphics card.
+
+Handlers of Blender may run in a render thread, which must not touch what a viewport uses. They only queue what has
+changed; the queue is worked off when a viewport is drawn.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import bpy
+import numpy as np
+
+from ...r5dgs_core.playback import affine_transform, posing
+from ..engine import visible_clouds
+from ..scene import evaluated_points, loaded_scenes, viewport_display
+from . import gaussian_table
+from . import splat_renderer as renderer
+
+Slot = tuple[int, int, int]  # key of a cloud in a table: object, instancer, number among the instances by it
+LayerKey = tuple[int, str]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Visible splats of a viewport.
+
+    Attributes:
+        table: Their Gaussians.
+        groups: The visible groups.
+        sky: Coefficients of the sky, [K, 3], or None; of the first scene shown as splats.
+        world: Map from that scene's world to Blender's. [4, 4]
+    """
+
+    table: renderer.SplatTable
+    groups: tuple[renderer.Group, ...]
+    sky: np.ndarray | None
+    world: np.ndarray
+
+
+@dataclass
+class _Layer:
+    """Gaussians that a view layer shows: points by `session_uid` of the object, and the table with its slots."""
+
+    clouds: dict[int, gaussian_table.CloudData | None] = field(default_factory=dict)
+    table: tuple[tuple[Slot, ...], renderer.SplatTable] | None = None
+
+    def drop(self, uids: set[int]) -> None:
+        """Read the points of objects again. Points of one view layer may differ from those of another."""
+        if self.table is not None and any(slot[0] in uids for slot in self.table[0]):
+            self.table = None
+        for uid in uids & self.clouds.keys():
+            del self.clouds[uid]
+
+
+_layers: dict[LayerKey, _Layer] = {}
+_changes: deque[frozenset[int] | None] = deque(maxlen=1000)  # appending is atomic; if full, some may be lost
+
+
+def queue_change(uids: Iterable[int]) -> None:
+    """Queue objects or point clouds whose points changed, by `session_uid`. Any thread may call this."""
+    _changes.append(frozenset(uids))
+
+
+def queue_reload() -> None:
+    """Queue that all points are read again. Any thread may call this."""
+    _changes.append(None)
+
+
+def catch_up() -> None:
+    """Work off the queue, and drop what no window or object needs any more."""
+    if not _changes:
+        return
+    changed: set[int] = set()
+    if len(_changes) == _changes.maxlen:
+        _layers.clear()
+    while _changes:
+        uids = _changes.popleft()
+        if uids is None:
+            _layers.clear()
+        else:
+            changed |= uids
+    windows = bpy.context.window_manager.windows
+    current = {layer_key(window.scene, window.view_layer) for window in windows}
+    alive = {obj.session_uid for obj in bpy.data.objects}
+    for key in list(_layers):
+        if current and key not in current:
+            del _layers[key]
+        else:
+            _layers[key].drop(changed | (_layers[key].clouds.keys() - alive))
+
+
+def forget() -> None:
+    """Release all tables."""
+    _layers.clear()
+    _changes.clear()
+
+
+def layer_key(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer) -> LayerKey:
+    """Key of a view layer, the same for evaluated scenes."""
+    return scene.session_uid, view_layer.name
+
+
+def shown(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None) -> Shown | None:
+    """Return the visible splats of the loaded scenes with display *Splats*, or None if there are none.
+
+    Args:
+        depsgraph: Evaluated depsgraph.
+        space: 3D view whose local view is respected.
+
+    Raises:
+        ConfigError: There are more Gaussians than the graphics card's textures hold.
+    """
+    scenes, clouds = visible_clouds.instances(depsgraph, space, edits=False)
+    clouds = [one for one in clouds if one.seen and one.collection.r5dgs.display == viewport_display.SPLATS]
+    layer = _layers.setdefault(layer_key(depsgraph.scene, depsgraph.view_layer), _Layer())
+    for one in clouds:
+        if one.object.session_uid not in layer.clouds:
+            evaluated = evaluated_points.evaluated(one.object, depsgraph)
+            layer.clouds[one.object.session_uid] = gaussian_table.read(evaluated)
+    clouds = [one for one in clouds if layer.clouds[one.object.session_uid] is not None]
+    if not clouds:
+        return None
+    slots = _slots(clouds)
+    if layer.table is None or not set(slots) <= set(layer.table[0]):
+        layer.table = None  # released before the new one is made
+        layer.table = slots, renderer.SplatTable(gaussian_table.pack([layer.clouds[uid] for uid, *_ in slots]))
+    numbers = {slot: number for number, slot in enumerate(layer.table[0])}
+    groups = tuple(_group(numbers[slot], one) for slot, one in zip(slots, clouds, strict=True))
+    present = {one.collection for one in clouds}
+    first = next(scene for scene in scenes if scene in present)
+    return Shown(layer.table[1], groups, _sky(first), visible_clouds.world_of(first, depsgraph))
+
+
+def _slots(clouds: list[visible_clouds.VisibleCloud]) -> tuple[Slot, ...]:
+    found: list[Slot] = []
+    numbers: dict[tuple[int, int], int] = {}
+    for one in clouds:
+        key = (one.object.session_uid, 0 if one.parent is None else one.parent.session_uid)
+        numbers[key] = numbers.get(key, -1) + 1
+        found.append((*key, numbers[key]))
+    return tuple(found)
+
+
+def _group(number: int, cloud: visible_clouds.VisibleCloud) -> renderer.Group:
+    light, change = loaded_scenes.light(cloud.collection), (0.0, 0.0, 0.0)
+    if light is not None:
+        turn = affine_transform.nearest_rotation(cloud.matrix[:3, :3])
+        turn = affine_transform.nearest_rotation(cloud.world[:3, :3]).T @ turn
+        change = tuple(posing.light_change(light, turn))
+    return renderer.Group(number, cloud.matrix, cloud.tint, change, cloud.holdout)
+
+
+def _sky(collection: bpy.types.Collection) -> np.ndarray | None:
+    """Coefficients of a loaded scene's sky, or None for scenes of older versions. [K, 3]"""
+    values = np.array(collection.get(loaded_scenes.SKY, ()), np.float32)
+    return values.reshape(-1, 3) if values.size in (3, 12, 27, 48) else None
