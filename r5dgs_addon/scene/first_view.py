@@ -38,9 +38,13 @@ def show(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
     if found.shape != (17,) or not np.isfinite(found).all() or collection.r5dgs.root is None:
         return 0
     root = np.array(collection.r5dgs.root.matrix_world, np.float64)
-    pose, distance = root @ found[:16].reshape(4, 4), found[16] * np.linalg.norm(root[:3, 2])
-    rotation = Matrix(pose[:3, :3].tolist()).to_quaternion()
-    target = pose[:3, 3] - distance * pose[:3, 2] / np.linalg.norm(pose[:3, 2])
+    pose, target = found[:16].reshape(4, 4), np.eye(4)[3]
+    target[:3] = pose[:3, 3] - found[16] * pose[:3, 2]
+    eye, target, up = (root @ pose[:, 3])[:3], (root @ target)[:3], root[:3, :3] @ pose[:3, 1]
+    axes, distance = _looking(eye, target, up), float(np.linalg.norm(target - eye))
+    if axes is None:
+        return 0
+    rotation = Matrix(axes.tolist()).to_quaternion()
     changed = 0
     for window in context.window_manager.windows:
         areas = window.screen.areas if window.scene == context.scene else ()
@@ -53,6 +57,18 @@ def show(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
             space.clip_end = max(space.clip_end, FARTHEST * distance, DEFAULT_CLIP[1])
             changed += 1
     return changed
+
+
+def _looking(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray | None:
+    """Rotation of an OpenGL camera that looks at a target, or None if there is none. [3, 3]
+
+    The root may be mirrored or stretched; the view is a rotation, nevertheless.
+    """
+    back = eye - target
+    right = np.cross(up, back)
+    axes = np.stack([right, np.cross(back, right), back], axis=-1)
+    lengths = np.linalg.norm(axes, axis=0)
+    return axes / lengths if np.isfinite(lengths).all() and lengths.min() > 0 else None
 
 
 def _points(scene: Scene) -> np.ndarray:

@@ -75,3 +75,32 @@ def test_a_scene_without_cameras_is_loaded_without_a_change_of_view(blender, tmp
     motions.load(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
     assert space.region_3d.view_location == before
     assert blender.ops.r5dgs.view_as_trained() == {"FINISHED"}
+
+
+@pytest.mark.parametrize("scale", [(-1, 1, 1), (2, 0.5, 3), (-0.1, -5, 1), (1, 1, -1)])
+def test_a_mirrored_or_stretched_root_is_seen_from_where_the_camera_is(blender, tmp_path, scale):
+    scene = scenes.make_scene(n=200, objects=2)
+    eye, middle = np.array([4.0, -5.0, 2.0]), scene.gaussians.means[scene.gaussians.object_ids > 0].mean(0)
+    scene = dataclasses.replace(scene, cameras=(looking(eye, middle, "c"),))
+    collection = motions.load(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
+    root, (space,) = collection.r5dgs.root, spaces(blender)
+    root.scale, root.location, root.rotation_quaternion = scale, (1, 2, 3), (0.8, 0.1, 0.5, 0.3)
+    blender.context.view_layer.update()
+    assert blender.ops.r5dgs.view_as_trained() == {"FINISHED"}
+    moved, axes = np.array(root.matrix_world), np.array(space.region_3d.view_rotation.to_matrix())
+    seen_from = np.array(space.region_3d.view_location) + space.region_3d.view_distance * axes[:, 2]
+    np.testing.assert_allclose(seen_from, moved[:3, :3] @ eye + moved[:3, 3], atol=1e-4)
+    ahead = moved[:3, :3] @ (middle - eye)
+    np.testing.assert_allclose(-axes[:, 2], ahead / np.linalg.norm(ahead), atol=1e-4)
+    assert axes[:, 1] @ moved[:3, :3] @ -scene.cameras[0].T_cam_world[1, :3] > 0  # not upside down
+
+
+def test_a_root_without_size_changes_no_view(blender, tmp_path):
+    collection = motions.load(blender, scene_file.write(scenes.make_scene(n=200), tmp_path / "scene.r5dgs"))
+    (space,) = spaces(blender)
+    before = space.region_3d.view_location.copy()
+    for scale in (0.0, float("nan")):
+        collection.r5dgs.root.scale = (scale,) * 3
+        blender.context.view_layer.update()
+        assert blender.ops.r5dgs.view_as_trained() == {"FINISHED"}
+        assert space.region_3d.view_location == before
