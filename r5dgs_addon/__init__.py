@@ -3,7 +3,7 @@
 from . import panels, preferences
 from .engine import engine, live_preview, render_notes, render_stats
 from .language import prompt_state
-from .motion import exact_mode, extrapolate, motion_fields, pivot
+from .motion import event_markers, exact_mode, extrapolate, motion_fields, pivot
 from .scene import click_select, evaluated_points, object_names, object_tint, properties, relink
 from .splats import viewport_splats
 from .worker import jobs
@@ -17,6 +17,7 @@ MODULES = (
     extrapolate,
     pivot,
     exact_mode,
+    event_markers,
     evaluated_points,
     preferences,
     render_stats,

@@ -1,31 +1,101 @@
-"""Timeline markers of observed events, such as "ball: impact"."""
+"""Timeline markers of observed events, such as "ball: impact".
 
-from collections.abc import Iterator
+A marker names the loaded scene and the motion group that it belongs to, so that it follows renamed objects and is
+removed with the scene, while markers of users stay.
+"""
+
+import re
+import threading
+import uuid
 
 import bpy
+from bpy.app.handlers import persistent
 
 from ..scene import loaded_scenes, timeline
 from . import physics
 
+SCENE = "r5dgs_scene"  # custom property of markers and of loaded scenes: id of the loaded scene
+GROUP = "r5dgs_group"  # the same, of markers only: motion group
+
 
 def show(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
-    """Add the markers of a loaded scene's events that a Blender scene lacks."""
-    present = {(marker.name, marker.frame) for marker in scene.timeline_markers}
-    for name, frame in _wanted(collection):
-        if (name, frame) not in present:
-            scene.timeline_markers.new(name, frame=frame)
+    """Set the markers of a loaded scene's events in a Blender scene. Markers of users stay."""
+    key, wanted = _new_key(collection), _wanted(collection)
+    present = set()
+    for marker in [one for one in scene.timeline_markers if one.get(SCENE) == key]:
+        place = (marker.name, marker.frame, marker.get(GROUP))
+        if place in wanted and place not in present:
+            present.add(place)
+        else:
+            scene.timeline_markers.remove(marker)
+    for name, frame, group in sorted(wanted - present):
+        marker = scene.timeline_markers.new(name, frame=frame)
+        marker[SCENE], marker[GROUP] = key, group
 
 
 def shown(scene: bpy.types.Scene, collection: bpy.types.Collection) -> bool:
-    """Return True if no marker is missing."""
-    return set(_wanted(collection)) <= {(marker.name, marker.frame) for marker in scene.timeline_markers}
+    """Return True if no marker is missing or outdated."""
+    key = _key(collection)
+    own = [one for one in scene.timeline_markers if one.get(SCENE) == key]
+    return sorted(_wanted(collection)) == sorted((one.name, one.frame, one.get(GROUP)) for one in own)
 
 
-def _wanted(collection: bpy.types.Collection) -> Iterator[tuple[str, int]]:
-    """Names and frames of the markers. Shadows follow their casters, so they have none."""
-    times = timeline.of_collection(collection)
+def _key(collection: bpy.types.Collection) -> str:
+    """Id of a loaded scene; linked scenes without one are known by their name."""
+    return collection.get(SCENE) or collection.name_full
+
+
+def _new_key(collection: bpy.types.Collection) -> str:
+    """Id of a loaded scene, created if it is missing or was copied."""
+    same = [one for one in loaded_scenes.scene_collections() if one != collection and _key(one) == _key(collection)]
+    if collection.library is None and (SCENE not in collection or same):
+        collection[SCENE] = uuid.uuid4().hex
+    return _key(collection)
+
+
+def _wanted(collection: bpy.types.Collection) -> set[tuple[str, int, int]]:
+    """Names, frames and motion groups of the markers. Shadows follow their casters, so they have none."""
+    times, wanted = timeline.of_collection(collection), set()
     for anchor in loaded_scenes.members(collection, "ANCHOR"):
-        if anchor.r5dgs_motion.learned_leader is not None:
+        if anchor.r5dgs_motion.learned_leader is None:
+            for event in physics.history(anchor).events:
+                frame = round(times.frame(event.time))
+                wanted.add((f"{_label(anchor)}: {event.kind}", frame, anchor.r5dgs.motion_id))
+    return wanted
+
+
+def _label(anchor: bpy.types.Object) -> str:
+    """Name of an anchor's object with Blender's number, which tells objects of several scenes apart."""
+    return re.sub(r" anchor(?=(\.\d+)?$)", "", anchor.name)
+
+
+@persistent
+def _follow(scene, depsgraph=None):
+    """Rename the markers of renamed objects, and remove those of scenes that are gone."""
+    own = [marker for marker in scene.timeline_markers if SCENE in marker]
+    if not own or threading.current_thread() is not threading.main_thread():
+        return
+    there = {_key(collection): collection for collection in loaded_scenes.shown(scene)}
+    labels: dict[tuple[str, int], set[str]] = {}
+    for key, collection in there.items():
+        for anchor in loaded_scenes.members(collection, "ANCHOR"):
+            labels.setdefault((key, anchor.r5dgs.motion_id), set()).add(_label(anchor))
+    for marker in own:
+        if marker[SCENE] not in there:
+            scene.timeline_markers.remove(marker)
             continue
-        for event in physics.history(anchor).events:
-            yield f"{anchor.name.removesuffix(' anchor')}: {event.kind}", round(times.frame(event.time))
+        label, colon, kind = marker.name.rpartition(": ")
+        current = labels.get((marker[SCENE], marker.get(GROUP)), set())
+        if colon and len(current) == 1 and label not in current:  # duplicates share a group
+            marker.name = f"{next(iter(current))}: {kind}"
+
+
+def register():
+    """Register the handler."""
+    bpy.app.handlers.depsgraph_update_post.append(_follow)
+
+
+def unregister():
+    """Undo `register`."""
+    if _follow in bpy.app.handlers.depsgraph_update_post:
+        bpy.app.handlers.depsgraph_update_post.remove(_follow)

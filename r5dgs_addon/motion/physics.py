@@ -3,6 +3,7 @@
 Unedited fields keep the precision of the file: a rate counts as edited if it differs from the learned one in float32.
 """
 
+import functools
 import hashlib
 import json
 from collections.abc import Iterable
@@ -25,6 +26,7 @@ from . import curve_place, fcurves, motion_fields
 RATES = tuple(motion_fields.VECTORS)
 FIELDS = (*RATES, *models.SCALARS)
 _LEAST_MOMENT = 1e-3  # minimum moment of inertia of flat or thin bodies, as a fraction of the largest
+_parsed = functools.lru_cache(maxsize=1024)(json.loads)  # for panels; callers must not change the result
 
 
 def remember(
@@ -150,16 +152,20 @@ def reset(anchor: bpy.types.Object) -> None:
 def basis(state: bpy.types.PropertyGroup) -> MotionModel:
     """Motion before edits of the fields: from the scene file, or taken from another object."""
     if state.taken:
-        return MotionModel.from_dict(json.loads(state.taken))
-    return MotionModel.from_dict(json.loads(state.learned)["model"]) if state.learned else models.STATIC
+        return MotionModel.from_dict(_parsed(state.taken))
+    return MotionModel.from_dict(_parsed(state.learned)["model"]) if state.learned else models.STATIC
 
 
 def history(anchor: bpy.types.Object) -> History:
     """Observed events of an anchor and the band of its learned motion; empty for files of older versions."""
-    learned = anchor.r5dgs_motion.learned
-    stored = json.loads(learned).get("history", {}) if learned else {}
+    return _history(anchor.r5dgs_motion.learned)
+
+
+@functools.lru_cache(maxsize=1024)
+def _history(learned: str) -> History:
+    stored = _parsed(learned).get("history", {}) if learned else {}
     try:
-        return history_json.read(json_row.Row(stored, anchor.name))
+        return history_json.read(json_row.Row(stored, "history"))
     except errors.R5dgsError:  # written by a newer version
         return NO_HISTORY
 
@@ -218,13 +224,13 @@ def inertia(anchor: bpy.types.Object) -> np.ndarray:
 
 def allow(anchor: bpy.types.Object, error: float) -> None:
     """Set the allowed error of an anchor's keys, in scene units."""
-    kept = json.loads(anchor.r5dgs_motion.learned)
+    kept = _parsed(anchor.r5dgs_motion.learned)
     anchor.r5dgs_motion.learned = json.dumps({**kept, "allowed": error})
 
 
 def size(anchor: bpy.types.Object) -> float:
     """Object size of an anchor: twice the radius used to weigh its learned motion, in scene units."""
-    kept = json.loads(anchor.r5dgs_motion.learned)
+    kept = _parsed(anchor.r5dgs_motion.learned)
     return 2.0 * (kept["model"]["radius"] if kept["reach"] else key_error(anchor)[1])
 
 
@@ -241,7 +247,7 @@ def _points(anchor: bpy.types.Object) -> np.ndarray:
 
 def key_error(anchor: bpy.types.Object) -> tuple[float, float]:
     """Allowed error of an anchor's keys, and largest distance of its points from it, in scene units."""
-    kept = json.loads(anchor.r5dgs_motion.learned)
+    kept = _parsed(anchor.r5dgs_motion.learned)
     return kept["allowed"], kept["reach"] or _reach(anchor)
 
 
@@ -254,7 +260,7 @@ def follow_matrix(state: bpy.types.PropertyGroup) -> np.ndarray | None:
     """Linear map from the leader's displacement to this anchor's, or None without leader. [3, 3]"""
     if state.leader is None:
         return None
-    matrix = json.loads(state.learned)["follow_matrix"]
+    matrix = _parsed(state.learned)["follow_matrix"]
     return np.eye(3) if matrix is None else np.array(matrix, np.float64)
 
 

@@ -46,6 +46,57 @@ def test_events_are_marked_on_the_timeline_once(blender, loaded):
     assert markers(blender) == sorted([*expected, (31, "mine")])
 
 
+def test_markers_follow_a_renamed_object(blender, loaded):
+    scene = blender.context.scene
+    scene.timeline_markers.new("mine: start", frame=5)
+    blender.data.objects["mug anchor"].name = "cup anchor"
+    blender.context.view_layer.update()
+    expected = [(5, "mine: start"), (13, "cup: start"), (31, "cup: impact"), (46, "t_max")]
+    assert markers(blender) == expected
+    blender.ops.r5dgs.fit_timeline()
+    assert markers(blender) == expected
+
+
+def test_two_scenes_have_markers_of_their_own_which_go_with_them(blender, loaded, scene_path, tmp_path):
+    first = markers(blender)
+    name = motions.load(blender, scene_path).name
+    added = [(13, "mug.001: start"), (31, "mug.001: impact")]
+    assert markers(blender) == sorted([*first, *added])
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    blender.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
+    second = blender.data.collections[name]
+    blender.data.batch_remove([*second.all_objects, *second.children_recursive, second])
+    blender.context.view_layer.update()
+    assert markers(blender) == first
+    blender.ops.r5dgs.fit_timeline()
+    assert markers(blender) == first
+
+
+def test_a_changed_motion_replaces_the_markers_of_its_scene(blender, loaded, mug):
+    import json
+
+    learned = json.loads(mug.r5dgs_motion.learned)
+    learned["history"]["events"][1]["time"] = 0.6
+    mug.r5dgs_motion.learned = json.dumps(learned)
+    event_markers = motions.addon("motion.event_markers")
+    assert not event_markers.shown(blender.context.scene, loaded)
+    blender.ops.r5dgs.fit_timeline()
+    assert markers(blender) == [(13, "mug: start"), (37, "mug: impact"), (46, "t_max")]
+    assert event_markers.shown(blender.context.scene, loaded)
+
+
+def test_panels_parse_a_history_once(blender, mug, monkeypatch):
+    physics = motions.addon("motion.physics")
+    monkeypatch.setattr(physics.json_row, "Row", lambda *_: pytest.fail("parsed again"))
+    physics._history.cache_clear()
+    with pytest.raises(pytest.fail.Exception):
+        physics.history(mug)
+    monkeypatch.undo()
+    found = physics.history(mug)
+    monkeypatch.setattr(physics.json_row, "Row", lambda *_: pytest.fail("parsed again"))
+    assert physics.history(mug) is found
+
+
 def test_no_event_is_marked_if_the_timeline_is_kept(blender, scene_path):
     motions.load(blender, scene_path, fit_timeline=False)
     assert markers(blender) == []
