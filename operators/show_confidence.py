@@ -16,7 +16,7 @@ ACTIONS = (
 
 
 class R5DGS_OT_show_confidence(polls.NeedsScene, bpy.types.Operator):
-    """Show extrapolated paths of the selected objects, or of all, as tubes containing the true path at 95 % probability"""
+    """Show the 95 % confidence bands of the extrapolated paths of the selected objects, or of all, as tubes"""
 
     bl_idname = "r5dgs.show_confidence"
     bl_label = "Show Confidence"

@@ -144,7 +144,7 @@ def _check_size(scene: Scene, path: Path) -> None:
     if size < SMALLEST:
         factor = 10.0 ** -math.floor(math.log10(size))
         raise errors.SceneFileError(
-            f"{path}: expected a scene of {SMALLEST:g} units or more, as Blender's animation has no finer steps than "
+            f"{path}: expected a scene of {SMALLEST:g} units or more, because Blender's animation has steps of "
             f"1e-7, found {size:.3g}; multiply the positions of the data set's cameras by {factor:g} and train again"
         )
 

@@ -79,7 +79,7 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         layout.use_property_split = True
         layout.prop(self, "worker_python")
         if os.environ.get(ENVIRONMENT):
-            layout.label(text=f"{ENVIRONMENT} is set and wins: {os.environ[ENVIRONMENT]}", icon="INFO")
+            layout.label(text=f"Overridden by {ENVIRONMENT}: {os.environ[ENVIRONMENT]}", icon="INFO")
         elif not self.worker_python and (named := _of_user_settings()):
             layout.label(text=f"From 'r5dgs config --user': {named}", icon="INFO")
         elif not self.worker_python and self.found_python:
@@ -87,11 +87,11 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         layout.prop(self, "worker_timeout")
         layout.prop(self, "text_encoder")
         if os.environ.get(ENCODER_ENVIRONMENT):
-            wins = f"{ENCODER_ENVIRONMENT} is set and wins: {os.environ[ENCODER_ENVIRONMENT]}"
-            layout.label(text=wins, icon="INFO")
+            text = f"Overridden by {ENCODER_ENVIRONMENT}: {os.environ[ENCODER_ENVIRONMENT]}"
+            layout.label(text=text, icon="INFO")
         layout.prop(self, "trusted_folders")
         if os.environ.get(TRUSTED_ENVIRONMENT):
-            layout.label(text=f"And {TRUSTED_ENVIRONMENT}: {os.environ[TRUSTED_ENVIRONMENT]}", icon="INFO")
+            layout.label(text=f"Also {TRUSTED_ENVIRONMENT}: {os.environ[TRUSTED_ENVIRONMENT]}", icon="INFO")
         worker_status.draw(layout, context)
 
 

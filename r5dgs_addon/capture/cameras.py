@@ -62,10 +62,10 @@ def choose(context: bpy.types.Context, settings: CaptureSettings, box: np.ndarra
         if rig == "ARC" and settings.observed == "":
             observed, novel = [], []
     if rig == "NONE" and not observed:
-        wanted = f"named {settings.observed!r}" if settings.observed else "not called novel"
+        wanted = f"named {settings.observed!r}" if settings.observed else "that is not novel"
         raise errors.ConfigError(
-            f"capture.observed: expected at least one camera {wanted}, found {len(cameras)} cameras in the scene of "
-            "which none is; add cameras or choose a rig"
+            f"capture.observed: expected at least one camera {wanted}, found none among {len(cameras)} cameras of the "
+            "scene; add cameras or choose a rig"
         )
     views = Views(tuple(View(ob.name, ob) for ob in observed), tuple(View(ob.name, ob) for ob in novel))
     if rig != "NONE":

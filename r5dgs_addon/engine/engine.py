@@ -73,7 +73,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         if objections:
             self.report(
                 {"WARNING"},
-                f"R5DGS: colors do not come out as trained with {', '.join(objections)}; press 'Show Colors as "
+                f"R5DGS: colors are not as trained with {', '.join(objections)}; press 'Show Colors as "
                 "Trained' in the render properties",
             )
         passes, transparent = render_passes.of_layer(layer), scene.render.film_transparent

@@ -126,7 +126,9 @@ def in_axes(depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object, axes: str,
     own = view_cameras.of_camera(depsgraph, lambda: np.zeros((0, 3)), camera, border=False).camera
     turn = gaussians.world_to(axes, world)
     if not affine_transform.is_similarity(turn[:3, :3]) or np.linalg.det(turn[:3, :3]) < 0:
-        raise errors.ConfigError("export: expected a root with one scale on all axes, found another; choose other axes")
+        raise errors.ConfigError(
+            "export: expected a root with uniform, positive scale, found another; choose other axes"
+        )
     matrix = turn @ cameras.cam_world_to_opengl(own.T_cam_world)
     return cameras.Camera(own.width, own.height, own.intrinsics, cameras.opengl_to_cam_world(matrix), camera.name)
 
@@ -145,6 +147,6 @@ def _cameras(scene: bpy.types.Scene, which: str, notes: list[str]) -> list[bpy.t
     for camera in _sorted(scene):
         if camera.data.type == "PERSP":
             found.append(camera)
-        elif (note := f"{camera.name}: left out, as it is {camera.data.type.lower()} and not perspective") not in notes:
+        elif (note := f"{camera.name}: left out, as it is {camera.data.type.lower()}, not perspective") not in notes:
             notes.append(note)
     return found

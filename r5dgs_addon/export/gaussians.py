@@ -28,7 +28,7 @@ AXES = (
 )
 WHICH = (
     ("SELECTED", "Selected", "Selected objects, and the clouds of selected anchors and roots"),
-    ("VISIBLE", "All Visible", "Everything that can be seen in this view layer"),
+    ("VISIBLE", "All Visible", "All clouds that are visible in this view layer"),
 )
 
 
@@ -141,7 +141,7 @@ def splats_of(
             points = from_points(evaluated_points.evaluated(one.object, depsgraph), one.object.r5dgs.object_id)
             parts.append(affine_transform.carry(points, matrix, np.array(one.tint)))
         if parts[-1].sh.shape[1] > 1 and not affine_transform.is_similarity(matrix[:3, :3]):
-            sources.note(f"{names[-1]}: scaled unevenly; how its colors change with the direction is a best fit")
+            sources.note(f"{names[-1]}: scaled non-uniformly; its view-dependent colors are a best fit")
     return affine_transform.join(parts), names
 
 

@@ -20,7 +20,7 @@ from . import cameras, frame_range
 LOOK_S = 0.005  # polling interval of the worker
 LAYER = "R5DGS"  # layer name of the EXR channels, as in Blender's own multilayer files
 FORMATS = (
-    ("PNG", "Masks", "PNG of 8 bits, or 16 where an id exceeds 255, in object_mask; 0 is the background"),
+    ("PNG", "Masks", "PNG of 8 bits, or 16 if an id exceeds 255, in object_mask; 0 is the background"),
     ("EXR", "Index and Depth", "Multilayer OpenEXR in object_index: object index, depth and alpha, for the compositor"),
     ("BOTH", "Both", "Masks, and index with depth"),
 )

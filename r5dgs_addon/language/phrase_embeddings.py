@@ -113,7 +113,7 @@ def forget() -> None:
 
 
 def _steps(where: str, asked: Sequence[str]) -> jobs.Steps:
-    return [("asking the text encoder", "embed", {"encoder": where, "texts": list(asked)})]
+    return [("running the text encoder", "embed", {"encoder": where, "texts": list(asked)})]
 
 
 def _keep(where: str, asked: Sequence[str], answer: jobs.Answer) -> None:

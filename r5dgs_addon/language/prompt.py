@@ -19,8 +19,10 @@ from ..ui import status_bar
 from . import phrase_embeddings
 
 HISTORY = 12  # maximum number of stored prompts
-ASKING = "Asking the text encoder for "  # prefix of the note shown while the encoder works
-STRANGER = "{}: made by the encoder {!r}; the preferences' {!r} cannot be asked: make its table again with that one"
+ASKING = "Running the text encoder for "  # prefix of the note shown while the encoder runs
+STRANGER = (
+    "{}: its table was made by the encoder {!r}, not by {!r} of the preferences; make the table again with that one"
+)
 _meanings: file_cache.Remembered[object_search.Meanings | None] = file_cache.Remembered(scene_file.read_meanings)
 
 
@@ -215,7 +217,7 @@ def _stored_meanings(collection: bpy.types.Collection) -> tuple[object_search.Me
     try:
         return _meanings.get(render_request.scene_path(collection)), ""
     except errors.SceneFileError as error:
-        return None, f"{collection.name}: searched by names alone, as its scene file cannot be read: {error}"
+        return None, f"{collection.name}: searched by names only, because its scene file cannot be read: {error}"
 
 
 def _show(session: bpy.types.PropertyGroup, text: str, answer: Answer) -> None:

@@ -1,9 +1,9 @@
 """Confidence tubes around extrapolated paths: 95 % bands.
 
-The radius is the half width of the stored band. If there is none, or the motion was edited, it is two standard
-deviations of the position by the covariance of the rates; edited rates then count as certain. The tube is a mesh with
-the anchor's parent. It is not rendered and not selectable. Its colour shows the uncertainty relative to the object's
-size.
+The radius is the half width of the stored band. If there is no band, or the motion was edited, it is two standard
+deviations of the position, computed from the covariance of the rates with edited rates as exact. The tube is a mesh
+with the anchor's parent. It is not rendered and not selectable. Its colour shows the uncertainty relative to the
+object's size.
 """
 
 import bpy
@@ -21,7 +21,7 @@ SIDES = 12
 THINNEST = 0.004  # minimum radius as a fraction of the object's reach, so that certain paths stay visible
 COLOR = "confidence"
 SURE, UNSURE = (0.05, 0.6, 0.3), (0.9, 0.15, 0.05)  # linear RGB
-LOST = 1.0  # half width of the most uncertain colour, as a fraction of the object's reach
+LOST = 1.0  # half width at which the colour is `UNSURE`, as a fraction of the object's reach
 SIGMAS = 2.0  # half width of a 95 % band in standard deviations
 
 
@@ -100,7 +100,7 @@ def path(anchor: bpy.types.Object, times: timeline.Times) -> tuple[np.ndarray, n
     follow = physics.follow_matrix(anchor.r5dgs_motion)
     model = physics.model(physics.mover(anchor))
     if models.steps_needed(model, tau[-1:])[0] > _MOST_STEPS:
-        raise errors.ConfigError(f"{anchor.name}: moves too fast for a path; take smaller rates under Motion")
+        raise errors.ConfigError(f"{anchor.name}: moves too fast for a path; lower the rates under Motion")
     _, displacements = models.evaluate(model, tau)
     band = physics.band(physics.mover(anchor))
     widths = SIGMAS * confidence.position_sigma(model, tau) if band is None else band.widths(times.t_max + tau)

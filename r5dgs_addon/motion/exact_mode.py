@@ -56,7 +56,7 @@ def _file_of(collection: bpy.types.Collection, again: bool = False) -> File:
     if len(found.means) != collection.r5dgs.gaussians:
         raise errors.SceneFileError(
             f"{path}: expected the {collection.r5dgs.gaussians} Gaussians that were loaded, found {len(found.means)}; "
-            "load the scene anew"
+            "load the scene again"
         )
     return found
 
@@ -72,7 +72,7 @@ def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> i
         raise errors.ConfigError(f"{collection.name}: its points lie in another .blend file; append the scene instead")
     count = len(_file_of(collection, again=True).bending.rows)
     if not count:
-        raise errors.ConfigError(f"{collection.name}: every object moves as a whole; there is nothing more to play")
+        raise errors.ConfigError(f"{collection.name}: all objects are rigid; there is no residual motion to play")
     state = collection.r5dgs_exact
     if not state.enabled:
         state.locked = context.scene.render.use_lock_interface
@@ -138,7 +138,7 @@ def _try(collection: bpy.types.Collection, frame: float) -> None:
         problem = str(error)
         if problem not in _told:
             _told.add(problem)
-            _log.warning("R5DGS: %s: Exact Mode plays nothing that bends: %s", collection.name, problem)
+            _log.warning("R5DGS: %s: Exact Mode cannot play the residual motion: %s", collection.name, problem)
     if collection.r5dgs_exact.problem != problem:
         collection.r5dgs_exact.problem = problem
 

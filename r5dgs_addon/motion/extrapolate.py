@@ -145,7 +145,7 @@ def _sampler(
     span = min(times.t_end - times.t_max, max(times.t_max - times.t_start, 1 / times.frames_per_unit))
     if models.steps_needed(model, np.array([span]))[0] > MOST_STEPS:
         raise errors.ConfigError(
-            f"{mover.name}: an orbit this fast or far off cannot be integrated; take smaller rates, or Throw and Spin"
+            f"{mover.name}: the orbit is too fast or too large to integrate; lower the rates, or choose Throw and Spin"
         )
     poses = reduction.model_sampler(model, times.t_max, most)
 
@@ -245,7 +245,7 @@ def source(anchors: list[bpy.types.Object], path: Path) -> Scene:
         motion_id = anchor.r5dgs.motion_id
         pivot = np.float32(scene.groups[motion_id].pivot) if motion_id < len(scene.groups) else None
         if pivot is None or (motion_id and (np.array(anchor.r5dgs.pivot, np.float32) != pivot).any()):
-            raise errors.SceneFileError(f"{path}: expected the scene of '{anchor.name}', found another; load it anew")
+            raise errors.SceneFileError(f"{path}: expected the scene of '{anchor.name}', found another; load it again")
     return scene
 
 

@@ -93,7 +93,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     )
     too_fast: BoolProperty(
         name="Too Fast for Keys",
-        description="The motion turns or swings too fast for keys, which are exact only at frames",
+        description="The motion rotates or swings too fast for keys, which are exact only at frames",
         options={"HIDDEN"},
     )
     at_once: BoolProperty(name="Write at Once", description="Re-extrapolate whenever a value changes", options=set())
@@ -156,17 +156,17 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     )
     frequency: FloatProperty(
         name="Swings /s",
-        description="Oscillations per second; 0 for none",
+        description="Oscillations per second; 0 for a steady motion",
         **_scalar("frequency", math.tau),
     )
     damping: FloatProperty(
         name="Damping /s",
-        description="Rate at which a swing, or the velocity under drag, decays, per second",
+        description="Decay rate of a swing, or of the velocity under drag, per second",
         **_scalar("damping"),
     )
     stop_time: FloatProperty(
         name="Rests After",
-        description="Seconds from the last observed time until the object rests; 0 for never",
+        description="Seconds from the last observed time until the object rests; 0 if it never rests",
         subtype="TIME_ABSOLUTE",
         unit="TIME_ABSOLUTE",
         **_scalar("stop_time"),
@@ -233,7 +233,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     leader: PointerProperty(
         name="Follows",
         description="Anchor whose path this one follows past the last observed time, like a shadow; "
-        "empty for a motion of its own",
+        "empty for its own motion",
         type=bpy.types.Object,
         poll=lambda state, obj: obj.r5dgs.role == "ANCHOR" and obj != state.id_data,
         options=set(),

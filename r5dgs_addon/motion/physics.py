@@ -104,7 +104,7 @@ def too_fast(anchors: Iterable[bpy.types.Object]) -> str:
     if not names:
         return ""
     return (
-        f"Too fast for keys, which are exact only at frames: {plural.names(names)}; take smaller rates under Motion, "
+        f"Too fast for keys, which are exact only at frames: {plural.names(names)}; lower the rates under Motion, "
         "or train with more frames per unit of time"
     )
 
@@ -195,7 +195,7 @@ def model(anchor: bpy.types.Object) -> MotionModel:
     """Current motion of an anchor from its fields, relative to its pose at t_max.
 
     A learned motion blends from the noisy last observed pose to the path fitted to all observations. An edited motion
-    starts exactly with the displayed rates. Edited rates count as certain; the covariance covers the others.
+    starts exactly with the displayed rates. Edited rates are treated as exact; the covariance covers the others.
 
     Raises:
         ConfigError: A field has an invalid value.

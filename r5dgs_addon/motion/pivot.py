@@ -45,8 +45,8 @@ def move(anchor: bpy.types.Object, to: np.ndarray) -> None:
     if model is None or old is None:
         kind = anchor.r5dgs_motion.bl_rna.properties["kind"].enum_items[anchor.r5dgs_motion.kind].name
         raise errors.ConfigError(
-            f"{anchor.name}: the motion '{kind}' has no pivot as it is; choose Throw and Spin, give it a spin, or "
-            "swings to what slides"
+            f"{anchor.name}: the motion '{kind}' has no pivot; choose Throw and Spin, set a spin, or set Swings for "
+            "Slide"
         )
     offset = np.asarray(to, np.float64) - _place(anchor)
     if not np.isfinite(offset).all():
@@ -126,7 +126,7 @@ def _store(anchor: bpy.types.Object, model: MotionModel) -> None:
     with np.errstate(over="ignore"):
         values = {name: getattr(model, name).astype(np.float32) for name in physics.RATES}
     if not all(np.isfinite(value).all() for value in values.values()):
-        raise errors.ConfigError(f"{anchor.name}: the pivot lies too far off for so fast a spin")
+        raise errors.ConfigError(f"{anchor.name}: the pivot is too far away for this spin; lower the spin")
     for name, value in values.items():
         if (value != np.array(getattr(state, f"stored_{name}"), np.float32)).any():
             setattr(state, f"stored_{name}", value)

@@ -154,8 +154,9 @@ def _mixed(name: str, parts: list[Curve], mix: np.ndarray) -> list[Curve]:
         )
         if not same:
             raise errors.ConfigError(
-                f"{name}: its rotation curves have keys at different frames, so that they cannot be turned as a whole; "
-                "bake them first (Object > Animation > Bake Action), or choose a frame at which both are turned alike"
+                f"{name}: its rotation curves have keys at different frames, so they cannot be rotated together; "
+                "bake them first (Object > Animation > Bake Action), or choose a frame at which both have the same "
+                "rotation"
             )
     result = []
     for row in mix:

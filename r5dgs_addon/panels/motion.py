@@ -67,7 +67,7 @@ def _physics(layout, anchor) -> None:
 
 
 def draw_warning(layout, anchor) -> None:
-    """Draw the reason to distrust the learned prediction, if there is one."""
+    """Draw a warning if the learned motion is not predictable."""
     warning = physics.history(anchor).warning()
     if warning and physics.band(anchor) is not None:
         status_bar.wrapped(layout, bpy.context, warning.capitalize(), "ERROR")

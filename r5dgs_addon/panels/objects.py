@@ -80,7 +80,7 @@ def _draw_active(box, collection, entry):
     if entry.caption:
         box.label(text=entry.caption)
     row = box.row()
-    row.label(text="Also Found As")
+    row.label(text="Aliases")
     row.operator("r5dgs.add_alias", text="", icon="ADD").object_id = entry.object_id
     for alias in entry.aliases:
         line = box.row(align=True)

@@ -46,7 +46,7 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
         objections = display_to_linear.objections(scene)
         if objections:
             box = layout.box().column(align=True)
-            text = f"Colors do not come out as trained: {', '.join(objections)}"
+            text = f"Colors are not as trained: {', '.join(objections)}"
             status_bar.wrapped(box, context, text, "ERROR")
             box.operator("r5dgs.show_colors_as_trained", icon="COLOR")
         for note in render_notes.of(scene):
@@ -60,7 +60,7 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
             status_bar.wrapped(column, context, text, "CHECKMARK")
             draw_loss(column, scene)
             if inverse.reach < display_to_linear.WIDE:
-                status_bar.wrapped(column, context, "Very saturated colors stay paler")
+                status_bar.wrapped(column, context, "Very saturated colors are paler than trained")
         column.prop(settings, "sky")
         column.prop(scene.render, "film_transparent", text="Transparent")
         column.prop(settings, "moving")

@@ -80,7 +80,7 @@ def _points(scene: Scene) -> np.ndarray:
 
 
 def _score(camera: cameras.Camera, points: np.ndarray) -> float:
-    """Share of the points inside a camera's picture, less their mean distance from its middle in half diagonals."""
+    """Share of the points inside a camera's image, minus their mean distance from its centre in half diagonals."""
     own = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
     depth = np.maximum(own[:, 2:], 1e-9)
     pixels = (own @ camera.intrinsics.T)[:, :2] / depth

@@ -72,12 +72,12 @@ def check_end(name: str, times: Times) -> None:
     longest = max(times.t_max + LONGEST * max(times.t_max - times.t_start, 1 / times.frames_per_unit), 1.0)
     if not times.t_end <= longest:
         raise errors.ConfigError(
-            f"{name}: expected an end up to {longest:.4g}, {LONGEST:g} times as long as was observed, found "
-            f"{times.t_end:.4g}; extrapolate less far"
+            f"{name}: expected an end of at most {longest:.4g}, {LONGEST:g} observed spans after t_max, found "
+            f"{times.t_end:.4g}; choose an earlier end"
         )
     for what, t, remedy in (
         ("observed times", max(times.t_start, times.t_max, key=abs), "train with fewer frames per unit of time"),
-        ("extrapolated times", times.t_end, "extrapolate less far"),
+        ("extrapolated times", times.t_end, "choose an earlier end"),
     ):
         if abs(times.frame(t)) > LAST_FRAME:
             raise errors.ConfigError(

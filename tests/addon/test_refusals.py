@@ -91,11 +91,11 @@ def test_reset_of_two_scenes_changes_neither_where_the_file_of_one_is_damaged(bl
 @pytest.mark.parametrize("t_end", [15.8, 1e30, math.inf])
 def test_an_end_that_extrapolation_refuses_is_refused_by_loading_too(blender, scene_path, t_end):
     before = {kind: len(getattr(blender.data, kind)) for kind in KINDS}
-    with pytest.raises(RuntimeError, match="synthetic.r5dgs: expected an end up to 15.75"):
+    with pytest.raises(RuntimeError, match="synthetic.r5dgs: expected an end of at most 15.75"):
         blender.ops.r5dgs.load_scene(filepath=str(scene_path), t_end=t_end)
     assert {kind: len(getattr(blender.data, kind)) for kind in KINDS} == before
     collection = motions.load(blender, scene_path, t_end=4.0)
-    with pytest.raises(RuntimeError, match="expected an end up to 15.75"):
+    with pytest.raises(RuntimeError, match="expected an end of at most 15.75"):
         blender.ops.r5dgs.extrapolate_until(t_end=t_end)
     assert collection.r5dgs.t_end == 4.0
 

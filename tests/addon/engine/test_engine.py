@@ -301,7 +301,7 @@ def test_other_view_transforms_are_inverted(blender, loaded, scene, tmp_path, vi
     assert reached.mean() > 0.2 and np.median(near[reached]) <= 1 and np.percentile(near[reached], 95) < 3
     assert color.objections(blender.context.scene) == []
     said = layouts.draw(blender, *importlib.import_module("r5dgs.r5dgs_addon.panels.render").CLASSES)
-    assert f"{view} is inverted for Gaussians" in said and ("stay paler" in "".join(said)) == (view == "AgX")
+    assert f"{view} is inverted for Gaussians" in said and ("are paler" in "".join(said)) == (view == "AgX")
     blender.context.scene.r5dgs_render.as_trained = False
     assert np.abs(render_png(blender, tmp_path, "changed") - expected).mean() > 5 * np.abs(saved - expected).mean()
 

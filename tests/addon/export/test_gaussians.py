@@ -304,7 +304,7 @@ def test_inexact_transforms_of_the_export_are_reported(blender, loaded, tmp_path
     blender.context.view_layer.update()
     assert 2 not in export(blender, tmp_path / "a.ply").object_ids
     said = capsys.readouterr().out
-    assert "mug: scaled unevenly" in said
+    assert "mug: scaled non-uniformly" in said
     assert "red apple" not in said
 
 

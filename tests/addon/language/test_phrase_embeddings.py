@@ -78,7 +78,7 @@ def test_without_an_encoder_other_words_find_nothing(loaded, monkeypatch):
 def test_another_encoder_is_named_with_the_remedy(loaded, folders, monkeypatch):
     monkeypatch.setenv("R5DGS_TEXT_ENCODER", str(folders[1]))
     assert ask(loaded, "zorb") == {"CANCELLED"}
-    assert "made by the encoder 'own'; the preferences' 'other' cannot be asked" in notes(loaded)[0]
+    assert "made by the encoder 'own', not by 'other' of the preferences" in notes(loaded)[0]
 
 
 def test_a_damaged_encoder_is_reported_and_names_are_still_searched(loaded, tmp_path, monkeypatch):
@@ -110,7 +110,7 @@ def test_a_window_shows_at_once_what_is_known_and_then_the_rest(windowed):
     session = windowed.context.window_manager.r5dgs_words
     assert ask(windowed, "mug and zorb") == {"FINISHED"}
     assert [match.object_id for match in session.matches] == [1]
-    assert notes(windowed) == ["Asking the text encoder for 'zorb'"]
+    assert notes(windowed) == ["Running the text encoder for 'zorb'"]
     wait_for_the_answer()
     assert {1, 2} <= {match.object_id for match in session.matches} and notes(windowed) == []
 

@@ -595,7 +595,7 @@ def test_a_velocity_that_is_not_finite_raises_an_error_that_names_it(blender, mu
 def test_an_end_beyond_all_measure_is_refused_and_nothing_changes(blender, loaded, mug):
     before = motions.keys(mug)
     for t_end in (20.0, math.inf, math.nan):
-        with pytest.raises(RuntimeError, match="expected an end up to 15.75"):
+        with pytest.raises(RuntimeError, match="expected an end of at most 15.75"):
             blender.ops.r5dgs.extrapolate_until(t_end=t_end)
     assert motions.keys(mug) == before and loaded.r5dgs.t_end == 1.0
 
