@@ -52,7 +52,7 @@ class Clock:
 
 
 def measure(path: Path, rounds: int, package: str) -> dict[str, float]:
-    """The round of a scene that took the processor least."""
+    """Times of a scene, from the round with the least processor time."""
     reading = importlib.import_module(f"{package}.r5dgs_core.scene.scene_file")
     keying = importlib.import_module(f"{package}.r5dgs_addon.motion.keyframes")
     found = []
@@ -66,8 +66,8 @@ def measure(path: Path, rounds: int, package: str) -> dict[str, float]:
 
 def main(arguments: list[str]) -> None:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description="Seconds that Blender takes to load a scene.")
-    parser.add_argument("--json", type=Path, help="write the rows there")
+    parser = argparse.ArgumentParser(description="Measure the time to load a scene in Blender.")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--gaussians", type=int, nargs="*", help="only scenes of these sizes")
     options = parser.parse_args(arguments)

@@ -40,7 +40,7 @@ ORIGIN = np.array([3.0, -2.0, 1.5])  # of the camera
 
 
 def make_scene(count: int, bodies: int, kind: str = "ballistic_spin", seed: int = 0) -> Scene:
-    """Bodies in a row, each with a motion of a kind, and members whose own dynamics differ a little from it."""
+    """Row of bodies, one per kind of motion, whose members' own dynamics differ slightly from that of the body."""
     rng = np.random.default_rng(seed)
     ids = np.sort(rng.integers(1, bodies + 1, count)).astype(np.int32)
     centers = np.concatenate([np.zeros((1, 3)), rng.uniform(-2, 2, (bodies, 3))])
@@ -118,7 +118,7 @@ class Networks:
             return self.means + self.field(self.means, T_MAX).offsets
 
     def states(self) -> trd.MotionState:
-        """The TRD there."""
+        """The TRD at t_max."""
         with torch.no_grad():
             return self.trd(self.means, T_MAX)
 
@@ -155,7 +155,7 @@ def contenders(count: int, bodies: int, size: str, horizon: float) -> dict[tuple
 
 
 def measure(calls: dict[tuple[str, str], Callable[[float], object]], rounds: int) -> list[dict[str, Any]]:
-    """Rows of `COLUMNS`; contenders take turns."""
+    """Rows of `COLUMNS`, measured in interleaved rounds."""
     spent: dict[tuple[str, str], list[float]] = {name: [] for name in calls}
     shares = np.random.default_rng(0).uniform(0.05, 1.0, rounds)
     for call in calls.values():
@@ -177,12 +177,12 @@ def measure(calls: dict[tuple[str, str], Callable[[float], object]], rounds: int
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure, print, write."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gaussians", type=int, default=40000, metavar="N")
     parser.add_argument("--bodies", type=int, default=12, metavar="K")
     parser.add_argument("--size", choices=sorted(deformation.SHAPES), default="complex", help="of the networks")
-    parser.add_argument("--horizon", type=float, default=T_MAX / 3, metavar="T", help="how far past t_max to play")
+    parser.add_argument("--horizon", type=float, default=T_MAX / 3, metavar="T", help="played time past t_max")
     parser.add_argument("--rounds", type=int, default=30, metavar="R")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""Times and memory of functions that take turns, each with its own number of torch threads."""
+"""Time and memory of functions that run in interleaved rounds, each with its own number of torch threads."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Contender(timing.Contender):
         label: Other columns of its row.
         torch_threads: Threads of torch's own operations.
         times: Times of a call, after `take_turns`.
-        peak_mb: Largest resident memory during a call beyond that before it; None if it is not known.
+        peak_mb: Peak resident memory during a call minus that before it; None if unknown.
     """
 
     def __init__(self, label: dict[str, Any], run: Callable[[], object], torch_threads: int = 1) -> None:
@@ -42,7 +42,7 @@ class Contender(timing.Contender):
         return super().take_turn()
 
     def row(self) -> dict[str, Any]:
-        """The label and the figures: smallest processor time, smallest and median wall time, peak memory."""
+        """The label, the smallest processor time, the smallest and median wall time, and the peak memory."""
         return {
             **self.label,
             "cpu_ms": round(self.times.cpu[0], 4),
@@ -57,9 +57,9 @@ def take_turns(contenders: Sequence[Contender], turns: int, memory: bool = True)
 
     Args:
         contenders: They receive their times and their peak memory.
-        turns: Turns of each; slow ones take fewer.
-        memory: Whether to measure memory, in separate calls: they first return freed memory to the system, and
-            allocating it again takes time.
+        turns: Number of rounds; slow contenders take part in fewer.
+        memory: True to measure memory. This takes separate calls, which first return freed memory to the system,
+            because allocating it again takes time.
     """
     before = torch.get_num_threads()
     try:
@@ -73,7 +73,7 @@ def take_turns(contenders: Sequence[Contender], turns: int, memory: bool = True)
 
 
 def measure_peak(run: Callable[[], object], calls: int = 2) -> float | None:
-    """Largest resident memory during a call beyond that before it, MB; None if the system does not report it."""
+    """Peak resident memory during a call minus that before it, MB; None if the system does not report it."""
     peaks = []
     for _ in range(calls):
         before = reset_peak_mb()
@@ -85,7 +85,7 @@ def measure_peak(run: Callable[[], object], calls: int = 2) -> float | None:
 
 
 def reset_peak_mb() -> float | None:
-    """Return freed memory to the system and reset Linux's peak; returns the present size, None on other systems."""
+    """Return freed memory to the system and reset Linux's peak. Returns the current size, or None on other systems."""
     try:
         ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")

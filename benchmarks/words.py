@@ -86,7 +86,7 @@ ABSENT = (
 
 
 class Remembering:
-    """An encoder that embeds each text once: the tables have most of theirs in common."""
+    """Encoder that embeds each text once, because the tables share most of their texts."""
 
     def __init__(self, encoder: encoder_base.Encoder):
         self.card = encoder.card
@@ -102,7 +102,7 @@ class Remembering:
 
 
 def named(names: tuple[str, ...]) -> Scene:
-    """A scene of one Gaussian for each name: words need no more."""
+    """Scene with one Gaussian per name, which is all that a search needs."""
     count = len(names)
     objects = (
         SceneObject(0, "background", (), "", (0.5, 0.5, 0.5), 0, 0),
@@ -160,7 +160,7 @@ def main() -> None:
     """Measure all tables and print them."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--encoder", default="text", help="folder, or text")
-    parser.add_argument("--json", type=Path, help="where the rows go")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
     args = parser.parse_args()
     encoder = Remembering(registry.open_encoder(args.encoder))
     rows = [measure(name, encoder) for name in NAMES]

@@ -87,7 +87,7 @@ def spoil(images: Sequence[Image], errors: Errors, pixels: int, seed: int) -> li
 
 
 def _wobbled(truth: np.ndarray, amount: float, pixels: int, rng: np.random.Generator) -> np.ndarray:
-    """Move each pixel's source by smooth random shifts, and by one more pixel for a fifth of them."""
+    """Shift the outlines smoothly at random, and a fifth of the pixels by one more pixel."""
     if not amount:
         return truth.copy()
     shifts = [ndimage.gaussian_filter(rng.normal(size=(pixels, pixels)), 2.0, mode="wrap") for _ in range(2)]
@@ -102,7 +102,7 @@ def _wobbled(truth: np.ndarray, amount: float, pixels: int, rng: np.random.Gener
 
 
 def _split(out: np.ndarray, where: np.ndarray, fresh: int, pixels: int, rng: np.random.Generator) -> int:
-    """Give one side of a line through the middle of an object a new id; the next free id."""
+    """Give one side of a line through the middle of an object a new id. Returns the next free id."""
     at = np.flatnonzero(where)
     xy = np.stack([at % pixels, at // pixels], axis=1) - np.mean([at % pixels, at // pixels], axis=1)
     angle = rng.uniform(0, 2 * np.pi)
@@ -121,9 +121,9 @@ def _merge(out: np.ndarray, mask: np.ndarray, present: np.ndarray, pixels: int, 
 
 
 def miou(masks: Sequence[np.ndarray], images: Sequence[Image]) -> float:
-    """Mean over the true objects of their IoU with the ids of one one-to-one map for all images (pooled pixels).
+    """Mean IoU of the true objects after one one-to-one map of ids for all images (pooled pixels).
 
-    Background is not among the objects; pixels that are background or unknown in the masks belong to none.
+    The background is not an object; pixels that are background or unknown in the masks belong to no object.
     """
     truth, found = np.concatenate([image.truth for image in images]), np.concatenate(masks)
     _, truth = np.unique(truth, return_inverse=True)  # 0, background, is always seen
@@ -149,7 +149,7 @@ def oracle(masks: Sequence[np.ndarray], images: Sequence[Image]) -> list[np.ndar
 
 
 def majority(masks: Sequence[np.ndarray], images: Sequence[Image], count: int) -> list[np.ndarray]:
-    """The plain repair: every Gaussian takes the id that it shows most often, every segment that of its Gaussians."""
+    """Baseline repair: each Gaussian gets its most frequent id, each segment the most frequent id of its Gaussians."""
     names, compact = np.unique(np.concatenate(masks), return_inverse=True)
     compact = compact.reshape(len(masks), -1)
     votes = np.zeros((count, len(names)), np.float32)

@@ -36,7 +36,7 @@ CAMERAS = 10
 
 
 def make_views(scene: Scene, images: int, pixels: int, folder: Path) -> tuple[list[datasets.View], list[Image]]:
-    """Spoilt masks of a scene in a folder, as views of one data set, and the truth."""
+    """Write degraded masks of a scene to a folder. Returns the views of the data set and the true masks."""
     views, truth, nothing = [], [], np.zeros((0, 1))
     for k in range(CAMERAS):
         camera = scenes.orbit_camera(2 * np.pi * k / CAMERAS, pixels, pixels)

@@ -1,7 +1,7 @@
 """Scenes of rigid bodies on a floor, seen as Gaussians by several cameras, for the benchmarks of association.
 
 Every image is splatted front to back, and each pixel keeps the Gaussians with the largest weights. The true object of a
-pixel is that with the largest weight at exact positions; an association gets the lists drawn at wrong positions.
+pixel is the one with the largest weight at exact positions; an association gets the lists of wrong positions.
 
 Notation: N Gaussians, T times, V views, P pixels of an image, k Gaussians kept per pixel.
 """
@@ -32,7 +32,7 @@ class Plan:
         times: Times that each camera sees.
         pixels: Width and height of an image.
         still: Share of objects that do not move.
-        pairs: Pairs of objects that touch and move alike in the first half of the time.
+        pairs: Pairs of objects that touch and move together in the first half of the time.
         radius: Smallest and largest semi-axis.
         extent: Half side of the square that objects stand on.
         sweep_rad: Angle that each camera turns about the middle from first to last time.
@@ -81,7 +81,7 @@ class Scene:
 
     @property
     def focal(self) -> float:
-        """Focal length in pixels: a unit in the middle is 0.3125 of the image's width."""
+        """Focal length in pixels, so that a unit in the middle covers 0.3125 of the image's width."""
         return self.plan.pixels * 0.3125 * DISTANCE
 
     @property
@@ -129,7 +129,7 @@ def make(plan: Plan, seed: int) -> Scene:
 
 
 def _motions(plan: Plan, axes: np.ndarray, times: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Centres [M, T, 3] and turns about the vertical [M, T] of bodies that stay apart, pairs aside."""
+    """Centres [M, T, 3] and rotations about the vertical [M, T] of bodies that stay apart, except in pairs."""
     ahead = times[:, None]
     centres, turns = np.zeros((plan.bodies, len(times), 3)), np.zeros((plan.bodies, len(times)))
     still = set(rng.permutation(plan.bodies)[: round(plan.still * plan.bodies)].tolist())
@@ -170,7 +170,7 @@ def _motions(plan: Plan, axes: np.ndarray, times: np.ndarray, rng: np.random.Gen
 
 
 def displaced(scene: Scene, error_px: float, model: str, rng: np.random.Generator) -> np.ndarray:
-    """Places with errors that are constant over time or change with it. [N, T, 3]
+    """Positions with errors that are constant or vary over time. [N, T, 3]
 
     Args:
         scene: The scene.
@@ -234,7 +234,7 @@ def _draw(scene: Scene, places: np.ndarray, view: int, time: int) -> Image:
 
 @numba.njit(cache=True)
 def _splat(xy, sigmas, order, objects, size):
-    """Blend front to back; per pixel the object with most weight, and the Gaussians with most weight."""
+    """Blend front to back. Returns the object and the Gaussians with the largest weights of each pixel."""
     pixels = size * size
     left = np.ones(pixels)
     shares = np.zeros((pixels, objects.max() + 1))

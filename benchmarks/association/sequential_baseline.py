@@ -1,8 +1,8 @@
 """Association image by image with a fixed threshold, as a baseline.
 
-Images vote per Gaussian, one after another. A segment joins the object that its Gaussians voted for if their IoU is
-above the threshold (Hungarian method, over Gaussians with votes), else it becomes a new object. Objects in fewer than 4
-images are dropped, and every image is assigned again without its own votes, three times.
+Images are processed in order and vote per Gaussian. A segment joins the object that its Gaussians voted for if their
+IoU is above the threshold (Hungarian method, over Gaussians with votes), otherwise it becomes a new object. Objects in
+fewer than 4 images are dropped, and every image is assigned again without its own votes, three times.
 """
 
 from __future__ import annotations

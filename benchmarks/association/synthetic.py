@@ -83,7 +83,7 @@ def measure(plan: scenes.Plan, case: str, error_px: float, model: str, seed: int
 
 
 def sequential(masks: Sequence[np.ndarray], images: Sequence[scenes.Image], count: int) -> list[np.ndarray]:
-    """Masks relabelled by `sequential_baseline` from the one Gaussian with most weight in each pixel."""
+    """Masks relabelled by `sequential_baseline` from the Gaussian with the largest weight in each pixel."""
     given = [
         segment_stack.from_pixels(
             mask, image.indices[:, :1], np.ones_like(image.weights[:, :1]), count, view=image.view, time=image.time

@@ -32,7 +32,7 @@ from .scenes import Image
 
 
 def spoil(dataset: datasets.Dataset, folder: Path, errors: degraded_masks.Errors, seed: int) -> None:
-    """Write the training masks with errors, and notes that say that ids hold within a video."""
+    """Write the training masks with errors, and a `masks.json` that declares numbering per video."""
     shots = videos.of(dataset.train)
     views = [(k, i, view) for k, video in enumerate(shots) for i, view in enumerate(video.views)]
     truth = [datasets.load_mask(view) for _, _, view in views]
@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, help="data set with true masks in every split")
-    parser.add_argument("--out", type=Path, required=True, help="folder of masks and runs; what is there is kept")
+    parser.add_argument("--out", type=Path, required=True, help="folder of masks and runs; existing ones are kept")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--switches", type=float, default=0.03)
     parser.add_argument("--misses", type=float, default=0.05)
@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None) -> None:
     associate.run_associate(out / "without", data, masks=spoilt, out=associated)
     rows = {
         "true masks": {"masks": 1.0, **train(data, datasets.MASKS, out / "true", **options)},
-        "spoilt, as they are": {
+        "degraded": {
             "masks": overlap(data, spoilt),
             **train(data, str(plain), out / "spoilt_run", **options),
         },

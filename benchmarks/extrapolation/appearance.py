@@ -15,9 +15,9 @@ views; the shares add up to one:
   scene without moving objects. Wrong textures of the background count, too.
 - background: the rest.
 
-``if gone`` is the gain in PSNR if that share were zero. ``excess`` is the part of a share beyond the error of val on
-such pixels, in dB; these add up to the distance between test and a test with the errors of val. The last rows compare
-the same scene with shading, shadows or both kept as at t_max. Results: docs/results/training.md.
+``if gone`` is the gain in PSNR if that share were zero. ``excess`` is the part of a share that exceeds the error of val
+on pixels of that kind, in dB; these add up to the difference between test and a test with the errors of val. The last
+rows compare the same scene with shading, shadows or both kept as at t_max. Results: docs/results/training.md.
 """
 
 from __future__ import annotations
@@ -82,12 +82,12 @@ class Picture:
 
 
 def pictures(scene: Scene, views: Sequence[datasets.View], move: Move) -> list[Picture]:
-    """Renderings of views of a scene that is moved in any way; views without a mask end the benchmark."""
+    """Renderings of views of a scene played in any mode. A view without a mask is an error."""
     found, behind = [], evaluate.truth_background(scene)
     for view in views:
         mask = datasets.load_mask(view)
         if mask is None:
-            raise SystemExit(f"{view.name}: expected an object mask, found none; without it no cause can be told")
+            raise SystemExit(f"{view.name}: expected an object mask, found none; the causes need one")
         frame = move(view.t)
         found.append(Picture(view, datasets.load_image(view, behind), mask, draw(scene, frame, view.camera), frame))
     return found
@@ -124,7 +124,7 @@ def frozen(scene: Scene, shading: bool, shadows: bool) -> tuple[Scene, Move]:
 
 
 class Sight:
-    """From where training has seen each Gaussian.
+    """Directions from which training views show each Gaussian.
 
     Args:
         scene: The scene.
@@ -141,7 +141,7 @@ class Sight:
             self.directions[k] = _towards(frame, view.camera) * seen[:, None]
 
     def share(self, frame: scene_player.Frame, camera: Camera) -> np.ndarray:
-        """Share of each pixel's Gaussians that training has seen from near that direction. [H, W]"""
+        """Share of each pixel's Gaussians that training views show from a similar direction. [H, W]"""
         now, nearest = _towards(frame, camera), np.full(len(frame.means), -1.0, np.float32)
         for directions in self.directions:
             np.maximum(nearest, (directions * now).sum(1), out=nearest)
@@ -158,7 +158,7 @@ def _towards(frame: scene_player.Frame, camera: Camera) -> np.ndarray:
 
 
 def visibility(scene: Scene, frame: scene_player.Frame, camera: Camera) -> np.ndarray:
-    """Visible share of each Gaussian in a view, relative to drawing it alone and whole. [N]"""
+    """Visible share of each Gaussian in a view, relative to drawing it alone and completely. [N]"""
     posed = scene_renderer.pose_frame(scene, frame)
     gaussians = scene_renderer.PosedGaussians(posed)
     shapes = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
@@ -172,7 +172,7 @@ def visibility(scene: Scene, frame: scene_player.Frame, camera: Camera) -> np.nd
 
 
 def resting(scene: Scene) -> np.ndarray:
-    """Gaussians of groups that neither move themselves nor follow one that does. [N] bool"""
+    """Mask of the Gaussians whose groups neither move nor follow a moving group. [N] bool"""
     still = np.array([g.model.is_static and not np.any(scene.tracks.poses[g.id, :, 1:]) for g in scene.groups])
     follow = np.array([True if g.follows is None else still[g.follows] for g in scene.groups])
     return (still & follow)[scene.gaussians.motion_ids]
@@ -191,7 +191,7 @@ def kinds(scene: Scene, sight: Sight, picture: Picture) -> np.ndarray:
 
 
 def recolored(shown: Sequence[Picture], regions: Sequence[np.ndarray]) -> float:
-    """Squared error that is left in regions of pictures after the best affine change of their colours, all together."""
+    """Total squared error that remains in regions of pictures after the best affine change of their colours."""
     x = np.concatenate([p.drawn[region] for p, region in zip(shown, regions, strict=True)]).astype(np.float64)
     y = np.concatenate([p.truth[region] for p, region in zip(shown, regions, strict=True)]).astype(np.float64)
     fitted = x
@@ -335,7 +335,7 @@ def write_sheet(scene: Scene, dataset: datasets.Dataset, folder: Path, rows: int
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description="What is left of the error past t_max, by cause.")
+    parser = argparse.ArgumentParser(description="Break down the image error past t_max by cause.")
     parser.add_argument("data", type=Path)
     parser.add_argument("--run", type=Path, required=True, help="folder of a finished run of tracks")
     parser.add_argument("--json", type=Path)

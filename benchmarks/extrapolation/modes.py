@@ -32,7 +32,7 @@ ORACLE = "true poses"
 
 
 def refitted(scene: Scene, name: str) -> Scene:
-    """The scene with one motion model for all bodies: a swing where there is one, else the steady motion beside it."""
+    """The scene with one motion model for all bodies: with oscillation for swinging bodies, without for the others."""
     names = (name, pose_task.STEADY[name]) if name in pose_task.STEADY else (name,)
     groups = []
     for group in scene.groups:
@@ -43,7 +43,7 @@ def refitted(scene: Scene, name: str) -> Scene:
 
 
 def measure(folder: Path, split: str) -> dict[str, Any]:
-    """One run: PSNR by way of moving, errors of the poses, share of true errors inside the band."""
+    """Measure a run: PSNR by mode or motion model, pose errors, and the share of true errors inside the band."""
     run = checkpoint.open_run(folder)
     dataset = datasets.read(run.data())
     scene = bake.bake(run, dataset)
@@ -87,7 +87,7 @@ def _objects(scene: Scene, dataset: Dataset) -> list[dict[str, Any]]:
 
 
 def markdown(found: list[dict[str, Any]]) -> str:
-    """One table for each kind of run: a row for each way of moving, a column for each run, their mean last."""
+    """One table per kind of run, with a row per mode or motion model, a column per run, and the mean as last column."""
     parts = []
     for single in (True, False):
         runs = [r for r in found if (r["training"] == "tracks") != single]

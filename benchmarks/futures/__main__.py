@@ -5,7 +5,7 @@
     accuracy  error, confidence band, events and run time of the fit, for each kind of motion
     rendered  tracks and predictions of scenes that are rendered, trained and baked
 
-Results: docs/results/motion.md.
+Results: docs/results/predicted_motion.md.
 """
 
 from ..commands import run

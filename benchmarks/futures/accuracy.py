@@ -6,7 +6,7 @@ Tracks of 15 poses on [0, 0.75] are drawn by `simulated_motions` and fitted by `
 
     error      median error at t = 1 over a ball of the body's radius, in % of the body's size; 90 % quantile
     line       median error of a straight line and a constant spin through the last five poses
-    still      median error of a body that stays at its last pose
+    still      median error of keeping the last pose
     holds      share of the later times at which the error is inside the 95 % band
     width      median half width of the band at t = 1, in % of the body's size
     flagged    share of tracks reported as not predictable up to t = 1
@@ -54,7 +54,7 @@ def line(track: simulated.Draw, count: int = 5) -> float:
 
 
 def still(track: simulated.Draw) -> float:
-    """Error at t = 1 of a body that stays, in % of the size."""
+    """Error at t = 1 of keeping the last pose, in % of the size."""
     count = len(track.later)
     turns = Rotation.concatenate([track.turns[-1]] * count)
     return float(simulated.errors(np.tile(track.places[-1], (count, 1)), turns, track)[-1])
@@ -154,7 +154,7 @@ def overall(found: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=20, metavar="N")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="seed of the first draw")

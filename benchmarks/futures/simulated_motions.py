@@ -30,8 +30,9 @@ class Motion:
 
     Attributes:
         path: Poses at times [S].
-        events: Times at which the velocity or the law changes, in [0, 1].
-        jump: Largest velocity jump at the events, including RADIUS times that of the spin; 0 for changes of law.
+        events: Times at which the velocity or the kind of motion changes, in [0, 1].
+        jump: Largest velocity jump at the events, including RADIUS times that of the spin; 0 if only the kind of motion
+            changes.
     """
 
     path: Path
@@ -58,7 +59,7 @@ def _direction(rng: np.random.Generator) -> np.ndarray:
 
 
 def _linear(v: np.ndarray, w: np.ndarray, clock: Callable[[np.ndarray], np.ndarray], g: float = 0.0) -> Path:
-    """Place and rotation vector in proportion to a clock, and a fall with acceleration g."""
+    """Position and rotation vector proportional to a clock, plus a fall with acceleration g."""
 
     def path(t: np.ndarray) -> Poses:
         s = clock(t)[:, None]
@@ -326,12 +327,12 @@ def collides(rng: np.random.Generator, at: float) -> Motion:
 
 
 def starts(rng: np.random.Generator, at: float) -> Motion:
-    """A body at rest is set in motion."""
+    """A body at rest that starts to move at once."""
     return _jump(at, (np.zeros(3), 1.2 * rng.normal(size=3)), (np.zeros(3), 2 * rng.normal(size=3)))
 
 
 def stops(rng: np.random.Generator, at: float) -> Motion:
-    """A moving body is stopped at once."""
+    """A moving body that stops at once."""
     return _jump(at, (1.2 * rng.normal(size=3), np.zeros(3)), (2 * rng.normal(size=3), np.zeros(3)))
 
 
@@ -353,12 +354,12 @@ def leaves_table(rng: np.random.Generator, at: float) -> Motion:
 
 
 def within(make: EventMaker, low: float, high: float) -> Maker:
-    """A motion whose event comes between two times."""
+    """A motion with an event between two times."""
     return lambda rng: make(rng, rng.uniform(low, high))
 
 
 def left(make: EventMaker, poses: int) -> Maker:
-    """A motion whose event leaves a number of observed poses after it."""
+    """A motion with a given number of observed poses after its event."""
     times = grid()
     low, step = times[POSES - poses - 1], times[1] - times[0]
     return lambda rng: make(rng, low + step * rng.uniform(0.05, 0.95))

@@ -47,14 +47,14 @@ class Variant:
     """One way to draw a workload.
 
     Attributes:
-        group: What is varied, of `GROUPS`.
-        setting: What differs from the defaults, in words.
-        changes: Of `RasterSettings`.
-        sh_degree: Harmonics are cut to this degree.
-        scale: Drawn at this share of the resolution, then enlarged.
-        backend: Of the rasterizer.
-        dtype: Of the tensors.
-        exp2_degree: Degree of the polynomial of the exponential, the rasterizer's own where None.
+        group: Group of the varied setting, one of `GROUPS`.
+        setting: Description of the differences from the defaults.
+        changes: Changed `RasterSettings`.
+        sh_degree: Highest degree of the spherical harmonics that are evaluated.
+        scale: Share of the resolution at which the image is drawn before it is enlarged.
+        backend: Backend of the rasterizer.
+        dtype: Dtype of the tensors.
+        exp2_degree: Degree of the polynomial of the exponential, or None for that of the rasterizer.
     """
 
     group: str
@@ -105,10 +105,12 @@ def main(arguments: list[str] | None = None) -> None:
     """Measure, print the table, write rows and plot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--workloads", type=workloads.name_list, nargs="+", default=[["W1", "tabletop-small"]])
-    parser.add_argument("--groups", type=workloads.name_list, nargs="+", default=[list(GROUPS)], help="what to vary")
-    parser.add_argument("--repeats", type=int, default=15, help="turns of each variant; default 15")
-    parser.add_argument("--json", type=Path, help="write the rows here")
-    parser.add_argument("--plot", type=Path, help="write the picture here")
+    parser.add_argument(
+        "--groups", type=workloads.name_list, nargs="+", default=[list(GROUPS)], help="settings to vary"
+    )
+    parser.add_argument("--repeats", type=int, default=15, help="rounds; default 15")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--plot", type=Path, help="write the plot to this file")
     options = parser.parse_args(arguments)
     if options.json and not options.json.parent.is_dir():
         parser.error(f"--json: no folder {options.json.parent}")
@@ -208,12 +210,12 @@ class Drawers:
 
 
 def make_drawer(name: str, variant: Variant) -> Callable[[], torch.Tensor]:
-    """The function that draws a variant of a workload, made where it is called."""
+    """Return the function that draws a variant of a workload. It is created in the process that calls it."""
     return Drawers(name).make(variant)
 
 
 def _harmonics(colors: torch.Tensor) -> torch.Tensor:
-    """Coefficients of degree 3 around given colours, as large as training leaves them. [N, 3] -> [N, 16, 3]"""
+    """Coefficients of degree 3 around given colours, of the size that training gives. [N, 3] -> [N, 16, 3]"""
     generator = torch.Generator().manual_seed(3)
     sh = torch.randn((len(colors), 16, 3), generator=generator)
     for degree, spread in enumerate(tabletop.SH_SPREAD):
@@ -238,7 +240,7 @@ def errors_of(image: torch.Tensor, truth: torch.Tensor) -> dict[str, float]:
 
 
 def _badness(point: Point, kind: str) -> float:
-    """The error, the less the better for all kinds."""
+    """The error with a sign such that smaller is better for all kinds."""
     return -point.errors[kind] if kind == "psnr_db" else point.errors[kind]
 
 
@@ -248,7 +250,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
 
 
 def table(points: Sequence[Point]) -> str:
-    """Text: all points, fastest first, and where the defaults stand."""
+    """Format all points, fastest first, and the verdict on the defaults."""
     lines = [f"{'cpu ms':>9} {'wall ms':>9} {'max abs':>9} {'rms':>9} {'PSNR dB':>8}  front (by rms)"]
     for point in sorted(points, key=lambda p: p.ms):
         e = point.errors
@@ -261,7 +263,7 @@ def table(points: Sequence[Point]) -> str:
 
 
 def verdict(points: Sequence[Point]) -> str:
-    """Text that tells if the defaults are on the front by rms, and otherwise the points that beat them."""
+    """Format the verdict: the defaults are on the front by rms, or the points that beat them."""
     own = next(point for point in points if point.variant.setting == DEFAULT)
     error = own.errors["rms"]
     better = [p for p in points if p.ms < own.ms and p.errors["rms"] <= error]
@@ -296,7 +298,7 @@ def to_rows(point: Point) -> list[dict[str, Any]]:
 
 
 def plot(points: Sequence[Point], path: Path) -> None:
-    """Root mean square error over milliseconds, one panel for each workload; numbers refer to the list beside it."""
+    """Plot root mean square error over milliseconds, one panel per workload; numbers refer to the list beside it."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -340,7 +342,7 @@ def plot(points: Sequence[Point], path: Path) -> None:
 
 
 def _labels(axis: Any, numbered: Sequence[tuple[int, Point]]) -> list[tuple[tuple[float, float], str]]:
-    """Numbers to write and where: points too close for a label each share one, at the rightmost of them."""
+    """Numbers of the points and the positions of their labels. Close points share a label, at the rightmost of them."""
     clusters: list[list[tuple[float, float, int, Point]]] = []
     placed = [(*axis.transData.transform((p.ms, p.errors["rms"])), number, p) for number, p in numbered]
     for item in sorted(placed, key=lambda item: item[:2]):

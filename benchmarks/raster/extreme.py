@@ -41,7 +41,7 @@ class Errors:
 
 
 def draw(scene: Case, backend: str) -> Drawing:
-    """Render and send a random gradient back through image, alpha and depth times alpha."""
+    """Render, and propagate a random gradient back through image, alpha and depth times alpha."""
     dtype = torch.float64 if backend == "reference" else torch.float32
     leaves = [t.to(dtype).clone().requires_grad_() for t in scene.inputs]
     background = None if scene.background is None else scene.background.to(dtype).clone().requires_grad_()
@@ -65,7 +65,7 @@ def compare(found: Drawing, expected: Drawing) -> Errors:
         return tensor.detach().abs().max().item() if tensor.numel() else 0.0
 
     def relative(a: torch.Tensor, b: torch.Tensor) -> float:
-        # What float32 cannot hold as a normal number counts as zero.
+        # Values below the normal float32 range count as zero.
         return largest(a.double() - b.double()) / max(largest(b.double()), torch.finfo(torch.float32).tiny)
 
     a, b = found.result, expected.result
@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--case", nargs="*", default=list(CASES), choices=list(CASES), metavar="NAME")
     parser.add_argument("--backend", default="cpu")
     options = parser.parse_args(arguments)
-    print("| case | what it gives | image | depth | gradient | of |\n|---|---|---|---|---|---|")
+    print("| case | expected picture | image | depth | gradient | of |\n|---|---|---|---|---|---|")
     for name in options.case:
         scene = CASES[name]()
         errors = compare(draw(scene, options.backend), draw(scene, "reference"))

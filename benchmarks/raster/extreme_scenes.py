@@ -18,14 +18,14 @@ from r5dgs_core.scene.cameras import Camera
 
 @dataclass(frozen=True)
 class Case:
-    """A scene that something could go wrong with.
+    """A difficult scene.
 
     Attributes:
         inputs: Means, quats, scales, opacities, channels, float32.
         camera: The view.
-        gives: What is seen, for the docs.
-        background: As in `rasterize_splats`.
-        settings: Likewise.
+        gives: Expected picture, for the docs.
+        background: Background for `rasterize_splats`.
+        settings: Settings for `rasterize_splats`.
     """
 
     inputs: list[torch.Tensor]
@@ -50,7 +50,7 @@ def view(width: int = 48, height: int = 40, focal: float = 50.0, T_cam_world: np
 
 
 def cloud(n: int = 200, n_channels: int = 3, seed: int = 0, sigma: float = 0.05) -> list[torch.Tensor]:
-    """Random Gaussians in a box two to four units before the camera."""
+    """Random Gaussians in a box two to four units in front of the camera."""
     random = np.random.default_rng(seed)
     values = (
         random.uniform([-1, -0.8, 2], [1, 0.8, 4], (n, 3)),
@@ -158,7 +158,7 @@ def centres_at_the_default_near_plane() -> Case:
     scene[0] = torch.stack(
         [torch.linspace(-4e-3, 4e-3, len(depths)), torch.zeros(len(depths)), torch.tensor(depths)], 1
     )
-    return Case(scene, view(), "those beyond 0.01 as float64 has it")
+    return Case(scene, view(), "those beyond 0.01, compared in float64")
 
 
 @case("camera inside Gaussians")
@@ -181,7 +181,7 @@ def opacities_at_their_limits() -> Case:
     scene = cloud(len(values), seed=10, sigma=0.03)
     scene[0] = on_pixels(camera, len(values))
     scene[3] = torch.tensor(values)
-    return Case(scene, camera, "0 is not seen, 1 is capped at 0.99, 1/255 is seen in one pixel")
+    return Case(scene, camera, "0 is invisible, 1 is capped at 0.99, 1/255 is visible in one pixel")
 
 
 @case("ten thousand opaque layers")
@@ -189,7 +189,7 @@ def ten_thousand_opaque_layers() -> Case:
     scene = cloud(10_000, seed=11)
     scene[0] = torch.tensor([0.0, 0, 2]) + torch.linspace(0, 1, 10_000)[:, None] * torch.tensor([0.0, 0, 1])
     scene[2][:], scene[3][:] = torch.tensor([0.5, 0.4, 0.3]), 1.0
-    return Case(scene, view(1, 1), "the nearest alone: a second would leave 1e-4", torch.tensor([0.2, 0.9, 0.4]))
+    return Case(scene, view(1, 1), "only the nearest: a second would leave 1e-4", torch.tensor([0.2, 0.9, 0.4]))
 
 
 @case("ten thousand thin layers")
@@ -220,7 +220,7 @@ def coordinates_1e6_from_the_origin() -> Case:
     angle = 0.1
     T_cam_world[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
     T_cam_world[:3, 3] = -T_cam_world[:3, :3] @ far.double().numpy()
-    return Case(scene, view(T_cam_world=T_cam_world), "what float32 can place there: steps of 1/16")
+    return Case(scene, view(T_cam_world=T_cam_world), "positions in steps of 1/16, the spacing of float32")
 
 
 @case("no Gaussians")
@@ -269,7 +269,7 @@ def depths_that_differ_less_than_float32_can() -> Case:
     scene[0][:, :2] *= 0.5
     T_cam_world = np.eye(4)
     T_cam_world[2, 3] = 100.0
-    return Case(scene, view(focal=1500.0, T_cam_world=T_cam_world), "the nearer in front, as float64 sorts them")
+    return Case(scene, view(focal=1500.0, T_cam_world=T_cam_world), "the nearer in front, sorted in float64")
 
 
 @case("quaternions of length 1e-30 to 1e30")
@@ -286,7 +286,7 @@ def means_as_far_as_1e30() -> Case:
     distance = torch.logspace(0, 30, 90)
     scene[0] *= distance[:, None]
     scene[2] *= distance[:, None]
-    return Case(scene, view(), "far ones as near ones that look as large")
+    return Case(scene, view(), "far Gaussians look like near ones of the same apparent size")
 
 
 @case("means far off to the side")
@@ -294,7 +294,7 @@ def means_far_off_to_the_side() -> Case:
     scene = cloud(90, seed=23)
     scene[0][::2, 0] *= torch.logspace(0, 38, 45)
     scene[0][1::2, 1] *= -torch.logspace(0, 38, 45)
-    return Case(scene, view(), "nothing of those outside the image")
+    return Case(scene, view(), "none of those outside the image")
 
 
 @case("scales as large as 1e30")

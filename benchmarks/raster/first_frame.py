@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def first_frame(count: int, size: int, sh_degree: int, sky_degree: int) -> dict[str, float]:
-    """Seconds of the imports and of the first two frames of this process, which must not have drawn yet."""
+    """Seconds of the imports and of the first two frames. This process must not have drawn before."""
     start = time.perf_counter()
     from r5dgs_core.playback import scene_player
     from r5dgs_core.raster.cpu import autograd, sky  # noqa: F401  (all that frames import)
@@ -59,7 +59,7 @@ def in_fresh_process(cache: Path, options: argparse.Namespace, degrees: str) -> 
 
 
 def measure(options: argparse.Namespace, degrees: str) -> list[dict]:
-    """Rows of cold and warm processes, which take turns."""
+    """Rows of cold and warm processes, which alternate."""
     found: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
     for _ in range(options.repeats):
         with tempfile.TemporaryDirectory(prefix="r5dgs-first-frame-") as folder:
@@ -84,8 +84,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--size", type=int, default=400, help="width and height in px")
     parser.add_argument("--degrees", nargs="+", default=["0,0", "3,2"], help="of colours and sky: SH,SKY")
     parser.add_argument("--repeats", type=int, default=3, help="processes of each kind")
-    parser.add_argument("--json", type=Path, help="write the rows here, too")
-    parser.add_argument("--verbose", action="store_true", help="show what the processes print, notices included")
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
+    parser.add_argument("--verbose", action="store_true", help="show the output of the processes, notices included")
     parser.add_argument("--alone", metavar="SH,SKY", help="measure in this process and print its times as JSON")
     options = parser.parse_args(arguments)
     if options.json and not options.json.parent.is_dir():

@@ -3,13 +3,13 @@
     python -m benchmarks.raster frames [--json FILE]
 
 A generated scene is played over its observed time and as long past it. In the ``cube``, moving bodies are slabs of a
-cube of static Gaussians and cover most of the image. In the ``room``, they are small balls before static walls.
+cube of static Gaussians and cover most of the image. In the ``room``, they are small balls in front of static walls.
 ``share`` of all Gaussians belong to the bodies.
 
-``fps`` counts whole frames, from scene time to picture, by the median. Medians of the parts: ``ms_motion`` poses the
-Gaussians, ``ms_colors`` evaluates harmonics and sky, ``ms_raster`` is the rest. ``fps_stage`` and ``ms_stage`` are of
-whole frames drawn by a `Stage`, which caches the static layer; each of its pictures is compared with a complete
-drawing. Results: docs/results/rasterizer.md.
+``fps`` is computed from the median time of whole frames, from scene time to picture. Medians of the parts:
+``ms_motion`` poses the Gaussians, ``ms_colors`` evaluates harmonics and sky, ``ms_raster`` is the rest. ``fps_stage``
+and ``ms_stage`` are those of whole frames drawn by a `Stage`, which caches the static layer; each of its pictures is
+compared with a complete drawing. Results: docs/results/rasterizer.md.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _room(random: np.random.Generator, cuts: list[int]) -> np.ndarray:
 
 
 def instances_at(scene: Scene, t: float) -> list[Instance]:
-    """The groups at a time as the add-on sends them: ranges of Gaussians, each with a matrix."""
+    """The groups at a time in the form of the add-on's requests: ranges of Gaussians, each with a matrix."""
     quats, displacements = scene_player.group_poses(scene, t)
     turns = rotations.quats_to_rotmats(quats)
     found = []
@@ -135,7 +135,7 @@ def instances_at(scene: Scene, t: float) -> list[Instance]:
 
 
 def compare(staged: RenderOutput, scene: Scene, instances: list[Instance], camera: Camera) -> None:
-    """Raise AssertionError where the picture of a stage is not that of all Gaussians drawn anew."""
+    """Raise AssertionError if the picture of a stage differs from a complete drawing."""
     anew = scene_renderer.render_frame(scene, scene_renderer.pose_instances(scene, instances), camera)
     for name in ("color", "alpha"):
         difference = np.abs(getattr(staged, name) - getattr(anew, name)).max()
@@ -180,7 +180,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--threads", default="1,2")
     parser.add_argument("--degrees", nargs="+", default=["0,0", "0,2", "3,2"], help="of colours and sky: SH,SKY")
     parser.add_argument("--frames", type=int, default=60)
-    parser.add_argument("--json", type=Path, help="write the rows here, too")
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
     options = parser.parse_args(arguments)
     if options.json and not options.json.parent.is_dir():
         parser.error(f"--json: no folder {options.json.parent}")

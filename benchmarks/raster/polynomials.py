@@ -17,17 +17,17 @@ import torch
 
 from .. import timing
 
-POINTS = 2001  # of [-1/2, 1/2] at which errors are looked at
-SWEEPS = 400  # of the iteration; more change nothing in float32
+POINTS = 2001  # points of [-1/2, 1/2] at which errors are evaluated
+SWEEPS = 400  # iterations; more change nothing in float32
 
 
 def fit(degree: int) -> tuple[float, ...]:
-    """The polynomial that is nearest to 2^x on [-1/2, 1/2] and exact at 0: the least largest relative error.
+    """Minimax polynomial of 2^x on [-1/2, 1/2], exact at 0: it minimises the largest relative error.
 
     Returns:
         Coefficients, the constant 1 first.
 
-    Source: Lawson 1961: least squares whose weights grow where the error is large tend to the minimax solution.
+    Source: Lawson 1961: least squares with weights that grow with the error converge to the minimax solution.
     """
     x = 0.5 * np.cos(np.linspace(0, np.pi, POINTS))
     columns = x[:, None] ** np.arange(1, degree + 1) * np.exp2(-x)[:, None]
@@ -52,7 +52,7 @@ def worst_error(coefficients: tuple[float, ...]) -> float:
 
 
 class Remote(timing.Contender):
-    """A contender that draws in a process of its own, with another polynomial. Close it when done."""
+    """Contender that draws in its own process, with another polynomial. Close it when done."""
 
     def __init__(self, label: dict[str, Any], coefficients: tuple[float, ...], make_run: Callable[[], Callable]):
         """Start the process; ``make_run``, called there, gives the function that returns the image as a tensor."""
@@ -81,7 +81,7 @@ class Remote(timing.Contender):
         return self._ask("turn")
 
     def close(self) -> None:
-        """End the process and forget its machine code."""
+        """End the process and delete its machine code."""
         self._connection.close()
         self._process.join()
         self._folder.cleanup()
@@ -95,7 +95,7 @@ class Remote(timing.Contender):
 
 
 def _serve(connection: Connection, coefficients: tuple[float, ...], make_run: Callable[[], Callable]) -> None:
-    """Answer requests until the other end closes."""
+    """Process requests until the other end closes."""
     from r5dgs_core.raster import compilation
     from r5dgs_core.raster.cpu.simd import float32x16
 

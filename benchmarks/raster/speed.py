@@ -76,7 +76,7 @@ PASSES = ("forward", "forward_backward")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure, print rows and ratios, write the rows."""
+    """Run the benchmark."""
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.json and not options.json.parent.is_dir():
@@ -115,7 +115,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def load_peer(name: str) -> ModuleType:
-    """A peer's module by dotted name or path. Raises ValueError where it is missing or lacks something."""
+    """Import a peer's module by dotted name or path. Raises ValueError if it is missing or incomplete."""
     if name.endswith(".py"):
         path = Path(name)
         if not path.is_file():
@@ -138,7 +138,7 @@ def load_peer(name: str) -> ModuleType:
 
 
 def ratios(rows: list[dict[str, Any]], peers: list[str]) -> str:
-    """Text: our `cpu` rows beside peers of this run, figures of another day and one thread, and frames per second."""
+    """Format our `cpu` rows beside peers of this run, figures of another day and one thread, and frames per second."""
     found = {(row["workload"], row["backend"], row["threads"], row["pass"]): row for row in rows}
     ours = [row for row in rows if row["backend"] == "cpu"]
     lines = []
@@ -182,7 +182,7 @@ def _title(row: dict[str, Any]) -> str:
 def _contenders(
     workload: Workload, threads: int, backends: list[str], peers: list[ModuleType]
 ) -> Iterator[timing.Contender]:
-    """Everything that takes turns on a workload with a number of threads."""
+    """Contenders of a workload with a given number of threads."""
     upstream = make_upstream(workload)
 
     def contender(backend: str, name: str, run: Callable[[], object]) -> timing.Contender:
@@ -217,7 +217,7 @@ def make_upstream(workload: Workload) -> torch.Tensor:
 
 @torch.no_grad()
 def draw(workload: Workload, backend: str) -> torch.Tensor:
-    """Image of a workload, finished. [H, W, D]"""
+    """Image of a workload, after the device has finished. [H, W, D]"""
     image = rasterize_splats(*workload.inputs, workload.camera, settings=workload.settings, backend=backend).image
     if image.is_cuda:
         torch.cuda.synchronize()
@@ -241,7 +241,7 @@ def play(workload: Workload, backend: str) -> None:
 
 
 def _split(workload: Workload, threads: int, repeats: int) -> str:
-    """Text: median wall time of each kernel in both passes."""
+    """Format the median wall time of each kernel in both passes."""
     upstream = make_upstream(workload)
     runs = {"forward": lambda: draw(workload, "cpu"), "forward_backward": lambda: step(workload, "cpu", upstream)}
     lines = []
@@ -304,7 +304,7 @@ def _choose(options: argparse.Namespace) -> list[Callable[[], Workload]]:
 def _parser() -> argparse.ArgumentParser:
     listed, numbers = workloads.name_list, workloads.number_list
     parser = argparse.ArgumentParser(
-        description=__doc__.splitlines()[0], epilog="Lists are written with commas or spaces."
+        description=__doc__.splitlines()[0], epilog="Separate the items of lists by commas or spaces."
     )
     parser.add_argument(
         "--workloads",
@@ -318,10 +318,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--time", type=float, help="scene time at which it is posed; default t_max")
     parser.add_argument("--backends", type=listed, nargs="+", default=[["cpu"]], help="of cpu, reference, cuda")
     parser.add_argument("--threads", type=numbers, nargs="+", default=[[1, 2]], help="default 1,2")
-    parser.add_argument("--repeats", type=int, default=15, help="turns of each; default 15")
+    parser.add_argument("--repeats", type=int, default=15, help="rounds; default 15")
     parser.add_argument("--peer", action="append", default=[], metavar="MODULE", help="another renderer; repeatable")
     parser.add_argument("--stages", action="store_true", help="also split the time of the backend cpu into its kernels")
-    parser.add_argument("--json", type=Path, help="write the rows here, too")
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
     return parser
 
 

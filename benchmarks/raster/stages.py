@@ -35,8 +35,8 @@ def measure(run: Callable[[], object], repeats: int) -> dict[str, float]:
 
 @contextmanager
 def _watch() -> Iterator[dict[str, float]]:
-    """Milliseconds by kernel while the context lasts: kernels and `compilation.run` are wrapped where Python finds
-    them.
+    """Record milliseconds by kernel while the context lasts, by wrapping the kernels and `compilation.run` in their
+    modules.
     """
     spent: dict[str, float] = defaultdict(float)
     inside = [False]  # a kernel that `run` calls is not counted twice; only the calling thread looks at this

@@ -28,7 +28,7 @@ COLUMNS = ("workload", "threads", "moving", "covered", "build_ms", "all_ms", "ba
 
 
 def measure(name: str, share: float, threads: int, repeats: int) -> dict:
-    """One row."""
+    """Measure one row."""
     work = workloads.make(name)
     inputs, camera = work.inputs, work.camera
     distances = (inputs[0] - torch.tensor([0.2, 0.1, -0.3])).norm(dim=1)
@@ -63,7 +63,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--moving", default="0.01,0.05,0.2,0.5", help="shares of the Gaussians that move")
     parser.add_argument("--threads", default="1,2")
     parser.add_argument("--repeats", type=int, default=10)
-    parser.add_argument("--json", type=Path, help="write the rows here, too")
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
     options = parser.parse_args(arguments)
     if options.json and not options.json.parent.is_dir():
         parser.error(f"--json: no folder {options.json.parent}")

@@ -1,4 +1,4 @@
-"""Generated scene that resembles trained ones: a table before two walls with six moving bodies.
+"""Generated scene that resembles trained ones: a table in front of two walls, with six moving bodies.
 
 Gaussians lie flat on surfaces, most are nearly opaque, colors depend on the view (degree 3), and each body has a rigid
 track and a motion past t_max. The seed is fixed, so the scene is the same on every machine.

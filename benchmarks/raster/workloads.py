@@ -31,7 +31,7 @@ GARDEN = "W4garden"  # needs a file; all others are generated
 
 @dataclass(frozen=True)
 class Workload:
-    """Gaussians before a camera.
+    """Gaussians in front of a camera.
 
     Attributes:
         name: As in the rows of results.
@@ -71,7 +71,7 @@ def make(name: str, garden: Path | None = None) -> Workload:
 
 
 def check(name: str, garden: Path | None = None) -> None:
-    """Raise ValueError where `make` could not make a workload of this name."""
+    """Raise ValueError if `make` cannot create a workload of this name."""
     if name not in (*GENERATED, GARDEN):
         raise ValueError(f"workloads: expected of {', '.join([*GENERATED, GARDEN])}, got {name!r}")
     if name == GARDEN and (garden is None or not garden.is_file()):
@@ -92,7 +92,7 @@ def pose_scene(name: str, scene: Scene, camera: Camera, t: float) -> Workload:
 
 
 def find_camera(scene: Scene, name: str) -> Camera:
-    """The camera of a scene by name, or by its number from 0. Raises ValueError where there is none."""
+    """Camera of a scene by name, or by its number from 0. Raises ValueError if it does not exist."""
     by_name = {camera.name: camera for camera in scene.cameras}
     if name in by_name:
         return by_name[name]
@@ -200,7 +200,7 @@ def _garden(name: str) -> Workload:
 
 
 def _tabletop(count: int, size: int) -> Callable[[str], Workload]:
-    """The table top a while past t_max, when all bodies have moved and turned."""
+    """The table top past t_max, at a time at which all bodies have moved and rotated."""
 
     def build(name: str) -> Workload:
         T_cam_world = look_at((0.35, -2.6, 1.5), (0, 0, 0.25), up=(0, 0, 1))
@@ -341,8 +341,8 @@ def number_list(text: str) -> list[int]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Print how heavy the workloads are."""
-    parser = argparse.ArgumentParser(description="Print how heavy the workloads are.")
+    """Print statistics of the workloads."""
+    parser = argparse.ArgumentParser(description="Print statistics of the workloads.")
     parser.add_argument("--workloads", type=name_list, nargs="+", default=[["W0", "W1", "W1h", "W2", "W3", "W4"]])
     parser.add_argument("--garden", type=Path, help=f"gsplat's test_garden.npz: adds {GARDEN}")
     options = parser.parse_args(arguments)

@@ -38,7 +38,7 @@ def measure(data: Path, iterations: int, overrides: list[str]) -> dict[str, Any]
 
 
 def to_rows(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of the report; a point is on the Pareto front where no faster one is at least as good."""
+    """Rows of the report. A point is on the Pareto front if no faster point is at least as good."""
     rows = []
     for split in ("val", "test"):
         best = -float("inf")

@@ -33,7 +33,7 @@ from r5dgs_core.train import run
 
 
 def held_out(times: Sequence[float], every: int, offset: int, sparse: bool = False) -> list[float]:
-    """Every so-manieth of the sorted times, from index ``offset`` on, or (sparse) the others; both ends stay."""
+    """Times to hold out: every ``every``-th from index ``offset`` on, or (sparse) the others; never the two ends."""
     found = sorted(set(times))
     return [t for k, t in enumerate(found) if (k % every == offset % every) != sparse and 0 < k < len(found) - 1]
 
@@ -75,7 +75,7 @@ def measure(scene: Scene, dataset: datasets.Dataset, removed: Collection[float])
 
 
 def train(data: Path, settings: config.Config) -> tuple[Scene, float]:
-    """A scene trained on a data set, and the processor's seconds that it took."""
+    """Train a scene on a data set. Returns it and the processor seconds of training."""
     with tempfile.TemporaryDirectory() as folder:
         began = time.process_time()
         trained = run.train(data, Path(folder) / "run", settings)
@@ -89,7 +89,7 @@ def _among(t: float, times: Collection[float]) -> bool:
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description="How well training sees between the times that it saw.")
+    parser = argparse.ArgumentParser(description="Measure the quality between the observed times.")
     parser.add_argument("data", type=Path)
     parser.add_argument("--every", type=int, default=3)
     parser.add_argument("--offset", type=int, default=1)

@@ -173,7 +173,7 @@ def measure(data: Path, folder: Path, gaussians: int, steps: int, overrides: lis
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, help="data set to train on; drawn there where there is none")
+    parser.add_argument("--data", type=Path, help="data set to train on; it is created if missing")
     parser.add_argument("--gaussians", type=int, default=300_000)
     parser.add_argument("--size", type=int, default=400, help="width and height of the images, pixels")
     parser.add_argument("--cameras", type=int, default=12)

@@ -2,12 +2,12 @@
 
     python -m benchmarks.training network_playback RUN [--turns 5]
 
-``RUN`` is a run of the field. Every call draws all test views of the run: the field moves Gaussians to the end of the
-observed time, and the TRD carries them on by TRACE's integrator, for each frame anew.
+``RUN`` is a run of the field. Every call draws all test views of the run. For each frame, the field moves Gaussians to
+the end of the observed time, and the TRD moves them on with TRACE's integrator.
 
-- 5DGS: the networks move every Gaussian that moves.
-- R5DGS: the networks move as many Gaussians as there are objects, whose motion carries the others.
-- baked: the motion comes from the scene file; no network takes part.
+- 5DGS: the networks are evaluated for every moving Gaussian.
+- R5DGS: the networks are evaluated for one Gaussian per object; the others move with it.
+- baked: the motion comes from the scene file; no network is evaluated.
 
 Results: docs/results/field.md.
 """

@@ -35,14 +35,14 @@ VARIANTS = {
 
 
 def settings(overrides: list[str], gaussians: int) -> config.Config:
-    """A run that grows to a number of Gaussians at once, with all times from its first step on."""
+    """Configuration of a run that quickly grows to a number of Gaussians and uses all times from its first step on."""
     grown = ["densify.share=1.0", "densify.gradient=1e-6", f"densify.max_gaussians={gaussians}", "densify.start=20"]
     at_once = ["train.iterations=100000", "densify.every=20", "curriculum.first=0", "curriculum.grow=0"]
     return config.load(None, [*at_once, *grown, *overrides])
 
 
 def measure(dataset: datasets.Dataset, overrides: list[str], gaussians: int, steps: int) -> dict[str, Any]:
-    """Grow to a number of Gaussians, then time steps; milliseconds."""
+    """Grow to a number of Gaussians, then time steps, in milliseconds."""
     run = trainer.Trainer(dataset, settings(overrides, gaussians))
     while len(run.gaussians) < 0.98 * gaussians and run.iteration < 1000:
         run.step()
