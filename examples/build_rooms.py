@@ -42,7 +42,7 @@ def room_settings(
         samples: Cycles samples per pixel.
         views: Observed cameras, on an arc inside the room.
         novel: Cameras between them, for val and test.
-        frame_step: Captured frames are this far apart, of 61; up to t = 0.75 they are observed.
+        frame_step: Distance of captured frames, of 61 in total; those up to t = 0.75 are observed.
     """
     return capture.CaptureSettings(
         directory=directory,
@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--samples", type=int, default=24, help="Cycles samples per pixel")
     parser.add_argument("--views", type=int, default=12, help="observed cameras")
     parser.add_argument("--novel", type=int, default=2, help="cameras between them, for val and test")
-    parser.add_argument("--frame-step", type=int, default=4, help="captured frames are this far apart, of 61")
+    parser.add_argument("--frame-step", type=int, default=4, help="distance of captured frames, of 61 in total")
     parser.add_argument("--threads", type=int, default=0, help="threads of Cycles, 0 for one per core")
     return parser
 

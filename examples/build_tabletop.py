@@ -1,8 +1,8 @@
 """Build the demo scene "tabletop" in Blender, and capture it into the data set that `r5dgs demo` trains on.
 
-Five objects on a round table, each moving by a law that can be written down: a toy car drives along an arc, a globe
-spins about its tilted axis, a ball is thrown, a block slides with friction, a vase stands still. Poses are keyed at
-every frame, so the scene is exact there and what happens after the last observed time follows from what was seen.
+Five objects on a round table, each with a motion in closed form: a toy car drives along an arc, a globe spins about its
+tilted axis, a ball is thrown, a block slides with friction, a vase stands still. Poses are keyed at every frame, so the
+scene is exact there. The motion after the last observed time continues the observed motion.
 
     python examples/build_tabletop.py --blend tabletop.blend --dataset DIR     with the bpy module
     blender -b --python examples/build_tabletop.py -- --blend tabletop.blend   with Blender

@@ -1,1 +1,1 @@
-"""Shared modules of the scene builders: materials, shapes, toys, laws of motion, and the capture of a scene."""
+"""Shared modules of the scene builders: materials, shapes, toys, motions, and the capture of a scene."""

@@ -11,7 +11,7 @@ Color = Sequence[float]
 
 
 def plain(name: str, color: Color) -> bpy.types.Material:
-    """A matte material of one linear colour, which is also what the solid viewport shows."""
+    """A matte material of one linear colour, which solid viewports show, too."""
     material = _new_material(name, color)
     _shader(material).inputs["Color"].default_value = (*color, 1.0)
     return material
@@ -28,7 +28,7 @@ def speckled(
         high: Colour where it is high.
         scale: Noise cells per unit.
         sharp: 0 for a smooth mixture, towards 1 for patches with edges.
-        middle: Value of the noise that divides the two.
+        middle: Noise value between the two colours.
     """
     material = _new_material(name, low)
     tree = material.node_tree

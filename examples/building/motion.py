@@ -1,7 +1,7 @@
 """Motion by closed-form laws, keyed at every frame.
 
-Scenes last from t = 0 to t = 1. Laws are smooth over all of it, so that what happens after the last observed time
-follows from what was seen before. Lengths are scene units, speeds units per unit of time, angles degrees.
+Scenes last from t = 0 to t = 1. Laws are smooth over this range, so that the motion after the last observed time
+continues the observed motion. Lengths are in scene units, speeds in units per unit of time, angles in degrees.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ Law = Callable[[float], tuple[Vector, Quaternion]]
 
 @dataclass(frozen=True)
 class Actor:
-    """An object of a scene, whose place in the list of actors is its id from 1 on.
+    """An object of a scene. Its id is its position in the list of actors, from 1.
 
     Attributes:
         ob: Blender object whose pose is the object's; its children belong to it.
-        law: How it moves; None for one that stands still, or that changes shape only.
+        law: Motion; None for an object that stands still or only changes its shape.
     """
 
     ob: bpy.types.Object
@@ -42,7 +42,7 @@ def perform(actors: Sequence[Actor]) -> None:
 
 
 def animate(ob: bpy.types.Object, law: Law) -> None:
-    """Key the law's pose at every frame of t in [0, 1]; of q and -q, the one nearer to the previous frame."""
+    """Key the law's pose at every frame of t in [0, 1], with the quaternion sign nearest to the previous frame."""
     ob.rotation_mode = "QUATERNION"
     before = law(0.0)[1]
     for step in range(FRAMES_PER_UNIT + 1):
@@ -94,10 +94,10 @@ def spin(
     """About a fixed axis through the origin of the object, which may be a hinge.
 
     Args:
-        place: Where the origin stays.
+        place: Position of the origin.
         axis: Axis in the world.
         speed_deg: Speed at t = 0.
-        rate_deg: What the speed gains per unit of time.
+        rate_deg: Change of the speed per unit of time.
         start_deg: Angle at t = 0.
         tilt: Rotation before that about the axis.
     """
@@ -153,14 +153,14 @@ def roll(
     *,
     tilt: Quaternion | None = None,
 ) -> Law:
-    """Rolling on level ground without slipping: the turn is the way divided by the radius.
+    """Rolling on level ground without slipping: the angle is the distance divided by the radius.
 
     Args:
         start: Middle of the rolling object at t = 0.
-        direction_deg: Direction of the way, counter-clockwise from +x.
+        direction_deg: Direction of the motion, counter-clockwise from +x.
         speed: Speed at t = 0.
-        acceleration: What it gains per unit of time.
-        radius: Radius that rolls.
+        acceleration: Change of the speed per unit of time.
+        radius: Rolling radius.
         tilt: Rotation at t = 0.
     """
     angle = math.radians(direction_deg)
@@ -176,7 +176,7 @@ def roll(
 def slide(
     start: Sequence[float], direction_deg: float, speed: float, stop: float, yaw_deg: float, yaw_speed_deg: float
 ) -> Law:
-    """Straight with constant friction, turning, both at rest from the time ``stop`` on."""
+    """Straight motion and rotation with constant friction, both at rest from the time ``stop`` on."""
 
     def law(t: float) -> tuple[Vector, Quaternion]:
         s = min(t, stop)

@@ -48,7 +48,7 @@ def lathe(
         name: Name of the object.
         profile: Radius and height of each ring, from the bottom up; a radius of 0 closes an end.
         materials: Materials of the object.
-        material_at: Which of them the face at a row and a segment has.
+        material_at: Index of the material of the face at a row and a segment.
         segments: Faces around.
         parent: Parent of the object.
     """
@@ -97,7 +97,7 @@ def box(
         size: Edge lengths.
         materials: One material, or six.
         center: Middle of the box.
-        taper: The top is this much smaller than the bottom.
+        taper: Scale of the top relative to the bottom.
         bevel: Width of rounded edges.
         parent: Parent of the object.
     """
@@ -156,7 +156,7 @@ def grid(
         size: Edge lengths along x and y.
         counts: Cells along x and y.
         materials: Materials of the object.
-        material_at: Which of them the cell at a column and a row has.
+        material_at: Index of the material of the cell at a column and a row.
         smooth: Shade it as a curved surface.
         parent: Parent of the object.
     """

@@ -57,8 +57,8 @@ def area_light(
     Args:
         name: Name of the light.
         place: Its middle.
-        target: What it faces.
-        size: Its two edges; the larger they are, the softer are shadows.
+        target: Point that it faces.
+        size: Lengths of its two edges; larger lights cast softer shadows.
         power: Watts.
         color: Its colour.
     """

@@ -50,7 +50,7 @@ def beach_ball(name: str, radius: float) -> bpy.types.Object:
 
 
 def toy_block(name: str, edge: float) -> bpy.types.Object:
-    """A wooden block whose faces carry squares of different colours. Returns the wood, which carries the squares."""
+    """A wooden block with a square of a different colour on each face. Returns the parent of the squares."""
     wood = materials.speckled("block wood", (0.50, 0.30, 0.13), (0.62, 0.41, 0.20), 6.0)
     ob = shapes.box(name, (edge, edge, edge), [wood], center=(0, 0, 0.5 * edge), bevel=0.03)
     colors = ((0.70, 0.06, 0.08), (0.06, 0.24, 0.62), (0.82, 0.55, 0.04), (0.10, 0.45, 0.20), (0.45, 0.10, 0.50))

@@ -1,4 +1,4 @@
-"""Indoor scenes: closed rooms with area lights, in which every object moves by a law of its own."""
+"""Indoor scenes: closed rooms with area lights, in which every object has its own motion."""
 
 from __future__ import annotations
 

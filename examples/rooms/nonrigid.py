@@ -17,8 +17,8 @@ def build() -> list[Actor]:
     """Build the scene into the open file.
 
     Returns:
-        Its objects, animated, in the order of their ids; the flag and the balloon have no law, since no pose tells
-        what they do.
+        Its objects, animated, in the order of their ids. The flag and the balloon have no law, because no pose
+        describes their motion.
     """
     _room()
     actors = [

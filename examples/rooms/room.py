@@ -13,7 +13,7 @@ HIGH = (3.5, 2.4, 3.3)
 
 
 def new() -> None:
-    """Start a scene without lights, with three bounces, which carry most of the indirect light of a room."""
+    """Start a scene without lights, with three light bounces, which give most of the indirect light of a room."""
     stage.new((0.0, 0.0, 0.0), 0.0)
     cycles = bpy.context.scene.cycles
     cycles.max_bounces = 3
