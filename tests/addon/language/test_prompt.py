@@ -1,4 +1,4 @@
-"""Words select objects by the table that the .blend file keeps."""
+"""Words select objects by the table stored in the .blend file."""
 
 import dataclasses
 import importlib
@@ -52,7 +52,7 @@ def test_aliases_are_kept_verbatim(blender, tmp_path):
     assert [label.aliases for label in table.labels(collection) if label.object_id == 1] == [words]
 
 
-def test_several_wishes_select_several_objects_ranked_in_the_panel(blender, loaded):
+def test_several_phrases_select_several_objects_ranked_in_the_panel(blender, loaded):
     ask(blender, "mug and fruit")
     assert selected_ids(blender) == {1, 2, 4}
     matches = blender.context.window_manager.r5dgs_words.matches
@@ -61,7 +61,7 @@ def test_several_wishes_select_several_objects_ranked_in_the_panel(blender, load
     assert scores == sorted(scores, reverse=True) and all(match.why for match in matches)
 
 
-def test_a_wish_that_finds_nothing_beside_others_is_named(blender, loaded, capfd):
+def test_a_phrase_without_match_is_named_beside_others(blender, loaded, capfd):
     assert ask(blender, "mug and elephant") == {"FINISHED"}
     assert "Nothing matches 'elephant'" in capfd.readouterr().out
     assert ask(blender, "mug and lemon") == {"FINISHED"}
@@ -146,7 +146,7 @@ def test_similar_names_are_reported_and_suggested(blender, loaded, capfd):
     assert len(session(blender).meant) == 0
 
 
-def test_prompts_that_found_something_are_kept_with_the_file(blender, loaded, tmp_path):
+def test_prompts_with_matches_are_saved_with_the_file(blender, loaded, tmp_path):
     def history():
         return [item.name for item in blender.context.scene.r5dgs_words.history]
 
@@ -259,7 +259,7 @@ def test_selecting_an_object_by_its_id_can_be_undone_and_redone(blender, loaded)
 
 @pytest.fixture
 def meaningful(blender, tmp_path):
-    """A loaded scene whose file knows what a "sour thing" is, and the file."""
+    """A loaded scene whose file stores an embedding of "sour thing", and the file."""
     bare = scenes.make_scene(n=200, objects=4)
     axes = np.eye(len(bare.objects), 8, dtype=np.float32)
     row = [item.id for item in bare.objects].index(4)
@@ -289,7 +289,7 @@ def test_without_the_scene_file_only_names_are_searched_with_a_note(blender, mea
     damage(meaningful[0])
     assert ask(blender, "sour things") == {"CANCELLED"}
     assert ask(blender, "lemon") == {"FINISHED"}
-    assert "by names alone" in session(blender).notes[0].name
+    assert "by names only" in session(blender).notes[0].name
 
 
 def test_without_a_scene_the_operators_cannot_be_called(blender):
@@ -337,7 +337,7 @@ def test_excluding_an_object_of_one_scene_selects_all_objects_of_the_other(blend
     assert found == {(True, number) for number in range(1, 6)} | {(False, 1), (False, 2)}
 
 
-def test_deleted_objects_are_no_part_of_everything(blender, loaded):
+def test_everything_excludes_deleted_objects(blender, loaded):
     ask(blender, "lemon")
     blender.ops.object.delete()
     ask(blender, "everything")

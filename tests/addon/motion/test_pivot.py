@@ -46,7 +46,7 @@ KINDS = {
 
 
 def body_point(bpy, collection, anchor, place):
-    """A point of the body that is at a place of the root's frame at t_max, in the anchor's own frame. [4]"""
+    """Point of the body at a position at t_max in the root's frame, in the anchor's own frame. [4]"""
     motions.go_to(bpy, collection, T_MAX)
     world = motions.matrix(bpy, collection.r5dgs.root) @ [*place, 1.0]
     return np.linalg.solve(motions.matrix(bpy, anchor), world)
@@ -65,7 +65,7 @@ def paths(bpy, collection, anchor, *points):
 @pytest.mark.parametrize("name", KINDS)
 def test_the_point_that_the_pivot_was_moved_to_stays_and_others_turn(blender, loaded, mug, name):
     kind, fields = KINDS[name]
-    for (path, index), curve in motions.curves(mug).items():  # the user has brought it elsewhere
+    for (path, index), curve in motions.curves(mug).items():  # the user has moved it
         for point in curve.keyframe_points if path == "location" else ():
             point.co_ui = (point.co[0], point.co[1] + (0.5, -0.25, 0.125)[index])
     before = motions.keys(mug, LAST)
@@ -111,7 +111,7 @@ def test_a_spring_swings_about_its_pivot(blender, loaded, mug):
         np.testing.assert_allclose(np.mean(places, axis=0), PIVOT, atol=1e-4)
 
 
-def test_nothing_is_edited_by_looking_and_reset_brings_the_learned_pivot_back(blender, scene_path, loaded, mug):
+def test_reading_edits_nothing_and_reset_restores_the_learned_pivot(blender, scene_path, loaded, mug):
     physics = motions.addon("motion.physics")
     learned = scene_file.read(scene_path).groups[1]
     motions.go_to(blender, loaded, T_MAX)
@@ -151,7 +151,7 @@ def test_the_3d_cursor_becomes_the_pivot_and_can_be_undone(blender, loaded, mug)
     assert motions.keys(mug) == written
 
 
-def test_the_3d_cursor_is_the_pivot_of_what_hangs_on_a_bone_too(blender, loaded, mug):
+def test_the_3d_cursor_becomes_the_pivot_of_an_object_parented_to_a_bone(blender, loaded, mug):
     rig = blender.data.objects.new("rig", blender.data.armatures.new("rig"))
     blender.context.scene.collection.objects.link(rig)
     rig.location, rig.rotation_euler = (0.5, 1.0, -0.5), (0.3, 0.2, 0.9)
@@ -173,7 +173,7 @@ def test_the_3d_cursor_is_the_pivot_of_what_hangs_on_a_bone_too(blender, loaded,
         np.testing.assert_allclose((motions.matrix(blender, mug) @ there)[:3], PIVOT, atol=1e-4)
 
 
-def test_the_pivot_of_a_copy_is_where_the_copy_is(blender, loaded, mug):
+def test_the_pivot_of_a_copy_moves_with_the_copy(blender, loaded, mug):
     set_up(mug.r5dgs_motion, *KINDS["hinge"][:1], **SPIN)
     mug.r5dgs_pivot.point = PIVOT
     blender.ops.r5dgs.duplicate_object(offset=(1.0, 2.0, 0.0))
@@ -222,7 +222,7 @@ def test_motions_without_a_pivot_show_none(blender, loaded, mug):
         blender.ops.r5dgs.pivot_to_cursor()
 
 
-def test_numbers_that_are_none_and_curves_that_cannot_be_read_do_no_harm(blender, loaded, mug):
+def test_nan_and_unreadable_curves_do_no_harm(blender, loaded, mug):
     (panel,) = importlib.import_module("r5dgs.r5dgs_addon.panels.motion").CLASSES
     state = mug.r5dgs_motion
     set_up(state, "world_twist", **SPIN)
@@ -238,7 +238,7 @@ def test_numbers_that_are_none_and_curves_that_cannot_be_read_do_no_harm(blender
         blender.ops.r5dgs.pivot_to_cursor()
 
 
-def test_a_pivot_beyond_all_measure_does_no_harm(blender, loaded, mug):
+def test_an_extreme_pivot_does_no_harm(blender, loaded, mug):
     set_up(mug.r5dgs_motion, "constant_twist", angular_velocity=(0.5, -1.0, 2.0))
     observed = motions.keys(mug, LAST)
     for far in (1e9, 1e30, np.inf):
@@ -255,7 +255,7 @@ def test_an_orbit_that_cannot_be_integrated_is_refused_and_nothing_changes(blend
     set_up(mug.r5dgs_motion, "world_twist", **SPIN)
     mug.r5dgs_pivot.point = (far, far, 0.0)
     before = motions.keys(mug)
-    with pytest.raises(RuntimeError, match="mug anchor: an orbit this fast"):
+    with pytest.raises(RuntimeError, match="mug anchor: the orbit is too fast"):
         blender.ops.r5dgs.re_extrapolate()
     assert motions.keys(mug) == before
     set_up(mug.r5dgs_motion, "world_twist", **SPIN)
