@@ -33,7 +33,7 @@ class _OneCore(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return module
 
     def exec_module(self, module):
-        module.__spec__ = self._own_spec  # importlib has put the alias's there
+        module.__spec__ = self._own_spec  # importlib has stored that of the alias
 
 
 def load_extension():
@@ -75,7 +75,7 @@ def blender(extension):
 
 @pytest.fixture
 def scene_path(tmp_path):
-    """The file of a synthetic scene of five objects."""
+    """File of a synthetic scene of five objects."""
     return scene_file.write(scenes.make_scene(n=400, objects=5, seed=1), tmp_path / "synthetic.r5dgs")
 
 

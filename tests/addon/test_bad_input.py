@@ -23,7 +23,7 @@ pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra
 from tests.support import motions  # noqa: E402
 
 KINDS = ("collections", "objects", "pointclouds", "meshes", "actions", "materials", "node_groups", "images", "scenes")
-OWN_OF_BLENDER = {"Render Result", "Viewer Node"}  # images that a render makes, whatever comes of it
+OWN_OF_BLENDER = {"Render Result", "Viewer Node"}  # images that every render creates
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def contents(bpy, users=0):
 @contextlib.contextmanager
 def refused(bpy, match):
     """Expect an error, and an unchanged state, both here and after saving and opening the .blend."""
-    scene, before = bpy.context.scene, [contents(bpy), contents(bpy, 1)]  # what nobody uses is not saved
+    scene, before = bpy.context.scene, [contents(bpy), contents(bpy, 1)]  # unused data is not saved
     timeline = scene.frame_start, scene.frame_end, scene.frame_current, len(scene.timeline_markers)
     selected = [obj.name for obj in bpy.context.selected_objects]
     with pytest.raises(RuntimeError, match=f"(?s){match}") as caught:
@@ -88,7 +88,7 @@ def f12(bpy):
     return path.is_file()
 
 
-# --- what is loaded ---
+# --- loading ---
 
 
 @pytest.fixture
@@ -205,7 +205,7 @@ def test_an_unreadable_scene_file_raises(blender, scene_path, what):
     locked.chmod(0)
     is_root, before = os.geteuid() == 0, contents(blender)
     if is_root:
-        os.seteuid(65534)  # who may read everything reads as nobody
+        os.seteuid(65534)  # root can read everything, so the file is read as the user nobody
     try:
         with pytest.raises(RuntimeError, match="cannot be read") as caught:
             blender.ops.r5dgs.load_scene(filepath=str(scene_path))
@@ -216,7 +216,7 @@ def test_an_unreadable_scene_file_raises(blender, scene_path, what):
     assert "Traceback" not in str(caught.value) and contents(blender) == before
 
 
-# --- a scene file that is gone ---
+# --- a missing scene file ---
 
 
 def test_a_scene_file_that_was_moved_away_is_missed_by_name_and_nothing_breaks(loaded, scene_path, tmp_path, capfd):
@@ -242,12 +242,12 @@ def test_a_scene_file_that_was_moved_away_is_missed_by_name_and_nothing_breaks(l
     assert loaded.ops.r5dgs.preview() == {"FINISHED"} and f12(loaded)
 
 
-# --- a worker in trouble ---
+# --- worker failures ---
 
 
 @pytest.fixture
 def without_torch(monkeypatch, tmp_path):
-    """This Python, as if torch were not installed, is the worker's."""
+    """Make this Python the worker's, as if torch were not installed."""
     path = tmp_path / "python"
     path.write_text(
         f"#!{sys.executable}\n"
@@ -286,7 +286,7 @@ def test_a_python_without_torch_is_named_with_the_remedy_and_the_next_choice_wor
 
 @pytest.fixture
 def dying(loaded):
-    """Has the worker killed while it is asked for something."""
+    """Kill the worker during a request."""
     worker = importlib.import_module("r5dgs.r5dgs_addon.worker.jobs")
 
     @contextlib.contextmanager

@@ -92,7 +92,7 @@ def test_a_lost_scene_file_raises_by_name_until_the_user_sets_its_path(blender, 
     with pytest.raises(errors.SceneFileError, match="synthetic.r5dgs.*'Scene File'"):
         motions.addon("engine.render_request").scene_path(collection)
     assert plays(blender, collection, hidden)  # which needs no file
-    blender.ops.wm.save_mainfile()  # the lost path is kept as it was
+    blender.ops.wm.save_mainfile()  # the stored path does not change
     assert collection.r5dgs.filepath == "//captured/synthetic.r5dgs"
     collection.r5dgs.filepath = "//hidden/renamed.r5dgs"
     assert motions.addon("engine.render_request").scene_path(collection).resolve() == hidden.resolve()
@@ -212,7 +212,7 @@ def test_an_override_is_selected_by_words(blender, library):
 
 
 @pytest.mark.parametrize("how", ["append", "link", "instance"])
-def test_a_scene_that_was_brought_offers_its_frames_and_marker(blender, library, how):
+def test_an_appended_or_linked_scene_offers_its_frames_and_marker(blender, library, how):
     if how == "instance":
         collection, _ = linked_as_instance(blender, library)
     else:
@@ -272,7 +272,7 @@ def test_an_excluded_or_hidden_active_collection_does_not_swallow_the_scene(blen
     assert plays(blender, collection, scene_path)
 
 
-def test_it_loads_into_the_scene_of_the_context_and_no_other(blender, scene_path):
+def test_a_scene_is_loaded_into_the_scene_of_the_context_only(blender, scene_path):
     empty = blender.data.scenes.new("empty")
     with blender.context.temp_override(scene=empty, view_layer=empty.view_layers[0]):
         collection = motions.load(blender, scene_path)
@@ -295,7 +295,7 @@ def test_a_linked_scene_is_not_loaded_into(blender, scene_path, tmp_path):
     assert contents(blender) == before
 
 
-# --- what stays after the extension ---
+# --- after the extension is removed ---
 
 
 def test_unregistering_leaves_nothing_and_registering_again_brings_all_back(blender, extension, scene_path):
@@ -314,7 +314,7 @@ def test_unregistering_leaves_nothing_and_registering_again_brings_all_back(blen
     assert plays(blender, motions.load(blender, scene_path), scene_path)
 
 
-def test_a_script_that_uses_the_module_ends_as_it_should(blender, scene_path):
+def test_a_script_that_uses_the_module_ends_normally(blender, scene_path):
     if blender.app.binary_path:
         pytest.skip("Blender's Python has no module bpy outside of Blender")
     lines = (

@@ -34,7 +34,7 @@ def test_without_a_scene_the_sidebar_offers_to_load_one(sidebar):
     assert "r5dgs.preview" not in said
 
 
-def test_the_sidebar_shows_the_loaded_scene_and_if_the_time_is_extrapolated(blender, sidebar, scene_path):
+def test_the_sidebar_shows_the_loaded_scene_and_marks_extrapolated_times(blender, sidebar, scene_path):
     blender.ops.r5dgs.load_scene(filepath=str(scene_path))
     blender.context.scene.frame_set(31)
     said = sidebar()
@@ -62,7 +62,7 @@ def test_the_sidebar_shows_kernel_compilation(blender, sidebar, scene_path, monk
     assert " ".join(new) == "Preparing the rasterizer (first use, 10 to 30 s)"
 
 
-def test_no_text_is_longer_than_a_sidebar_of_normal_width_shows(blender, sidebar, scene_path, monkeypatch):
+def test_texts_fit_a_sidebar_of_normal_width(blender, sidebar, scene_path, monkeypatch):
     blender.ops.r5dgs.load_scene(filepath=str(scene_path))
     windows, points, worker, live, notes = (
         importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
@@ -156,7 +156,7 @@ def _texts(rna):
                 yield f"{rna.identifier}.{item.identifier}", part.description
 
 
-def test_labels_and_tooltips_are_written_as_blenders_own(blender):
+def test_labels_and_tooltips_follow_blenders_style(blender):
     groups = (blender.types.PropertyGroup, blender.types.AddonPreferences)
     rnas = [cls.bl_rna for base in groups for cls in base.__subclasses__() if cls.__module__.startswith("r5dgs.")]
     rnas += [getattr(blender.ops.r5dgs, name).get_rna_type() for name in dir(blender.ops.r5dgs)]

@@ -23,7 +23,7 @@ def fields(anchor):
 
 
 def make_bouncy(anchor):
-    """Keys whose way from one to the next has no cubic that could be cut at the last observed time."""
+    """Set an interpolation between keys that cannot be split at the last observed time."""
     anchor.keyframe_insert("location", frame=1)
     for curve in motions.curves(anchor).values():
         for k in reversed(range(len(curve.keyframe_points))):
@@ -35,7 +35,7 @@ def make_bouncy(anchor):
 
 
 @pytest.mark.parametrize("observed", [False, True], ids=["physics", "observed keys too"])
-def test_reset_changes_no_field_where_the_curves_of_a_shadow_cannot_be_cut(blender, mug, observed):
+def test_reset_changes_no_field_if_the_curves_of_a_shadow_cannot_be_split(blender, mug, observed):
     shadow = blender.data.objects["mug shadow anchor"]
     make_bouncy(shadow)
     mug.r5dgs_motion.velocity = (4.0, 5.0, 6.0)
@@ -45,7 +45,7 @@ def test_reset_changes_no_field_where_the_curves_of_a_shadow_cannot_be_cut(blend
     assert (fields(mug), motions.keys(mug), motions.keys(shadow)) == before
 
 
-def test_reset_changes_no_field_where_its_own_curves_cannot_be_cut_unless_they_are_replaced(blender, mug):
+def test_reset_changes_no_field_if_its_own_curves_cannot_be_split_unless_they_are_replaced(blender, mug):
     make_bouncy(mug)
     mug.r5dgs_motion.velocity = (4.0, 5.0, 6.0)
     before = fields(mug), motions.keys(mug)
@@ -56,7 +56,7 @@ def test_reset_changes_no_field_where_its_own_curves_cannot_be_cut_unless_they_a
     assert not motions.addon("motion.physics").edited(mug.r5dgs_motion)
 
 
-def test_reset_of_a_shadow_is_refused_where_its_caster_has_numbers_that_are_none(blender, mug):
+def test_reset_of_a_shadow_is_refused_if_its_caster_has_nan_values(blender, mug):
     shadow = blender.data.objects["mug shadow anchor"]
     mug.r5dgs_motion.velocity = (math.nan, 0.0, 0.0)
     shadow.r5dgs_motion.leader = None
@@ -68,7 +68,7 @@ def test_reset_of_a_shadow_is_refused_where_its_caster_has_numbers_that_are_none
     assert (fields(shadow), motions.keys(shadow)) == before and shadow.r5dgs_motion.leader is None
 
 
-def test_reset_of_two_scenes_changes_neither_where_the_file_of_one_is_damaged(blender, scene_path, loaded, tmp_path):
+def test_reset_of_two_scenes_changes_neither_if_the_file_of_one_is_damaged(blender, scene_path, loaded, tmp_path):
     other_path = shutil.copy(scene_path, tmp_path / "other.r5dgs")
     other = motions.load(blender, other_path)
     anchors = [next(o for o in each.all_objects if o.name.startswith("mug anchor")) for each in (loaded, other)]

@@ -34,7 +34,7 @@ def parts(actor):
 
 
 def surface(blender, obs, depsgraph):
-    """All faces of some objects as a tree, and their box. World frame."""
+    """Search tree of all faces of some objects, and their bounding box, world frame."""
     from mathutils.bvhtree import BVHTree
 
     vertices, faces = [], []
@@ -66,7 +66,7 @@ def test_a_scene_has_its_objects_numbered_and_the_rest_is_background(built, blen
     assert any(actor.law is None for actor in actors) and sum(actor.law is not None for actor in actors) >= 2
 
 
-def test_objects_keep_clear_of_each_other_and_of_the_room(built, blender):
+def test_objects_touch_neither_each_other_nor_the_room(built, blender):
     name, actors = built
     scene = blender.context.scene
     members = {part for actor in actors for part in parts(actor)}
@@ -87,7 +87,7 @@ def test_objects_keep_clear_of_each_other_and_of_the_room(built, blender):
 
 
 def test_motion_is_smooth_from_the_first_frame_to_the_last(built, blender):
-    """A jump of velocity or acceleration lets third difference quotients grow with smaller steps; else they stay."""
+    """Third difference quotients grow with smaller steps if velocity or acceleration jumps, else they stay bounded."""
     name, _ = built
     compat = importlib.import_module("r5dgs.r5dgs_addon.compat")  # from 5.0 on curves lie deeper
     curves = [curve for ob in blender.data.objects for curve in compat.fcurves(ob)]
@@ -104,7 +104,7 @@ def test_motion_is_smooth_from_the_first_frame_to_the_last(built, blender):
         assert fine < 1.1 * coarse + 1.0, (name, curve.id_data.name, curve.data_path, curve.array_index)  # 1: float32
 
 
-def test_every_law_is_met_at_the_frames(built, blender):
+def test_keyed_poses_match_the_laws_at_the_frames(built, blender):
     from mathutils import Matrix
 
     name, actors = built

@@ -1,4 +1,4 @@
-"""Capture: the data set agrees with Blender to the pixel, and Blender's file is as it was afterwards."""
+"""Capture: the data set agrees with Blender to the pixel, and Blender's file is restored afterwards."""
 
 import dataclasses
 import importlib
@@ -36,7 +36,7 @@ def service(extension):
 
 @pytest.fixture
 def scene(blender):
-    """Two coloured balls, one moving along x, on a floor that is no object; four cameras of which one is novel."""
+    """Two coloured balls, one moving along x, on a floor that is not an object; four cameras, one of them novel."""
     for ob in list(blender.data.objects):
         blender.data.objects.remove(ob)
     add_ball(blender, "still ball", (-1.0, 0.0, 0.5), (0.1, 0.3, 0.8))
@@ -202,7 +202,7 @@ def test_the_layout_is_read_as_captured(captured):
     assert not data.has_alpha
 
 
-def test_the_mask_is_where_the_camera_sees_the_object(captured):
+def test_the_mask_covers_the_visible_pixels_of_the_object(captured):
     data, _ = captured
     truth = data.ground_truth
     for view in (*data.train, *data.val, *data.test):
@@ -214,7 +214,7 @@ def test_the_mask_is_where_the_camera_sees_the_object(captured):
         np.testing.assert_allclose([xs.mean() + 0.5, ys.mean() + 0.5], pixel, atol=0.5)
 
 
-def test_poses_are_those_that_blender_evaluates(captured, blender, scene):
+def test_poses_match_blenders_evaluation(captured, blender, scene):
     truth = captured[0].ground_truth
     moving = blender.data.objects["moving ball"]
     for index, t in enumerate(truth.times):
@@ -226,7 +226,7 @@ def test_poses_are_those_that_blender_evaluates(captured, blender, scene):
 
 @pytest.mark.parametrize("transparent", [False, True])
 @pytest.mark.parametrize("transform", ["Standard", "AgX"])
-def test_colours_are_those_that_blender_writes(service, blender, scene, tmp_path, transparent, transform):
+def test_colours_match_blenders_output(service, blender, scene, tmp_path, transparent, transform):
     changes = {"samples": 4, "seed": 7, "view_transform": transform, "transparent": transparent, "observed": "cam1"}
     blender.data.objects.remove(blender.data.objects["Plane"])
     data, _ = capture(service, blender, tmp_path / "set", rig="NONE", **STILL, **changes)
@@ -296,7 +296,7 @@ def test_an_object_that_no_image_shows_is_reported(service, blender, scene, tmp_
     assert result.unseen == ("behind",)
 
 
-# What counts as an object
+# Selection of objects
 
 
 def choose(service, bpy, choice, collection=""):
@@ -357,7 +357,7 @@ def test_child_collections_are_objects(service, blender, scene):
     assert [(o.id, o.name, o.root.name) for o in found] == [(1, "pair", "moving ball"), (2, "still ball", "still ball")]
 
 
-def test_a_selection_counts_where_nothing_moves(service, blender, scene):
+def test_the_selection_is_used_if_nothing_moves(service, blender, scene):
     blender.data.objects["moving ball"].animation_data_clear()
     blender.data.objects["moving ball"].select_set(False)
     blender.data.objects["still ball"].select_set(True)
@@ -377,7 +377,7 @@ def test_objects_hidden_in_renders_are_not_captured(service, blender, scene):
     assert [o.name for o in choose(service, blender, "AUTO")] == ["still ball"]
 
 
-def test_poses_are_rigid_whatever_the_scale(service, blender, scene):
+def test_poses_are_rigid_at_any_scale(service, blender, scene):
     moving = blender.data.objects["moving ball"]
     moving.scale = (2.0, -0.5, 1.0)
     with service.overrides.Overrides() as overrides:
@@ -527,7 +527,7 @@ def test_missing_denoiser_raises_an_error_with_the_remedy(service, blender, scen
         ({"rig_fov_deg": 180.0}, "capture.rig_fov_deg"),
     ],
 )
-def test_a_wrong_setting_names_itself(service, blender, scene, tmp_path, change, message):
+def test_a_wrong_setting_is_named(service, blender, scene, tmp_path, change, message):
     with pytest.raises(errors.ConfigError, match=message):
         capture(service, blender, tmp_path / "set", **change)
     assert list(tmp_path.iterdir()) == []
@@ -549,7 +549,7 @@ def test_the_operator_captures_like_the_service(service, blender, scene, tmp_pat
     assert [line["done"] for line in lines] == list(range(1, len(pictures) + 1))
 
 
-def test_the_operator_reports_an_error_of_the_user(blender, scene, tmp_path):
+def test_the_operator_reports_user_errors(blender, scene, tmp_path):
     with pytest.raises(RuntimeError, match="capture.observed"):
         blender.ops.r5dgs.capture_dataset(directory=str(tmp_path / "a"), rig="NONE", observed="nobody")
     with pytest.raises(RuntimeError, match="expected a folder"):
@@ -557,7 +557,7 @@ def test_the_operator_reports_an_error_of_the_user(blender, scene, tmp_path):
 
 
 def test_a_capture_that_blender_cancels_leaves_nothing(service, blender, scene, tmp_path):
-    """As when the file or the window is closed; bpy has no window, so the operator's own method is called."""
+    """Blender cancels if the file or window is closed. bpy has no window, so the test calls the operator's method."""
     operator = importlib.import_module("r5dgs.operators.capture_dataset").R5DGS_OT_capture_dataset
     before = fingerprint(blender)
     steps = service.capture.steps(blender.context, settings_for(service, tmp_path / "set", rig="ARC"))
@@ -570,7 +570,7 @@ def test_a_capture_that_blender_cancels_leaves_nothing(service, blender, scene, 
     rendering.cancel(context)
     assert fingerprint(blender) == before and list(tmp_path.iterdir()) == []
     assert removed == ["timer", "progress"]
-    choosing = type("Operator", (), methods)()  # its file browser is closed: nothing has begun
+    choosing = type("Operator", (), methods)()  # its file browser is closed before the capture starts
     choosing.cancel(context)
     assert removed == ["timer", "progress"]
 
@@ -586,7 +586,7 @@ def test_the_operator_has_the_defaults_of_the_settings(service, blender):
 # The bundled example
 
 
-def test_the_bundled_data_set_is_what_its_script_builds(service, blender, tmp_path):
+def test_the_bundled_data_set_matches_its_script(service, blender, tmp_path):
     folder = Path(__file__).resolve().parents[3] / "examples"
     spec = importlib.util.spec_from_file_location("build_tabletop", folder / "build_tabletop.py")
     script = importlib.util.module_from_spec(spec)

@@ -1,4 +1,4 @@
-"""`blender -b FILE -a`, in which no window is in the context, writes what F12 shows."""
+"""`blender -b FILE -a`, which has no window in its context, writes the same images as F12."""
 
 import subprocess
 
@@ -18,7 +18,7 @@ REGISTER += "check_playback.extension_package()"
 
 
 @pytest.mark.parametrize("view", ["Standard", "AgX"])
-def test_the_command_line_renders_what_f12_does(blender, tmp_path, monkeypatch, view):
+def test_the_command_line_renders_like_f12(blender, tmp_path, monkeypatch, view):
     if not blender.app.binary_path:
         pytest.skip("the module bpy has no command line")
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)

@@ -14,7 +14,7 @@ pytest.importorskip("torch", reason="torch is not installed in this Python, whic
 
 
 def node_tree(bpy, scene):
-    """The empty compositor of a scene, and its output socket; scenes have a group of nodes for it from 5.0 on."""
+    """Empty compositor of a scene and its output socket. From 5.0 on, the compositor is a node group."""
     if "compositing_node_group" in scene.bl_rna.properties:
         tree = scene.compositing_node_group = bpy.data.node_groups.new("merge", "CompositorNodeTree")
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
@@ -64,7 +64,7 @@ def merged(blender, tmp_path, monkeypatch):
     return gaussians
 
 
-def test_the_nearer_of_gaussians_and_meshes_is_seen(blender, merged, tmp_path):
+def test_the_nearer_of_gaussians_and_meshes_is_visible(blender, merged, tmp_path):
     picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     merged.render.filepath = str(tmp_path / "merged.png")
     merged.render.image_settings.file_format = "PNG"

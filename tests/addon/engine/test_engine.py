@@ -1,4 +1,4 @@
-"""The engine R5DGS renders the core's own pictures, with the passes, films and borders that Blender asks for."""
+"""The engine R5DGS renders the same pictures as the core, with Blender's passes, films and borders."""
 
 import importlib
 import json
@@ -191,14 +191,14 @@ def test_a_transparent_film_has_the_cores_alpha_and_straight_colours(blender, lo
     assert psnr(saved[..., 3], alpha) > 45 and psnr(saved[seen][:, :3], np.clip(straight, 0, 1)[seen]) > 45
 
 
-def test_without_sky_it_is_black_behind(blender, loaded, scene, tmp_path):
+def test_without_sky_the_background_is_black(blender, loaded, scene, tmp_path):
     blender.context.scene.r5dgs_render.sky = False
     go_to(blender, 0.0)
     assert psnr(render_png(blender, tmp_path), np.clip(core(scene, 0.0, background=None).color, 0, 1)) > 45
 
 
 @pytest.mark.parametrize("border", [(0.3, 0.8, 0.1, 0.6), (0.0, 0.5, 0.71, 1.0), (0.123, 0.777, 0.311, 0.899)])
-def test_a_border_is_a_part_of_the_whole_picture(blender, loaded, tmp_path, border):
+def test_a_border_renders_a_part_of_the_whole_picture(blender, loaded, tmp_path, border):
     settings = blender.context.scene.render
     settings.resolution_x, settings.resolution_y = 97, 71
     whole = render_png(blender, tmp_path)
@@ -237,12 +237,12 @@ def test_each_view_layer_has_its_own_picture(blender, loaded, tmp_path):
     assert {"nothing.CryptoObject02.a"} <= set(layers) and "ViewLayer.CryptoObject00.r" not in layers
 
 
-def test_two_scenes_are_in_one_picture_and_cover_each_other(blender, loaded, scene, tmp_path):
+def test_two_scenes_occlude_each_other_in_one_picture(blender, loaded, scene, tmp_path):
     other = scenes.make_scene(n=300, objects=1, sh_degree=0, seed=9, world_convention="colmap")
     blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(other, tmp_path / "other.r5dgs")))
     blender.context.view_layer.use_pass_object_index = True
     second = next(c for c in blender.data.collections if c.r5dgs.is_scene and c != loaded)
-    for obj in list(second.all_objects):  # a change may end going through them
+    for obj in list(second.all_objects):  # a change may stop an iteration over them
         obj.pass_index = 50
     both = render_passes(blender, tmp_path).index
     for obj in list(loaded.all_objects):
@@ -266,7 +266,7 @@ def test_an_animation_is_its_frames(blender, loaded, tmp_path):
         np.testing.assert_array_equal(images.read(tmp_path / "many" / name)[..., :3], render_png(blender, tmp_path))
 
 
-def test_colour_management_that_changes_colours_is_named_and_put_right(blender, loaded):
+def test_colour_management_that_changes_colours_is_named_and_corrected(blender, loaded):
     color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     blend_scene = blender.context.scene
     view, settings = blend_scene.view_settings, blend_scene.r5dgs_render
@@ -331,7 +331,7 @@ def test_using_the_engine_keeps_the_view_transform_and_reports_its_loss(blender,
     assert "colors are not as trained with view transform False Color" in capfd.readouterr().out
 
 
-def test_the_loss_under_another_exposure_reads_no_points_again(blender, loaded, monkeypatch):
+def test_the_loss_under_another_exposure_does_not_read_points_again(blender, loaded, monkeypatch):
     loss, reads = importlib.import_module("r5dgs.r5dgs_addon.color.inverse_loss"), []
     plain = loss._colors
     monkeypatch.setattr(loss, "_colors", lambda collections: reads.append(1) or plain(collections))
@@ -361,7 +361,7 @@ def test_invertible_curves_are_inverted_and_others_reported(blender, loaded, sce
     assert color.objections(blender.context.scene) == ["view transform False Color"]
 
 
-def test_an_output_with_a_view_of_its_own_is_named(blender, loaded):
+def test_an_output_with_its_own_view_transform_is_named(blender, loaded):
     color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     blend_scene = blender.context.scene
     output = blend_scene.render.image_settings
@@ -401,8 +401,8 @@ def test_inverting_a_view_leaves_nothing_behind(blender, loaded):
     assert view_module.want(blender.context.scene) is made
 
 
-def test_a_view_is_inverted_where_there_is_no_window(blender, loaded, monkeypatch):
-    """As in `blender -b FILE -a`, where removing a scene of one's own crashed Blender 4.2 and 4.3."""
+def test_a_view_is_inverted_without_a_window(blender, loaded, monkeypatch):
+    """As in `blender -b FILE -a`, in which removing a new scene crashed Blender 4.2 and 4.3."""
     view_module = importlib.import_module("r5dgs.r5dgs_addon.color.view_transform")
     monkeypatch.setattr(view_module, "_inverses", {})
     blender.context.scene.view_settings.view_transform = "Filmic"
@@ -412,7 +412,7 @@ def test_a_view_is_inverted_where_there_is_no_window(blender, loaded, monkeypatc
     assert len(blender.data.scenes) == 1
 
 
-def test_a_view_that_cannot_be_sampled_is_named_and_rendered_all_the_same(blender, loaded, tmp_path, monkeypatch):
+def test_a_view_that_cannot_be_sampled_is_named_and_still_rendered(blender, loaded, tmp_path, monkeypatch):
     color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     view_module = importlib.import_module("r5dgs.r5dgs_addon.color.view_transform")
     blender.context.scene.view_settings.view_transform = "Filmic"
@@ -501,7 +501,7 @@ def test_a_render_is_stopped_while_the_worker_hangs_and_the_next_one_works(blend
     render_png(blender, tmp_path)
 
 
-def test_a_worker_that_is_killed_in_mid_render_is_reported_and_survived(blender, loaded, tmp_path):
+def test_a_worker_killed_during_a_render_is_reported_and_restarted(blender, loaded, tmp_path):
     running = importlib.import_module("r5dgs.r5dgs_addon.worker.jobs").current()
     os.kill(running.pid, signal.SIGSTOP)  # so that the render waits
     killer = threading.Timer(0.5, os.kill, (running.pid, signal.SIGKILL))
@@ -513,7 +513,7 @@ def test_a_worker_that_is_killed_in_mid_render_is_reported_and_survived(blender,
     render_png(blender, tmp_path)
 
 
-def test_blenders_panels_for_all_engines_are_shown_and_given_back(blender, extension):
+def test_blenders_panels_for_all_engines_are_shown_and_restored(blender, extension):
     compat = importlib.import_module("r5dgs.r5dgs_addon.compat")
     panels = {panel.__name__ for panel in blender.types.Panel.__subclasses__()}
     assert {"RENDER_PT_format", "RENDER_PT_output", "DATA_PT_lens"} <= panels

@@ -1,4 +1,4 @@
-"""Hold-outs cut holes as in Cycles, and what cameras do not see is not drawn."""
+"""Hold-outs cut holes as in Cycles, and objects invisible to cameras are not drawn."""
 
 import numpy as np
 import pytest
@@ -108,7 +108,7 @@ def test_an_animation_follows_keyed_hold_outs_and_visibility(blender, loaded, pa
 
 
 def test_cycles_leaves_alpha_and_depth_empty_in_a_hold_out(blender, tmp_path):
-    """The rule that the engine follows, by Cycles itself."""
+    """Check in Cycles itself the rule that the engine follows."""
     scene = blender.context.scene
     scene.render.engine, scene.render.film_transparent = "CYCLES", False
     scene.cycles.samples, scene.cycles.use_denoising, scene.view_layers[0].use_pass_z = 1, False, True
@@ -121,7 +121,7 @@ def test_cycles_leaves_alpha_and_depth_empty_in_a_hold_out(blender, tmp_path):
     assert found.depth[8, 8] > 1e9
 
 
-def test_meshes_that_hold_out_are_named(blender, loaded, passes, capfd):
+def test_holdout_meshes_are_named(blender, loaded, passes, capfd):
     blender.ops.mesh.primitive_cube_add()
     blender.context.object.is_holdout = True
     passes()

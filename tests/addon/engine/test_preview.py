@@ -1,4 +1,4 @@
-"""The preview is the core's picture of what Blender shows, and a worker in trouble says so."""
+"""The preview is the core's picture of the visible objects, and worker failures are reported."""
 
 import importlib
 import inspect
@@ -136,7 +136,7 @@ def test_hidden_objects_are_left_out_and_moved_ones_are_moved(blender, loaded, s
     instances = []
     for obj in by_name.values():
         if obj.r5dgs.role == "CLOUD" and obj.name not in ("mug", "background"):
-            # At t_max anchor and parent inverse cancel: what is left is the cloud's own matrix.
+            # At t_max anchor and parent inverse cancel, so only the cloud's own matrix remains.
             instances.append(scene_renderer.Instance(obj.r5dgs.start, obj.r5dgs.count, np.array(obj.matrix_basis)))
     expected = core_picture(scene, scene_renderer.pose_instances(scene, instances))
     everything = core_picture(scene, scene_player.frame(scene, scene.t_max))
@@ -144,7 +144,7 @@ def test_hidden_objects_are_left_out_and_moved_ones_are_moved(blender, loaded, s
     assert psnr(shown, expected) > 45 and psnr(everything, expected) < 30
 
 
-def test_a_duplicate_is_seen_twice_and_a_deleted_cloud_not_at_all(blender, loaded, scene_path):
+def test_a_duplicate_is_drawn_twice_and_a_deleted_cloud_not_at_all(blender, loaded, scene_path):
     scene = scene_file.read(scene_path)
     go_to(blender, scene.t_max)
     apple = loaded.all_objects["red apple"]
@@ -222,7 +222,7 @@ def test_preview_with_a_panoramic_camera_raises(blender, loaded):
         blender.ops.r5dgs.preview()
 
 
-def test_a_moved_scene_file_is_found_beside_the_blend_or_missed_by_name(blender, loaded, scene_path, tmp_path):
+def test_a_moved_scene_file_is_found_beside_the_blend_and_a_missing_one_is_named(blender, loaded, scene_path, tmp_path):
     folder = tmp_path / "project"
     folder.mkdir()
     blender.ops.wm.save_as_mainfile(filepath=str(folder / "saved.blend"))
@@ -258,10 +258,10 @@ def windowed(blender, loaded):
     return lambda: Window(operator, picture.start(blender.context))
 
 
-def test_in_a_window_the_picture_comes_while_the_window_stays_free(blender, loaded, worker, windowed):
+def test_a_preview_does_not_block_the_window(blender, loaded, worker, windowed):
     expected = preview(blender)
     blender.data.images.remove(blender.data.images["R5DGS Preview"])
-    os.kill(worker.current().pid, signal.SIGSTOP)  # so that the job is seen at work
+    os.kill(worker.current().pid, signal.SIGSTOP)  # so that the job is still running
     window = windowed()
     assert worker.busy() and not blender.ops.r5dgs.preview.poll() and not blender.ops.r5dgs.check_worker.poll()
     assert window.send("MOUSEMOVE") == {"PASS_THROUGH"} and window.said == []
@@ -321,7 +321,7 @@ def test_a_worker_that_died_is_started_again_by_the_next_preview(blender, loaded
     assert worker.current().pid != first.pid
 
 
-def test_a_worker_that_dies_in_a_request_is_an_error_with_its_last_words(worker):
+def test_a_worker_that_dies_during_a_request_is_an_error_with_its_last_output(worker):
     running = worker.current()
     os.kill(running.pid, signal.SIGKILL)
     with pytest.raises(errors.BackendError, match="ended unexpectedly.*starts it again"):
@@ -383,7 +383,7 @@ def test_worker_test_reports_readiness_and_unregistering_stops_the_worker(blende
 
 
 def drawn_check(bpy):
-    """Texts that *Test Worker* draws under its button."""
+    """Texts below the button of *Test Worker*."""
     said = []
     module = importlib.import_module("r5dgs.r5dgs_addon.ui.worker_status")
     module.draw(layouts.Layout(bpy, said), bpy.context)

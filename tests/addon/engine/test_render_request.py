@@ -29,7 +29,7 @@ def picture(blender, monkeypatch):
 
 @pytest.fixture
 def load(blender, tmp_path):
-    """Loads a made scene; returns its collection and what its file holds."""
+    """Loads a synthetic scene. Returns its collection and the content of its file."""
 
     def loaded(name, **options):
         made = dataclasses.replace(scenes.make_scene(world_convention="colmap", **options), name=name)
@@ -64,7 +64,7 @@ def affine(linear, translation=(0, 0, 0)):
 
 
 def everything(scene, matrix, number=0):
-    """All of a scene, its world and its bind state moved by a matrix: at t_max they are at the same place."""
+    """All clouds of a scene, with world and bind state moved by a matrix; both give the same positions at t_max."""
     return scene_renderer.Instance(0, len(scene.gaussians.means), matrix, number, matrix)
 
 
@@ -72,7 +72,7 @@ def core_color(several, instances, camera, sky=None):
     return incremental_renderer.Stage(several).render(instances, camera, sky=sky).color
 
 
-def test_two_scenes_that_are_loaded_are_both_in_the_picture(blender, picture, load, kitchen):
+def test_two_loaded_scenes_are_both_in_the_picture(blender, picture, load, kitchen):
     first, scene = kitchen
     second, other = load("shed", n=300, objects=2, sh_degree=0, seed=7)
     second.r5dgs.root.location = (0.2, 0.1, 0.3)
@@ -91,7 +91,7 @@ def test_two_scenes_that_are_loaded_are_both_in_the_picture(blender, picture, lo
     assert owners == {first, second}
 
 
-def test_a_scene_that_is_loaded_twice_is_seen_twice(blender, picture, kitchen):
+def test_a_scene_loaded_twice_is_drawn_twice(blender, picture, kitchen):
     first, scene = kitchen
     assert blender.ops.r5dgs.load_scene(filepath=str(picture.scene_path(first))) == {"FINISHED"}
     second = next(c for c in blender.data.collections if c.r5dgs.is_scene and c != first)
@@ -118,7 +118,7 @@ def test_exact_mode_renders_deformed_gaussians(blender, picture, load, tmp_path)
     assert psnr(exact, expected) > 45 and psnr(stiff, expected) < 40
 
 
-def test_a_scene_of_which_nothing_is_seen_needs_no_file(blender, picture, load, kitchen):
+def test_an_invisible_scene_needs_no_file(blender, picture, load, kitchen):
     first, scene = kitchen
     hidden, _ = load("shed", n=300, objects=2, seed=7)
     picture.scene_path(hidden).unlink()
@@ -130,7 +130,7 @@ def test_a_scene_of_which_nothing_is_seen_needs_no_file(blender, picture, load, 
     assert blender.ops.r5dgs.preview() == {"FINISHED"}
 
 
-def test_a_scene_that_is_hidden_all_of_it_leaves_its_sky(blender, picture, kitchen):
+def test_a_completely_hidden_scene_leaves_its_sky(blender, picture, kitchen):
     collection, scene = kitchen
     for obj in collection.all_objects:
         obj.hide_set(True)
@@ -139,7 +139,7 @@ def test_a_scene_that_is_hidden_all_of_it_leaves_its_sky(blender, picture, kitch
     assert psnr(arrays["color"], core_color(scene, [], seen.camera, incremental_renderer.Sky(0, affine(W)))) > 60
 
 
-def test_an_instanced_collection_is_seen_where_it_is_instanced(blender, picture, kitchen):
+def test_an_instanced_collection_is_drawn_at_its_instance(blender, picture, kitchen):
     collection, scene = kitchen
     instancer = blender.data.objects.new("copy", None)
     instancer.instance_type, instancer.instance_collection = "COLLECTION", collection
@@ -150,7 +150,7 @@ def test_an_instanced_collection_is_seen_where_it_is_instanced(blender, picture,
     seen, arrays = drawn(blender, picture)
     both = [everything(scene, affine(W)), everything(scene, copy)]
     assert psnr(arrays["color"], core_color(scene, both, seen.camera, incremental_renderer.Sky(0, affine(W)))) > 45
-    # Excluded from the view layer, the scene is seen through its instance alone.
+    # Excluded from the view layer, the scene is visible only through its instance.
     blender.context.view_layer.layer_collection.children[collection.name].exclude = True
     seen, arrays = drawn(blender, picture)
     assert {one.parent for one in seen.instances} == {instancer}
@@ -168,7 +168,7 @@ def test_objects_of_hidden_collections_are_not_rendered(blender, picture, kitche
     assert shown(blender, picture).instances == shown(blender, picture).scenes == ()
 
 
-def test_a_copy_outside_its_scene_is_still_its_scenes(blender, picture, kitchen):
+def test_a_copy_outside_its_collection_belongs_to_its_scene(blender, picture, kitchen):
     collection, scene = kitchen
     apple = collection.all_objects["red apple"]
     copy = apple.copy()
@@ -236,7 +236,7 @@ def test_points_without_required_attributes_are_refused(blender, picture, kitche
 
 
 def without(bpy, old, rows, named=True):
-    """A cloud of the points of some rows alone, as deleting the others leaves it."""
+    """Cloud with the points of some rows, as if the others were deleted."""
     compat = importlib.import_module("r5dgs.r5dgs_addon.compat")
     clouds = importlib.import_module("r5dgs.r5dgs_addon.scene.point_clouds")
     (cloud,) = compat.new_point_clouds([len(rows)])
@@ -304,7 +304,7 @@ def test_an_orthographic_picture_has_depths_from_its_camera_and_nothing_behind_i
     forward = -np.array(camera.matrix_world)[:3, 2]
     depths = (corners - np.array(camera.matrix_world)[:3, 3]) @ forward
     assert depths.min() - 0.01 < arrays["depth"][solid].min() <= arrays["depth"][solid].max() < depths.max() + 0.01
-    # The camera moves on until all lies behind it.
+    # The camera moves until everything is behind it.
     camera.matrix_world = Matrix.Translation(forward * float(depths.max() + 0.1)) @ camera.matrix_world
     assert drawn(blender, picture, want=("alpha",))[1]["alpha"].max() == 0
 
@@ -313,8 +313,8 @@ def scene_points(scene):
     return scene.gaussians.means.astype(np.float64) @ W.T
 
 
-def test_a_view_of_a_region_is_the_cameras_where_it_looks_through_it(blender, picture, kitchen):
-    """A window's region, as far as `views` reads it: bpy has none."""
+def test_a_region_that_looks_through_a_camera_has_the_cameras_view(blender, picture, kitchen):
+    """Uses a stand-in for a window's region, because bpy has none."""
     import types
 
     views = importlib.import_module("r5dgs.r5dgs_addon.engine.view_cameras")

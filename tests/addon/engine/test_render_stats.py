@@ -1,4 +1,4 @@
-"""The figures of `tests/blender/run.py` fail where Blender does something else than the core."""
+"""The measurements of `tests/blender/run.py` fail if Blender's result differs from the core's."""
 
 import importlib
 
@@ -14,7 +14,7 @@ def program():
     return importlib.import_module("tests.blender.run")
 
 
-def test_positions_and_keys_fail_where_blender_plays_something_else(program, tmp_path, monkeypatch, blender):
+def test_positions_and_keys_fail_if_blender_plays_something_else(program, tmp_path, monkeypatch, blender):
     path = scene_file.write(scenes.make_scene(n=120, objects=2), tmp_path / "scene.r5dgs")
     modules = {
         name: importlib.import_module(f"r5dgs.r5dgs_core.{room}.{name}")

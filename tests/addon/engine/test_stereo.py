@@ -1,4 +1,4 @@
-"""Each view of a stereoscopic or multi-view render is the picture of a camera that stands where its eye is."""
+"""Each view of a stereoscopic or multi-view render is the picture of a camera at the position of its eye."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ APART, CONVERGENCE = 0.4, 3.0
 
 @pytest.fixture
 def stereo(blender, tmp_path, monkeypatch):
-    """A scene before a camera of two eyes; what is written is one file for each eye."""
+    """Scene with a stereo camera that writes one file per eye."""
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
     scene = scenes.make_scene(n=600, objects=3, seed=4)
     blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(scene, tmp_path / "scene.r5dgs")))
@@ -62,7 +62,7 @@ def test_each_eye_renders_like_a_camera_at_its_position(blender, stereo, tmp_pat
         assert np.abs(found[suffix] - alone).max() < 2 / 255, suffix
 
 
-def test_views_of_several_cameras_are_those_of_each(blender, stereo, tmp_path):
+def test_each_view_of_a_multi_camera_render_matches_its_camera(blender, stereo, tmp_path):
     camera = stereo.camera
     camera.name = "eye_L"
     other = camera.copy()

@@ -1,4 +1,4 @@
-"""Rendered viewports and the live preview ask the worker without waiting, and the latest wish wins."""
+"""Rendered viewports and the live preview send requests without waiting, and the latest request wins."""
 
 import importlib
 import time
@@ -15,7 +15,7 @@ pytest.importorskip("torch", reason="torch is not installed in this Python, whic
 
 @pytest.fixture
 def seen(blender, tmp_path, monkeypatch):
-    """Gives what the camera sees at a frame."""
+    """Return the visible scene of the camera at a frame."""
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
     picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(scenes.make_scene(n=300), tmp_path / "scene.r5dgs")))
@@ -58,10 +58,10 @@ def test_a_viewport_gets_a_small_picture_at_once_and_a_full_one_when_it_rests(bl
     expected = color.scene_linear(picture.render(now)[1]["color"])
     np.testing.assert_array_equal(port._pixels, expected[::-1])
     port.want(viewport.Wish(seen(20), sky=True, transparent=False, moving=4))
-    assert port.next() is None  # the same picture is not made again
+    assert port.next() is None  # the same picture is not rendered again
 
 
-def test_the_latest_wish_wins(blender, seen, viewport):
+def test_the_latest_request_wins(blender, seen, viewport):
     picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     port = viewport.Port()
@@ -86,7 +86,7 @@ def test_a_viewport_shows_render_errors_and_retries_after_a_change(blender, seen
     assert port._pixels is not None and "Gaussians in" in port._message
 
 
-def test_a_viewport_that_is_closed_is_not_waited_for(blender, seen, viewport):
+def test_a_closed_viewport_is_not_waited_for(blender, seen, viewport):
     port = viewport.Port()
     port.want(viewport.Wish(seen(20), sky=True, transparent=False, moving=1))
     assert viewport.look() is not None
@@ -95,7 +95,7 @@ def test_a_viewport_that_is_closed_is_not_waited_for(blender, seen, viewport):
     assert viewport.look() is None and len(viewport._ports) == 0
 
 
-def test_smaller_pictures_are_of_the_same_view(blender, seen, viewport):
+def test_smaller_pictures_show_the_same_view(blender, seen, viewport):
     wish = viewport.Wish(seen(20), sky=True, transparent=False, moving=4)
     request = wish.requests(4)[-1][2]["camera"]
     small = cameras.Camera(

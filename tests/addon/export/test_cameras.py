@@ -70,7 +70,7 @@ def test_exported_transforms_json_matches_blenders_camera(blender, view, tmp_pat
 
 
 @pytest.mark.parametrize("axes", ["FILE", "COLMAP", "OPENGL"])
-def test_other_axes_turn_the_world_and_not_the_picture(blender, view, loaded, axes, tmp_path):
+def test_other_axes_rotate_the_world_and_not_the_picture(blender, view, loaded, axes, tmp_path):
     loaded.r5dgs.root.scale, loaded.r5dgs.root.location = (2, 2, 2), (0, 0, 1)
     blender.context.view_layer.update()
     options = {"directory": str(tmp_path), "frames": "CURRENT", "axes": axes}
@@ -105,7 +105,7 @@ def test_colmap_text_holds_all_cameras_and_their_times(blender, view, loaded, tm
     assert json.loads((tmp_path / "times.json").read_text())["times"][names[1]] == pytest.approx(4 / 60)
 
 
-def test_cameras_whose_names_differ_in_signs_alone_have_views_of_their_own(blender, view, tmp_path):
+def test_cameras_whose_names_differ_only_in_punctuation_have_separate_views(blender, view, tmp_path):
     for name in ("top view", "top_view", "Top/View", "top_view_2"):
         blender.context.scene.collection.objects.link(blender.data.objects.new(name, view.data))
     options = {"directory": str(tmp_path), "which": "ALL", "format": "COLMAP", "frames": "CURRENT"}

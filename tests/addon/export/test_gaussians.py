@@ -1,4 +1,4 @@
-"""Exported PLY files hold what Blender shows: for the core's own picture of it, and for readers of others."""
+"""Exported PLY files contain the visible Gaussians, as the core's pictures and other readers confirm."""
 
 import dataclasses
 import importlib
@@ -55,7 +55,7 @@ def turn_about(obj, turn):
 
 
 def edit(bpy, collection):
-    """Move, turn and scale one object, mirror another, hide a third. Its anchor moves the first all the same."""
+    """Move, turn and scale one object, mirror another, hide a third. The anchor of the first still moves it."""
     mug, apple, car = (cloud(collection, name) for name in ("mug", "red apple", "toy car"))
     turn = Quaternion((0.6, 0.3, -0.5, 0.4)).normalized().to_matrix().to_4x4()
     mug.matrix_local = Matrix.Translation((0.1, -0.2, 0.1)) @ mug.matrix_local @ turn_about(mug, turn)
@@ -81,7 +81,7 @@ def psnr(a, b):
 
 
 def shown(scene, collection, camera):
-    """The core's picture of what Blender shows, by maps of the bind state."""
+    """The core's picture of the edited scene, computed with maps of the bind state."""
     instances = [
         scene_renderer.Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_world, np.float64), world=WORLD_4)
         for o in collection.all_objects
@@ -113,7 +113,7 @@ def test_exported_gaussians_keep_translation_rotation_scale_and_mirroring(blende
     wanted = shown(scene, loaded, camera)
     assert psnr(render(splats, scene, camera), wanted) > 50
     without = select(splats, splats.object_ids != 1)
-    assert psnr(render(without, scene, camera), wanted) < 35  # it can be seen
+    assert psnr(render(without, scene, camera), wanted) < 35  # the edit is visible
     blender.context.scene.frame_set(30)
     assert psnr(render(splats, scene, camera), shown(scene, loaded, camera)) < 35  # the file is that of frame 43
 
@@ -164,10 +164,10 @@ def test_exported_ply_read_by_trimesh_matches_the_preview(blender, scene, previe
     theirs = Splats(column("x", "y", "z"), turns, sigmas, column("opacity")[:, 0], sh)
     assert psnr(render(theirs, scene, camera), shown_there) > 40
     flat = dataclasses.replace(theirs, sh=sh[:, :1])
-    assert psnr(render(flat, scene, camera), shown_there) < 40  # the harmonics can be seen
+    assert psnr(render(flat, scene, camera), shown_there) < 40  # the harmonics are visible
 
 
-def test_an_unedited_scene_is_that_of_playback(blender, scene, loaded, tmp_path):
+def test_an_unedited_scene_matches_playback(blender, scene, loaded, tmp_path):
     blender.context.scene.frame_set(13, subframe=0.5)
     splats = export(blender, tmp_path / "a.ply", axes="FILE")
     frame = scene_player.frame(scene, 12.5 / 60)
@@ -211,7 +211,7 @@ def test_a_tint_is_baked_into_the_colours(blender, loaded, tmp_path):
     np.testing.assert_array_equal(after.sh[~rows], before.sh[~rows])
 
 
-def test_selected_objects_come_alone_by_cloud_or_by_anchor(blender, scene, loaded, tmp_path):
+def test_only_selected_objects_are_exported_by_cloud_or_by_anchor(blender, scene, loaded, tmp_path):
     blender.ops.object.select_all(action="DESELECT")
     lemon = cloud(loaded, "mug")
     for handle in (lemon, lemon.parent):
@@ -225,7 +225,7 @@ def test_selected_objects_come_alone_by_cloud_or_by_anchor(blender, scene, loade
     assert not (tmp_path / "none.ply").exists()
 
 
-def test_a_range_is_a_numbered_file_for_each_frame_and_the_frame_stays(blender, scene, loaded, tmp_path):
+def test_a_range_writes_a_numbered_file_per_frame_and_keeps_the_current_frame(blender, scene, loaded, tmp_path):
     view = blender.context.scene
     view.frame_start, view.frame_end = 5, 9
     view.frame_set(30, subframe=0.25)
@@ -237,7 +237,7 @@ def test_a_range_is_a_numbered_file_for_each_frame_and_the_frame_stays(blender, 
     np.testing.assert_allclose(np.sort(found, axis=0), np.sort(wanted, axis=0), atol=1e-5 * scene.extent)
 
 
-def test_instances_of_a_collection_come_with_their_own_place(blender, scene, loaded, tmp_path):
+def test_instances_of_a_collection_are_exported_at_their_own_place(blender, scene, loaded, tmp_path):
     home = next(child for child in loaded.children if child.name == "mug")
     handle = blender.data.objects.new("copy", None)
     handle.instance_type, handle.instance_collection, handle.location = "COLLECTION", home, (0, 0, 5)
@@ -250,7 +250,7 @@ def test_instances_of_a_collection_come_with_their_own_place(blender, scene, loa
     np.testing.assert_allclose(mugs[count:], mugs[:count] + 5, atol=1e-4)
 
 
-def test_stopping_keeps_the_files_that_were_finished(blender, loaded, gaussians, tmp_path):
+def test_stopping_keeps_finished_files(blender, loaded, gaussians, tmp_path):
     view = blender.context.scene
     view.frame_start, view.frame_end = 1, 5
     steps = gaussians.ply_steps(blender.context, tmp_path / "a.ply", "VISIBLE", axes="BLENDER", plain=False, every=True)
@@ -263,7 +263,7 @@ def test_stopping_keeps_the_files_that_were_finished(blender, loaded, gaussians,
 
 
 @pytest.mark.parametrize("axes", ["BLENDER", "FILE", "COLMAP", "OPENGL"])
-def test_axes_turn_the_whole_and_plain_files_have_no_ids(blender, scene, loaded, axes, tmp_path):
+def test_axes_rotate_all_gaussians_and_plain_files_have_no_ids(blender, scene, loaded, axes, tmp_path):
     blender.context.scene.frame_set(46)  # t_max: the bind state
     found = export(blender, tmp_path / "a.ply", axes=axes, plain=True)
     assert found.object_ids is None and found.identities is None
@@ -273,7 +273,7 @@ def test_axes_turn_the_whole_and_plain_files_have_no_ids(blender, scene, loaded,
     np.testing.assert_allclose(np.sort(found.means, axis=0), np.sort(wanted, axis=0), atol=1e-5)
 
 
-def test_without_the_scene_file_the_points_in_blender_do(blender, loaded, tmp_path, capsys):
+def test_without_the_scene_file_the_points_in_blender_are_exported(blender, loaded, tmp_path, capsys):
     first = export(blender, tmp_path / "a.ply")
     (tmp_path / "scene.r5dgs").unlink()
     second = export(blender, tmp_path / "b.ply")
@@ -284,7 +284,7 @@ def test_without_the_scene_file_the_points_in_blender_do(blender, loaded, tmp_pa
     assert second.identities is None
 
 
-def test_third_parties_read_the_columns(blender, loaded, tmp_path):
+def test_other_libraries_read_the_columns(blender, loaded, tmp_path):
     trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed; it comes with the extra 'test'")
     ours = export(blender, tmp_path / "a.ply")
     theirs = trimesh.load(tmp_path / "a.ply")
@@ -300,7 +300,7 @@ def test_third_parties_read_the_columns(blender, loaded, tmp_path):
 
 def test_inexact_transforms_of_the_export_are_reported(blender, loaded, tmp_path, capsys):
     cloud(loaded, "mug").scale = (1, 2, 1)
-    cloud(loaded, "red apple").scale = (0, 0, 0)  # nothing to see, so nothing to export
+    cloud(loaded, "red apple").scale = (0, 0, 0)  # nothing visible, so nothing to export
     blender.context.view_layer.update()
     assert 2 not in export(blender, tmp_path / "a.ply").object_ids
     said = capsys.readouterr().out
@@ -308,7 +308,7 @@ def test_inexact_transforms_of_the_export_are_reported(blender, loaded, tmp_path
     assert "red apple" not in said
 
 
-def test_a_folder_that_is_not_there_is_an_error_and_no_file(blender, loaded, tmp_path):
+def test_a_missing_folder_is_an_error_and_writes_no_file(blender, loaded, tmp_path):
     with pytest.raises(RuntimeError, match=r"a\.ply.*cannot be written"):
         blender.ops.r5dgs.export_ply(filepath=str(tmp_path / "none" / "a.ply"))
     assert not (tmp_path / "none").exists()

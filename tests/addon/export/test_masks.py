@@ -1,4 +1,4 @@
-"""Masks and index images say what the core says is in front."""
+"""Masks and index images show the object that is in front according to the core."""
 
 import json
 
@@ -52,7 +52,7 @@ def truth(scene, frame):
     )
 
 
-def test_masks_and_index_of_a_range_are_the_cores(blender, scene, loaded, tmp_path):
+def test_masks_and_index_of_a_range_match_the_core(blender, scene, loaded, tmp_path):
     assert blender.ops.r5dgs.export_masks(directory=str(tmp_path / "out"), format="BOTH") == {"FINISHED"}
     folder = tmp_path / "out"
     assert json.loads((folder / "objects.json").read_text()) == {
@@ -95,7 +95,7 @@ def test_large_pass_indices_make_masks_of_16_bits(blender, loaded, tmp_path):
     assert json.loads((tmp_path / "out" / "objects.json").read_text())["700"] == "mug"
 
 
-def test_a_worker_in_trouble_is_an_error_and_no_file(blender, loaded, tmp_path, monkeypatch):
+def test_a_worker_failure_is_an_error_and_writes_no_file(blender, loaded, tmp_path, monkeypatch):
     monkeypatch.setenv("R5DGS_PYTHON", str(tmp_path / "no-python"))
     with pytest.raises(RuntimeError, match="no-python"):
         blender.ops.r5dgs.export_masks(directory=str(tmp_path / "out"))

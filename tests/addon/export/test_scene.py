@@ -101,7 +101,7 @@ def test_exported_scene_keeps_transforms_of_clouds_anchors_and_parents(blender, 
     assert_same_motion(blender, loaded, motions.load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
 
 
-def test_edited_curves_are_there_again(blender, scene, loaded, tmp_path):
+def test_edited_curves_survive_export(blender, scene, loaded, tmp_path):
     anchor = cloud(loaded, "red apple").parent
     for frame, place in ((1, (2, 0, 0)), (20, (2, 1, 0)), (46, (0, 0, 1.0))):
         anchor.location = place
@@ -128,7 +128,7 @@ def bind_of(bpy, collection, name):
     return result
 
 
-def test_edited_physics_are_the_model_of_the_new_file(blender, scene, loaded, tmp_path):
+def test_edited_physics_become_the_model_of_the_new_file(blender, scene, loaded, tmp_path):
     physics = importlib.import_module("r5dgs.r5dgs_addon.motion.physics")
     extrapolate = importlib.import_module("r5dgs.r5dgs_addon.motion.extrapolate")
     anchor = cloud(loaded, "red apple").parent
@@ -220,7 +220,7 @@ def test_names_colours_and_deletions_are_kept(blender, scene, loaded, tmp_path):
     np.testing.assert_allclose(found, colour * (0.5, 1, 1), atol=2e-3)  # harmonics are stored in half precision
 
 
-def test_a_duplicate_becomes_an_object_of_its_own(blender, scene, loaded, tmp_path):
+def test_a_duplicate_becomes_a_separate_object(blender, scene, loaded, tmp_path):
     blender.ops.object.select_all(action="DESELECT")
     anchor = cloud(loaded, "mug").parent
     anchor.select_set(True)
@@ -255,7 +255,7 @@ def test_export_without_the_scene_file_raises(blender, loaded, tmp_path):
     assert not (tmp_path / "b.r5dgs").exists()
 
 
-def test_stopping_leaves_no_file_and_the_frame_where_it_was(blender, loaded, tmp_path):
+def test_stopping_leaves_no_file_and_restores_the_frame(blender, loaded, tmp_path):
     module = importlib.import_module("r5dgs.r5dgs_addon.export.scene")
     blender.context.scene.frame_set(9)
     steps = module.steps(blender.context, loaded, tmp_path / "b.r5dgs")
@@ -289,7 +289,7 @@ def test_residuals_survive(blender, scene, tmp_path):
     assert (tmp_path / "again.r5dgs").read_bytes() == (tmp_path / "bent.r5dgs").read_bytes()
 
 
-def test_a_motion_taken_from_another_object_is_there_again(blender, scene, loaded, tmp_path):
+def test_a_motion_copied_from_another_object_survives_export(blender, scene, loaded, tmp_path):
     mug, car = cloud(loaded, "mug").parent, cloud(loaded, "toy car").parent
     blender.ops.object.select_all(action="DESELECT")
     for anchor in (car, mug):

@@ -1,4 +1,4 @@
-"""Prompts in words that no scene stores: the worker embeds them with the encoder of the preferences."""
+"""Words that no scene stores are embedded by the worker with the encoder of the preferences."""
 
 import sys
 
@@ -14,7 +14,7 @@ pytest.importorskip("transformers", reason="transformers is not installed in thi
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """An encoder, a stranger, and a scene file with the first one's table; its object 2 means zorb."""
+    """Two encoders, and a scene file with the table of the first one, whose object 2 means zorb."""
     from r5dgs_core.language import build_table
     from r5dgs_core.language.encoders import encoder_base, registry
 
@@ -87,7 +87,7 @@ def test_a_damaged_encoder_is_reported_and_names_are_still_searched(loaded, tmp_
     assert f"Text encoder: {tmp_path}/config.json: expected in the folder of an encoder" in notes(loaded)[0]
 
 
-def test_beside_a_window_the_answer_comes_later(loaded, monkeypatch):
+def test_with_a_window_the_answer_arrives_later(loaded, monkeypatch):
     phrases, told = motions.addon("language.phrase_embeddings"), []
     phrases.begin(["zorb", "glorp"], told.append)
     assert phrases.missing(["zorb", "glorp"]) == ["zorb", "glorp"]
@@ -106,7 +106,7 @@ def windowed(loaded, monkeypatch):
     return loaded
 
 
-def test_a_window_shows_at_once_what_is_known_and_then_the_rest(windowed):
+def test_a_window_shows_known_matches_at_once_and_the_others_later(windowed):
     session = windowed.context.window_manager.r5dgs_words
     assert ask(windowed, "mug and zorb") == {"FINISHED"}
     assert [match.object_id for match in session.matches] == [1]
@@ -115,7 +115,7 @@ def test_a_window_shows_at_once_what_is_known_and_then_the_rest(windowed):
     assert {1, 2} <= {match.object_id for match in session.matches} and notes(windowed) == []
 
 
-def test_an_answer_that_comes_later_is_not_shown_where_another_prompt_stands(windowed):
+def test_a_late_answer_is_not_shown_for_another_prompt(windowed):
     session = windowed.context.window_manager.r5dgs_words
     ask(windowed, "zorb")
     ask(windowed, "mug")

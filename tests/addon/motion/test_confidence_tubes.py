@@ -62,7 +62,7 @@ def test_a_tube_without_a_band_has_a_radius_of_two_standard_deviations(blender, 
     assert (np.diff(red) >= 0).all() and red[-1] > red[0]
 
 
-def test_all_that_move_get_one_where_nothing_is_chosen_and_a_second_press_removes_them(blender, loaded):
+def test_without_a_selection_all_moving_objects_get_tubes_and_a_second_press_removes_them(blender, loaded):
     before = {kind: {d.name for d in getattr(blender.data, kind)} for kind in ("objects", "meshes", "materials")}
     motions.choose(blender, loaded.r5dgs.root)
     blender.ops.r5dgs.show_confidence()
@@ -94,7 +94,7 @@ def test_a_motion_that_takes_too_many_steps_is_refused_before_they_are_taken(ble
     assert mug.r5dgs_motion.tube is None
 
 
-def test_a_shadow_gets_one_where_it_is_chosen(blender, loaded):
+def test_a_selected_shadow_gets_a_tube(blender, loaded):
     shadow = blender.data.objects["mug shadow anchor"]
     motions.choose(blender, shadow)
     assert blender.ops.r5dgs.show_confidence() == {"FINISHED"}
@@ -104,7 +104,7 @@ def test_a_shadow_gets_one_where_it_is_chosen(blender, loaded):
     assert shadow.r5dgs_motion.tube is None
 
 
-def test_it_follows_edits_and_what_was_edited_is_certain(blender, loaded):
+def test_the_tube_follows_edits_and_treats_edited_rates_as_exact(blender, loaded):
     apple = blender.data.objects["red apple anchor"]
     motions.choose(blender, apple)
     blender.ops.r5dgs.show_confidence()

@@ -1,4 +1,4 @@
-"""Objects are copied, removed and given other motions as a whole; other data is kept."""
+"""Objects are copied and removed as a whole and take over other motions; other data is kept."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def test_an_object_moves_as_another_does_about_its_own_pivot(blender, loaded, st
     assert car.animation_data.action != mug.animation_data.action
 
 
-def test_the_taken_motion_goes_on_as_physics_and_can_be_reset(blender, scene_path, loaded):
+def test_the_copied_motion_continues_as_physics_and_can_be_reset(blender, scene_path, loaded):
     mug, car = anchor(blender, "mug"), anchor(blender, "toy car")
     motions.choose(blender, car, mug)
     blender.ops.r5dgs.replace_motion()
@@ -58,7 +58,7 @@ def test_the_taken_motion_goes_on_as_physics_and_can_be_reset(blender, scene_pat
     motions.assert_plays_like_the_core(blender, loaded, scene_file.read(scene_path), TIMES)
 
 
-def test_still_objects_stand_still_when_that_is_the_motion_to_take(blender, loaded):
+def test_the_motion_of_a_still_object_can_be_copied(blender, loaded):
     block, mug = anchor(blender, "wooden block"), anchor(blender, "mug")
     motions.choose(blender, mug, block)
     blender.ops.r5dgs.replace_motion()
@@ -68,7 +68,7 @@ def test_still_objects_stand_still_when_that_is_the_motion_to_take(blender, load
     np.testing.assert_array_equal(turns, np.repeat(turns[:1], len(TIMES), axis=0))
 
 
-def test_a_shadow_goes_with_the_new_motion_of_its_caster(blender, loaded):
+def test_a_shadow_follows_the_new_motion_of_its_caster(blender, loaded):
     shadow, mug, car = blender.data.objects["mug shadow anchor"], anchor(blender, "mug"), anchor(blender, "toy car")
     motions.choose(blender, mug, car)
     blender.ops.r5dgs.replace_motion()
@@ -81,7 +81,7 @@ def test_a_shadow_goes_with_the_new_motion_of_its_caster(blender, loaded):
         blender.ops.r5dgs.replace_motion()
 
 
-def test_nothing_moves_otherwise_where_the_shadow_cannot_go_along(blender, loaded):
+def test_nothing_changes_if_the_shadow_cannot_follow(blender, loaded):
     shadow, mug, car = blender.data.objects["mug shadow anchor"], anchor(blender, "mug"), anchor(blender, "toy car")
     shadow.rotation_mode, before = "XYZ", motions.keys(mug)
     motions.choose(blender, mug, car)
@@ -101,7 +101,7 @@ def test_rotation_curves_with_keys_at_different_frames_are_refused_and_nothing_c
     assert motions.keys(car) == before
 
 
-def test_a_duplicate_moves_the_same_way_on_its_own(blender, loaded):
+def test_a_duplicate_moves_the_same_way_independently(blender, loaded):
     mug, cloud = anchor(blender, "mug"), blender.data.objects["mug"]
     motions.choose(blender, mug)
     assert blender.ops.r5dgs.duplicate_object(offset=(1.0, 2.0, 3.0)) == {"FINISHED"}
@@ -124,7 +124,7 @@ def test_a_duplicate_moves_the_same_way_on_its_own(blender, loaded):
 
 
 def test_a_duplicate_is_placed_beside_the_original_by_default(blender, loaded):
-    motions.choose(blender, blender.data.objects["red apple"])  # its cloud stands for it
+    motions.choose(blender, blender.data.objects["red apple"])  # its selected cloud selects the object
     blender.ops.r5dgs.duplicate_object()
     a, b = (motions.points(blender, blender.data.objects[name]) for name in ("red apple", "red apple.001"))
     assert b[:, 0].min() > a[:, 0].max()
@@ -159,7 +159,7 @@ def test_deleting_removes_only_the_parts_of_the_object(blender, scene_path, load
 
 @pytest.mark.parametrize("name", ["background", "mug"])
 def test_clouds_that_move_with_another_object_are_selected_with_their_own_object(blender, tmp_path, name):
-    """Clouds that move with another object are selected, and do not stand for that one."""
+    """Selecting clouds that move with another object does not select that object."""
     scene = scenes.make_scene(n=400, objects=5, seed=1)
     motion_ids = scene.gaussians.motion_ids.copy()
     motion_ids[np.flatnonzero((scene.gaussians.object_ids == 0) & (motion_ids == 0))[-5:]] = (
@@ -178,7 +178,7 @@ def test_clouds_that_move_with_another_object_are_selected_with_their_own_object
     meant = motions.addon("motion.duplicate_delete").chosen(blender.context)
     assert meant and {obj.r5dgs.object_id for obj in meant} == {anchor(blender, name).r5dgs.object_id}
     blender.ops.r5dgs.delete_object()
-    blender.ops.r5dgs.select_by_prompt(text=name)  # what is left of it moves with others
+    blender.ops.r5dgs.select_by_prompt(text=name)  # its remaining clouds move with other objects
     assert blender.context.selected_objects and not motions.addon("motion.duplicate_delete").chosen(blender.context)
 
 
@@ -188,11 +188,11 @@ def test_shadows_are_kept_on_request(blender, loaded):
     shadow = blender.data.objects["mug shadow anchor"]
     assert shadow.r5dgs_motion.leader is None
     motions.choose(blender, shadow)
-    assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}  # it stays where it was left
+    assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}  # it keeps its last position
 
 
-def test_a_turned_duplicate_keeps_its_turn(blender, loaded):
-    """Taking a motion that is turned at the reference frame mixes the four components of the quaternion."""
+def test_a_rotated_duplicate_keeps_its_rotation(blender, loaded):
+    """Copying a motion that is rotated at the reference frame mixes the four components of the quaternion."""
     mug, car = anchor(blender, "mug"), anchor(blender, "toy car")
     turn = rotations.rotvecs_to_quats(np.array([0.3, -0.2, 1.0]))
     for index in range(4):

@@ -42,7 +42,7 @@ def stored(cloud, name, field, width):
 
 
 def state(collection):
-    """All points as they are stored."""
+    """Stored values of all points."""
     fields = (("position", "vector", 3), ("rotation", "value", 4), ("scale", "vector", 3))
     clouds = sorted((o for o in collection.all_objects if o.r5dgs.role == "CLOUD"), key=lambda o: o.name)
     return [stored(cloud, *field) for cloud in clouds for field in fields]
@@ -170,7 +170,7 @@ def seen(bpy, cloud):
 
 
 def exported(bpy, cloud, folder):
-    """Centres of a cloud that are exported, by the scene file. [n, 3]"""
+    """Exported centres of a cloud, from the scene file. [n, 3]"""
     for other in bpy.context.selected_objects:
         other.select_set(False)
     cloud.select_set(True)

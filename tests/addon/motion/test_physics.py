@@ -1,4 +1,4 @@
-"""Motion that was edited as physics is written past t_max, and nothing else is touched."""
+"""Edited physics change the keys past t_max and nothing else."""
 
 import dataclasses
 import importlib
@@ -18,7 +18,7 @@ TIMES = (0.0, 0.3334, 0.7499, T_MAX, 0.7507, 0.9111, 1.0)
 
 
 def remove_key_at_t_max(curve):
-    """Returns which one it was."""
+    """Remove the key at t_max. Returns its index."""
     at = next(k for k, point in enumerate(curve.keyframe_points) if abs(point.co[0] - LAST) < 1e-3)
     curve.keyframe_points.remove(curve.keyframe_points[at])
     return at
@@ -51,7 +51,7 @@ def test_a_motion_that_was_not_edited_is_written_as_it_was_learned(blender, scen
     for anchor in anchors:
         after = motions.keys(anchor)
         assert after.keys() == before[anchor.name].keys()
-        for name, rows in after.items():  # what was one cubic across t_max now has a key there
+        for name, rows in after.items():  # the cubic across t_max now has a key there
             assert 0 <= len(rows) - len(before[anchor.name][name]) <= 1
     motions.assert_plays_like_the_core(blender, loaded, scene_file.read(scene_path), TIMES)
 
@@ -136,8 +136,8 @@ def test_no_scene_file_is_needed(blender, scene_path, tmp_path):
     motions.assert_plays_like_the_core(blender, collection, scene, (*TIMES, 1.2))
 
 
-def test_it_starts_from_where_the_user_brought_the_object(blender, loaded, mug):
-    """Keys before t_max that were moved, turned and added, and other channels, stay as they are."""
+def test_the_motion_starts_at_the_pose_that_the_user_set(blender, loaded, mug):
+    """Moved, rotated and added keys before t_max, and other channels, do not change."""
     turn = rotations.rotvecs_to_quats(np.array([0.0, 0.0, math.pi / 2]))
     for (path, index), curve in motions.curves(mug).items():
         for point in curve.keyframe_points:
@@ -264,7 +264,7 @@ def push_down(bpy, anchor):
     return strip
 
 
-def test_an_action_in_the_nla_is_written_where_it_lies(blender, loaded, mug):
+def test_an_action_in_the_nla_is_updated_in_place(blender, loaded, mug):
     push_down(blender, mug)
     state = mug.r5dgs_motion
     state.kind, state.velocity, state.acceleration = "translation", (per_second(blender, 1.0), 0, 0), (0, 0, 0)
@@ -277,7 +277,7 @@ def test_an_action_in_the_nla_is_written_where_it_lies(blender, loaded, mug):
     np.testing.assert_allclose(motions.matrix(blender, mug)[:3, 3] - start, [0.7, 0, 0], atol=1e-5)
 
 
-def test_a_strip_that_was_moved_and_slowed_down_plays_the_new_motion_so_too(blender, loaded, mug):
+def test_a_moved_and_slowed_strip_plays_the_new_motion(blender, loaded, mug):
     strip = push_down(blender, mug)
     strip.scale = 2.0
     strip.frame_start, strip.frame_end = 11, 11 + 2 * 60
@@ -311,7 +311,7 @@ def test_several_strips_of_the_nla_are_refused(blender, loaded, mug):
         blender.ops.r5dgs.re_extrapolate()
 
 
-def test_an_action_that_two_anchors_play_is_made_single_before_it_is_written(blender, loaded, mug):
+def test_a_shared_action_is_copied_before_it_is_written(blender, loaded, mug):
     other = mug.copy()
     loaded.objects.link(other)
     motions.choose(blender, mug)
@@ -371,7 +371,7 @@ def test_reset_with_a_missing_file_raises_and_changes_nothing(blender, scene_pat
 
 
 @pytest.mark.parametrize("t_end", [1.7, 0.85, T_MAX, 0.2])
-def test_the_future_is_extended_and_shortened(blender, scene_path, loaded, t_end):
+def test_the_extrapolation_is_extended_and_shortened(blender, scene_path, loaded, t_end):
     scene = scene_file.read(scene_path)
     assert blender.ops.r5dgs.extrapolate_until(t_end=t_end) == {"FINISHED"}
     end = max(t_end, T_MAX)
@@ -382,7 +382,7 @@ def test_the_future_is_extended_and_shortened(blender, scene_path, loaded, t_end
     motions.assert_plays_like_the_core(blender, loaded, scene, (*(t for t in TIMES if t <= end), end))
 
 
-def test_a_later_end_obeys_edited_physics_and_leaves_keys_edited_by_hand(blender, loaded, mug, capfd):
+def test_a_later_end_uses_edited_physics_and_keeps_keys_edited_by_hand(blender, loaded, mug, capfd):
     car = blender.data.objects["toy car anchor"]
     curve = motions.curves(car)["location", 1]
     curve.keyframe_points[-1].co_ui = (curve.keyframe_points[-1].co[0], 7.0)
@@ -433,14 +433,14 @@ def test_every_action_can_be_undone_and_redone(blender, loaded, action):
     blender.ops.ed.undo_push(message="before")
     assert action(blender.ops.r5dgs) == {"FINISHED"}
     after = snapshot(blender)
-    blender.ops.ed.undo_push(message="action")  # the window does this after an operator of the user
+    blender.ops.ed.undo_push(message="action")  # with a window, Blender does this after an operator
     blender.ops.ed.undo()
     assert snapshot(blender) == before
     blender.ops.ed.redo()
     assert snapshot(blender) == after
 
 
-def test_without_a_chosen_object_the_actions_say_what_to_do(blender, loaded):
+def test_without_a_selected_object_the_operators_name_the_remedy(blender, loaded):
     motions.choose(blender, loaded.r5dgs.root)
     for name in ("re_extrapolate", "reset_motion", "replace_motion", "duplicate_object", "delete_object"):
         with pytest.raises(RuntimeError, match=r"[Ss]elect"):
@@ -461,7 +461,7 @@ def test_far_from_the_origin_extrapolation_still_holds(blender, tmp_path):
     assert scene_player.frame(far, 1.3).means.shape == (300, 3)
 
 
-def test_fewer_keys_hold_the_tolerance_and_the_ends(blender, scene_path, loaded):
+def test_key_reduction_keeps_the_tolerance_and_the_ends(blender, scene_path, loaded):
     scene = scene_file.read(scene_path)
     anchors = [o for o in loaded.all_objects if o.r5dgs.role == "ANCHOR" and motions.curves(o)]
     count = sum(len(rows) for anchor in anchors for rows in motions.keys(anchor).values())
@@ -477,11 +477,11 @@ def test_fewer_keys_hold_the_tolerance_and_the_ends(blender, scene_path, loaded)
             worst = np.linalg.norm(motions.points(blender, cloud) - frame.means[rows], axis=-1).max()
             assert worst <= 2e-3 * motions.addon("motion.physics").size(cloud.parent) + 1e-5 * scene.extent
     motions.assert_plays_like_the_core(blender, loaded, scene, (0.0, T_MAX, 1.0))
-    blender.ops.r5dgs.extrapolate_until(t_end=1.2)  # nobody edited these by hand
+    blender.ops.r5dgs.extrapolate_until(t_end=1.2)  # these were not edited by hand
     motions.assert_plays_like_the_core(blender, loaded, scene, (0.0, T_MAX, 1.2))
 
 
-def test_kinks_that_the_user_made_survive_fewer_keys(blender, loaded, mug):
+def test_kinks_made_by_the_user_survive_key_reduction(blender, loaded, mug):
     curve = motions.curves(mug)["location", 2]
     point = curve.keyframe_points.insert(20.0, 2.0)
     point.handle_left_type = point.handle_right_type = "VECTOR"
@@ -503,7 +503,7 @@ def test_stepped_keys_are_not_smoothed_away(blender, loaded, mug):
     assert motions.keys(mug) == before
 
 
-def test_the_panel_shows_what_a_motion_has_and_whether_it_was_edited(blender, loaded, mug):
+def test_the_panel_shows_the_fields_of_a_motion_and_marks_edits(blender, loaded, mug):
     (panel,) = importlib.import_module("r5dgs.r5dgs_addon.panels.motion").CLASSES
     for kind, fields in ((name, kind.fields) for name, kind in models.KINDS.items()):
         mug.r5dgs_motion.kind = kind
@@ -536,7 +536,7 @@ def test_edited_numbers_are_written_at_once_if_enabled(blender, loaded, mug):
         places.append(motions.matrix(blender, mug)[:3, 3])
     np.testing.assert_allclose(places[1] - places[0], [0.5, 0, 0], atol=1e-5)
     mug.rotation_mode = "XYZ"
-    state.velocity = (0.0, 0.0, 0.0)  # cannot be written: no error out of a slider
+    state.velocity = (0.0, 0.0, 0.0)  # cannot be written; a slider must not raise an error
     assert not motions.addon("motion.physics").is_written(mug)
 
 
@@ -575,7 +575,7 @@ def test_a_spin_too_fast_for_keys_is_keyed_at_every_frame_and_named(blender, loa
 
 
 @pytest.mark.parametrize("speed", [1e9, 1e30, math.inf])
-def test_speeds_beyond_all_measure_do_no_harm(blender, loaded, mug, speed):
+def test_extreme_speeds_do_no_harm(blender, loaded, mug, speed):
     before = motions.keys(mug, LAST)
     mug.r5dgs_motion.velocity = (speed, 0.0, 0.0)
     assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
@@ -592,7 +592,7 @@ def test_a_velocity_that_is_not_finite_raises_an_error_that_names_it(blender, mu
     assert motions.keys(mug) == before
 
 
-def test_an_end_beyond_all_measure_is_refused_and_nothing_changes(blender, loaded, mug):
+def test_an_extreme_end_is_refused_and_nothing_changes(blender, loaded, mug):
     before = motions.keys(mug)
     for t_end in (20.0, math.inf, math.nan):
         with pytest.raises(RuntimeError, match="expected an end of at most 15.75"):

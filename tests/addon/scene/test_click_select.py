@@ -1,4 +1,4 @@
-"""A click on a cloud in a 3D view selects its anchor; what else changes the active object does not."""
+"""A click on a cloud in a 3D view selects its anchor; other changes of the active object do not."""
 
 import importlib
 from types import SimpleNamespace
@@ -29,7 +29,7 @@ def choose(bpy, name, extend=False):
     bpy.context.view_layer.objects.active = bpy.data.objects[name]
 
 
-def test_the_anchor_takes_the_place_of_its_cloud(blender, click):
+def test_the_anchor_replaces_its_cloud_in_the_selection(blender, click):
     choose(blender, "mug")
     assert click.follow(blender.context, extend=False).name == "mug anchor"
     assert selected(blender) == {"mug anchor"}
@@ -67,7 +67,7 @@ def test_a_cloud_whose_anchor_cannot_be_selected_stays_selected(blender, click):
 
 
 def heard(monkeypatch, bpy, click, operator, **properties):
-    """Let the message come after an operator of the user; the real list of operators is empty without a window."""
+    """Send the notification as if after an operator; without a window, the real list of operators is empty."""
     done = [
         SimpleNamespace(
             bl_idname=operator, properties=SimpleNamespace(**{"extend": False, "toggle": False} | properties)
@@ -96,7 +96,7 @@ def test_only_a_click_in_a_view_is_followed(blender, click, monkeypatch):
     assert selected(blender) == {"mug anchor", "toy car anchor"}
 
 
-def test_it_can_be_switched_off(blender, click, monkeypatch):
+def test_click_selection_can_be_switched_off(blender, click, monkeypatch):
     blender.context.scene.r5dgs_words.click_selects_anchor = False
     choose(blender, "mug")
     heard(monkeypatch, blender, click, "VIEW3D_OT_select")
@@ -115,7 +115,7 @@ def test_it_can_be_undone(blender, click, monkeypatch):
     assert selected(blender) == {"mug anchor"}
 
 
-def test_it_listens_in_each_file_and_not_after_unregistering(blender, extension, click):
+def test_clicks_are_followed_in_each_file_until_unregistering(blender, extension, click):
     handlers = blender.app.handlers.load_post
     assert handlers.count(click._after_load) == 1
     blender.ops.wm.read_homefile(app_template="")

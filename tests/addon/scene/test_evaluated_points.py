@@ -32,7 +32,7 @@ def loaded(blender, scene, tmp_path):
 
 @pytest.fixture
 def mug(loaded):
-    """A cloud whose anchor has moved and turned it."""
+    """Cloud that its anchor has moved and rotated."""
     return next(o for o in loaded.all_objects if o.name == "mug" and o.r5dgs.role == "CLOUD")
 
 
@@ -77,7 +77,7 @@ def lowered(tree, source, target):
 
 
 def bent(tree, source, target):
-    """Set Position by a noise: no two points move alike."""
+    """Set Position by noise: every point moves differently."""
     noise = tree.nodes.new("ShaderNodeTexNoise")
     noise.inputs["Scale"].default_value = 7.0
     vector = next(one for one in noise.outputs if one.name == "Color")
@@ -186,25 +186,25 @@ EDITS = (lowered, bent, halved, turned, doubled)
 
 
 @pytest.mark.parametrize("build", EDITS)
-def test_geometry_nodes_move_and_delete_what_is_drawn_and_exported(
+def test_geometry_nodes_move_and_delete_drawn_and_exported_gaussians(
     blender, scene, loaded, mug, rendered, tmp_path, build
 ):
     before, _, _ = rendered()
     nodes(blender, mug, build)
     points, rows = viewport(blender, mug)
     splats = export(blender, tmp_path, mug)
-    if build is doubled:  # one point is new, first or last
+    if build is doubled:  # one point is new, either the first or the last
         assert len(points) == 2 * mug.r5dgs.count + 1 and len(splats.means) == 2 * mug.r5dgs.count
         kept = slice(1, None) if np.allclose(points[1], splats.means[0], atol=1e-5) else slice(0, -1)
         points = points[kept]
     np.testing.assert_allclose(splats.means, points, atol=1e-5)
     after, camera, _ = rendered()
-    assert psnr(before, after) < 40  # it can be seen
+    assert psnr(before, after) < 40  # the edit is visible
     blender.ops.r5dgs.export_ply(filepath=str(tmp_path / "all.ply"), which="VISIBLE")
     assert psnr(picture_of(ply.read(tmp_path / "all.ply"), scene, camera), after) > 50
 
 
-def test_a_cloud_without_edits_is_the_scenes_own_rows(blender, loaded, visible):
+def test_a_cloud_without_edits_uses_the_scenes_own_rows(blender, loaded, visible):
     _, found = visible.instances(blender.context.evaluated_depsgraph_get())
     assert found and all(one.edit is None and one.count == len(one.object.data.points) for one in found)
 
@@ -358,7 +358,7 @@ def test_unchanged_points_are_compared_once(blender, mug, visible, cloud_points,
     assert counted
 
 
-def test_an_edited_scene_holds_what_nodes_and_edits_made_of_its_points(blender, loaded, mug, rendered, tmp_path, capfd):
+def test_an_edited_scene_contains_points_changed_by_nodes_and_edits(blender, loaded, mug, rendered, tmp_path, capfd):
     apple = next(o for o in loaded.all_objects if o.name == "red apple" and o.r5dgs.role == "CLOUD")
     nodes(blender, mug, doubled)
     nodes(blender, apple, halved)
@@ -413,7 +413,7 @@ def render(bpy, folder, name="out", **arguments):
 
 
 @pytest.mark.parametrize("build", (bent, halved))
-def test_f12_is_the_preview_of_the_evaluated_cloud(blender, mug, engine, tmp_path, build):
+def test_f12_matches_the_preview_of_the_evaluated_cloud(blender, mug, engine, tmp_path, build):
     blender.context.scene.r5dgs_render.sky = False
     before = render(blender, tmp_path, "before")
     nodes(blender, mug, build)
@@ -421,7 +421,7 @@ def test_f12_is_the_preview_of_the_evaluated_cloud(blender, mug, engine, tmp_pat
     assert psnr(before, after) < 40 and psnr(after, np.clip(engine()[0], 0, 1)) > 45
 
 
-def test_f12_sees_points_that_a_script_changes_without_telling_blender(blender, mug, engine, tmp_path):
+def test_f12_draws_points_that_a_script_changed_without_an_update(blender, mug, engine, tmp_path):
     before = render(blender, tmp_path, "before")
     points = np.empty(3 * mug.r5dgs.count, np.float32)
     mug.data.attributes["position"].data.foreach_get("vector", points)
@@ -429,7 +429,7 @@ def test_f12_sees_points_that_a_script_changes_without_telling_blender(blender, 
     assert psnr(before, render(blender, tmp_path, "after")) < 40
 
 
-def test_an_animation_follows_nodes_and_names_what_it_leaves_out_once(blender, loaded, mug, engine, tmp_path, capfd):
+def test_an_animation_follows_nodes_and_reports_ignored_parts_once(blender, loaded, mug, engine, tmp_path, capfd):
     for obj in loaded.all_objects:  # what rests
         obj.animation_data_clear()
     scene = blender.context.scene

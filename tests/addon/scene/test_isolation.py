@@ -1,4 +1,4 @@
-"""Isolating hides the objects of loaded scenes but some, and goes back to exactly what was before."""
+"""Isolating hides all but some objects of loaded scenes and can be undone exactly."""
 
 import pytest
 
@@ -61,7 +61,7 @@ def test_all_loaded_scenes_are_hidden_but_the_selected_objects(blender, load):
     assert shown(blender) == before
 
 
-def test_it_survives_saving_renaming_and_deleting(blender, load, tmp_path):
+def test_isolation_survives_saving_renaming_and_deleting(blender, load, tmp_path):
     blender.data.objects["toy car"].hide_set(True)
     before = shown(blender)
     blender.ops.r5dgs.isolate(text="mug")

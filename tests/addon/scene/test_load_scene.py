@@ -42,7 +42,7 @@ TIMES = (0.0, 0.013, 0.22, 0.3334, 0.61, 0.7499, scenes.T_MAX, 0.7507, 0.8, 0.91
 
 
 @pytest.mark.parametrize("convention", ["blender", "colmap", "opengl"])
-def test_points_stand_where_playback_has_them_at_any_time(blender, tmp_path, convention):
+def test_points_match_playback_at_any_time(blender, tmp_path, convention):
     scene = scenes.make_scene(n=300, objects=5, world_convention=convention)
     path = scene_file.write(scene, tmp_path / "scene.r5dgs")
     motions.assert_plays_like_the_core(blender, motions.load(blender, path), scene_file.read(path), TIMES)
@@ -189,7 +189,7 @@ def test_a_uniform_translation_has_two_keys(blender, tmp_path):
     motions.assert_plays_like_the_core(blender, collection, sliding, np.linspace(0.0, 1.0, 9))
 
 
-def test_a_larger_tolerance_gives_fewer_keys_and_keeps_its_promise(blender, scene_path):
+def test_a_larger_tolerance_gives_fewer_keys_within_the_tolerance(blender, scene_path):
     scene = scene_file.read(scene_path)
     counts = {}
     for tolerance in (3e-6, 1e-3):
@@ -274,7 +274,7 @@ def test_a_save_that_failed_changes_no_path(blender, scene_path, tmp_path):
     assert collection.r5dgs.filepath == "//synthetic.r5dgs"
 
 
-def test_one_undo_takes_back_the_whole_scene_and_redo_brings_it(blender, scene_path):
+def test_one_undo_removes_the_whole_scene_and_redo_restores_it(blender, scene_path):
     blender.ops.ed.undo_push(message="before")
     names = {kind: {data.name for data in getattr(blender.data, kind)} for kind in KINDS}
     range_before = blender.context.scene.frame_end
@@ -351,7 +351,7 @@ def test_registering_twice_in_a_row_is_clean(blender, extension):
     assert "load_scene" in dir(blender.ops.r5dgs)
 
 
-def test_an_anchor_stays_with_its_own_object_whoever_moves_with_it(blender, tmp_path):
+def test_an_anchor_stays_with_its_own_object_if_others_move_with_it(blender, tmp_path):
     scene = scenes.make_scene(n=400, objects=3)
     motion_ids, object_ids = scene.gaussians.motion_ids.copy(), scene.gaussians.object_ids.copy()
     floor = np.flatnonzero((object_ids == 0) & (motion_ids == 0))

@@ -1,4 +1,4 @@
-"""Names follow the user: what is renamed in the Outliner or in the sidebar is called so everywhere."""
+"""Names follow the user: a rename in the Outliner or in the sidebar applies everywhere."""
 
 import importlib
 
@@ -107,7 +107,7 @@ def test_a_name_that_is_taken_gets_a_number_and_none_is_refused(blender, loaded,
     assert table.names(loaded)[MUG] == "ü" * 31
 
 
-def test_one_objects_name_in_anothers_is_left_alone(blender, loaded, table):
+def test_a_name_inside_another_name_is_not_renamed(blender, loaded, table):
     table.rename(loaded, APPLE, "mug tall")
     table.rename(loaded, MUG, "cup")
     assert {"mug tall", "mug tall anchor", "cup", "cup shadow anchor"} <= named(loaded)
@@ -125,7 +125,7 @@ def test_rows_of_the_list_rename_and_are_renamed(blender, loaded, table):
     assert entry.label == "urn"
 
 
-def test_one_name_alone_is_the_one_of_the_whole_table(blender, loaded, path, table):
+def test_the_name_of_one_object_equals_that_in_the_whole_table(blender, loaded, path, table):
     def agree():
         scenes = [c for c in blender.data.collections if c.r5dgs.is_scene]
         return all(table.name_of(e) == table.names(c)[e.object_id] for c in scenes for e in c.r5dgs.table)

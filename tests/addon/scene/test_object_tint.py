@@ -1,4 +1,4 @@
-"""A tint recolours what viewports show, loses nothing, and goes with the object."""
+"""A tint recolours an object in viewports, is reversible, and stays with the object."""
 
 import importlib
 

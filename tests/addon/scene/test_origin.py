@@ -1,4 +1,4 @@
-"""A scene with an origin far away: shown near Blender's, saved with the .blend, given back where coordinates leave."""
+"""A far origin of a scene: shown near Blender's origin, saved with the .blend, added again on export."""
 
 import dataclasses
 import importlib
@@ -33,7 +33,7 @@ def loaded_scenes(blender):
 
 @pytest.fixture
 def view(blender, loaded, scene_path):
-    """A camera of Blender where the scene's first one is."""
+    """Blender camera at the position of the scene's first camera."""
     return place_camera(blender, loaded, scene_file.read(scene_path).cameras[0])
 
 

@@ -1,4 +1,4 @@
-"""A path that a .blend names is read by itself only beside or below that .blend; for any other the panel asks."""
+"""A path in a .blend is read automatically only beside or below that .blend; other paths must be allowed."""
 
 import dataclasses
 import importlib
@@ -17,7 +17,7 @@ ASKS = "not read, because it is outside the folder of the .blend"
 
 @pytest.fixture
 def trust(blender, monkeypatch):
-    """The module, with what other tests have allowed forgotten, and the environment of a plain session."""
+    """The module without permissions of other tests, and the environment of a plain session."""
     module = motions.addon("scene.trust")
     monkeypatch.setattr(module, "_allowed", set())
     monkeypatch.delenv(module.ENVIRONMENT, raising=False)
@@ -33,7 +33,7 @@ def scene_path(tmp_path):
 
 @pytest.fixture
 def blend(blender, trust, scene_path, tmp_path):
-    """A .blend with Exact Mode on whose scene file lies in another folder, as a new session finds it."""
+    """A .blend with Exact Mode on whose scene file is in another folder, opened in a new session."""
     motions.load(blender, scene_path)
     blender.ops.r5dgs.exact_mode(action="ON")
     path = tmp_path / "project" / "work.blend"
@@ -45,7 +45,7 @@ def blend(blender, trust, scene_path, tmp_path):
 
 
 def new_session(trust):
-    """Forget what the user has allowed, and what was read."""
+    """Clear the permissions of the user and the cached files."""
     trust._allowed.clear()
     motions.addon("motion.exact_mode")._files.clear()
 
@@ -150,7 +150,7 @@ def test_a_file_that_the_user_chooses_in_the_panel_is_allowed(blender, blend, tr
     assert trust.find(collection).path == chosen
 
 
-def test_trusted_folders_of_preferences_and_environment_ask_nothing(blender, blend, trust, scene_path, monkeypatch):
+def test_files_in_trusted_folders_are_read_without_confirmation(blender, blend, trust, scene_path, monkeypatch):
     collection = opened(blender, blend)
     assert trust.find(collection).path is None
     monkeypatch.setenv(trust.ENVIRONMENT, os.pathsep.join(("/nowhere", str(scene_path.parent))))
@@ -164,7 +164,7 @@ def test_trusted_folders_of_preferences_and_environment_ask_nothing(blender, ble
     assert preferences._trusted(kept) == (str(scene_path.parent),)
 
 
-def test_a_linked_scene_may_read_beside_its_library_alone(blender, blend, trust, scene_path, tmp_path):
+def test_a_linked_scene_may_read_only_beside_its_library(blender, blend, trust, scene_path, tmp_path):
     opened(blender, blend)
     library = scene_path.parent / "library.blend"
     blender.ops.wm.save_as_mainfile(filepath=str(library))
@@ -180,9 +180,7 @@ def test_a_linked_scene_may_read_beside_its_library_alone(blender, blend, trust,
     assert trust.find(target.collections[0]).asked == scene_path
 
 
-def test_an_override_of_a_library_that_is_missing_lets_nothing_be_read_beside_it(
-    blender, blend, trust, scene_path, tmp_path
-):
+def test_an_override_of_a_missing_library_reads_nothing_beside_it(blender, blend, trust, scene_path, tmp_path):
     opened(blender, blend)
     library, folder = scene_path.parent / "library.blend", tmp_path / "project"
     blender.ops.wm.save_as_mainfile(filepath=str(library))
@@ -217,7 +215,7 @@ def test_a_file_that_cannot_be_read_is_read_once_until_it_changes(blender, blend
     assert len(reads) == 3 and collection.r5dgs_exact.problem == ""
 
 
-def test_the_module_that_remembers_reads_again_after_a_change_alone(blender, tmp_path):
+def test_the_cache_reads_a_file_again_only_after_a_change(blender, tmp_path):
     remembered = importlib.import_module("r5dgs.r5dgs_addon.scene.file_cache")
     calls = []
     files = remembered.Remembered(lambda path: calls.append(path) or len(path.read_bytes()))

@@ -17,7 +17,7 @@ def scene_path(tmp_path):
 
 
 def instances(bpy):
-    """World matrices of all ellipsoids, by the place of their middle. [N, 4, 4]"""
+    """World matrices of all ellipsoids, sorted by their centres. [N, 4, 4]"""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     found = [np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance]
     return np.array(sorted(found, key=lambda matrix: tuple(matrix[:3, 3].round(4)))).reshape(-1, 4, 4)
@@ -62,7 +62,7 @@ def test_the_display_can_be_changed_and_leaves_nothing_behind(blender, scene_pat
     before = {kind: len(getattr(blender.data, kind)) for kind in ("materials", "node_groups", "objects", "pointclouds")}
     clouds = [obj for obj in collection.all_objects if obj.r5dgs.role == "CLOUD"]
     assert collection.r5dgs.display == "POINTS" and not any(cloud.modifiers for cloud in clouds)
-    for display in ("ELLIPSOIDS", "ELLIPSOIDS", "SPLATS", "SPLATS"):  # twice: nothing is made twice either
+    for display in ("ELLIPSOIDS", "ELLIPSOIDS", "SPLATS", "SPLATS"):  # twice: nothing is created a second time
         assert blender.ops.r5dgs.set_display(display=display) == {"FINISHED"}
         assert collection.r5dgs.display == display and {len(cloud.modifiers) for cloud in clouds} == {1}
         assert len(blender.data.node_groups) == before["node_groups"] + 1
@@ -79,7 +79,7 @@ def test_splats_hide_their_points_in_viewports_only(blender, scene_path):
     assert min(point.radius for point in cloud.data.points) > 0 and not cloud.modifiers[0].show_render
 
 
-def test_one_undo_takes_a_display_back_and_redo_brings_it(blender, scene_path):
+def test_one_undo_reverts_the_display_and_redo_restores_it(blender, scene_path):
     def display():
         collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
         clouds = [obj for obj in collection.all_objects if obj.r5dgs.role == "CLOUD"]

@@ -11,7 +11,7 @@ pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra
 
 
 class Window:
-    """A stand-in for a context with a window, which the bpy module lacks: notes what an operator does to it."""
+    """Stand-in for a context with a window, which the bpy module lacks. Records the calls of an operator."""
 
     def __init__(self):
         self.said, self.done, self.timers = [], [], 0
@@ -42,7 +42,7 @@ def running(blender, extension, monkeypatch):
 
 
 def make(running, steps):
-    """An operator that runs steps, a window, and what it reports."""
+    """An operator that runs steps, a window, and the list of its reports."""
     reports = []
     members = {"steps": lambda self, context: steps, "suggest": lambda self, context: True}
     operator = type("Operator", (running.Running,), members)()
@@ -51,7 +51,7 @@ def make(running, steps):
 
 
 def begin(running, steps):
-    """`make`, and it has begun beside the window."""
+    """`make`, and start the operator modally."""
     operator, window, reports = make(running, steps)
     assert operator.invoke(window, None) == {"RUNNING_MODAL"} and window.timers == 1
     return operator, window, reports
@@ -66,7 +66,7 @@ def tidy(window):
 
 
 def endless(running, closed):
-    """Steps that go on until they are closed, which they note."""
+    """Endless steps that record when they are closed."""
     try:
         while True:
             yield running.Step(0, 9, "frame", slow=True)
@@ -74,7 +74,7 @@ def endless(running, closed):
         closed.append(True)
 
 
-def test_the_end_is_reported_with_what_was_not_as_expected(running):
+def test_the_end_is_reported_with_warnings(running):
     def steps():
         for number in range(3):
             yield running.Step(number, 3, f"file {number}")
@@ -142,7 +142,7 @@ def test_esc_closes_the_steps(running):
     assert tidy(window) and "stopped" in reports[0][1]
 
 
-def test_esc_leaves_the_window_as_it_was_even_where_undoing_the_steps_fails(running):
+def test_esc_restores_the_window_even_if_cleaning_up_the_steps_fails(running):
     def steps():
         try:
             while True:
@@ -191,7 +191,7 @@ def test_a_fault_in_the_steps_is_raised_and_leaves_the_window_as_it_was(running)
     assert tidy(window) and reports == []
 
 
-def test_the_mouse_shows_how_far_loading_is_and_is_itself_again_after_an_error(running):
+def test_the_cursor_shows_loading_progress_and_is_restored_after_an_error(running):
     window = Window()
     with pytest.raises(ZeroDivisionError), running.cursor(window) as progress:
         progress(0.4)
@@ -199,7 +199,7 @@ def test_the_mouse_shows_how_far_loading_is_and_is_itself_again_after_an_error(r
     assert window.done == ["begin", 40.0, "end"]
 
 
-def test_without_a_window_there_is_no_mouse_to_show_it(running):
+def test_without_a_window_no_progress_is_shown_at_the_cursor(running):
     window = Window()
     window.window = None
     with running.cursor(window) as progress:

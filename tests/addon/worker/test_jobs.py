@@ -58,7 +58,7 @@ def held(worker):
 
 @pytest.mark.skipif(not hasattr(signal, "SIGPIPE"), reason="Windows has no such signal")
 def test_writing_to_a_worker_that_has_ended_is_an_error_and_no_signal_for_blender(worker):
-    """Blender leaves SIGPIPE to the system, which would end it; Python ignores it."""
+    """Blender keeps the default action of SIGPIPE, which would end it; Python ignores the signal."""
     process = importlib.import_module("r5dgs.r5dgs_addon.worker.process")
     heard = []
     before = signal.signal(signal.SIGPIPE, lambda *_: heard.append(True))
@@ -96,7 +96,7 @@ def test_a_running_request_is_not_dropped_for_a_later_one(worker):
     assert first.answer()[0]["pid"] == second.answer()[0]["pid"] == running.pid
 
 
-def test_a_request_in_place_waits_for_its_turn(worker, held):
+def test_a_blocking_request_waits_for_its_turn(worker, held):
     running, first = held
     threading.Timer(0.1, os.kill, (running.pid, signal.SIGCONT)).start()
     assert worker.request("hello")[0]["pid"] == running.pid and first.done
@@ -114,7 +114,7 @@ def test_cancelling_a_waiting_job_keeps_the_worker_and_a_running_job_ends_it(wor
     assert not running.alive and next_one.answer()[0]["pid"] != running.pid
 
 
-def test_stopping_ends_all_that_runs_and_waits(worker, held):
+def test_stopping_ends_running_and_waiting_jobs(worker, held):
     running, first = held
     waiting = [worker.submit(key, HELLO) for key in ("a", "b")]
     worker.stop()
@@ -139,7 +139,7 @@ def test_a_worker_that_is_killed_in_the_middle_of_a_picture_is_survived(worker, 
 
 
 def fake_python(path, reason=""):
-    """An executable that says that it can run the worker, or why not."""
+    """Executable that reports that it can run the worker, or a reason why it cannot."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(f"#!{PYTHON}\nraise SystemExit({reason!r} or 0)\n")
     path.chmod(path.stat().st_mode | stat.S_IXUSR)
@@ -148,7 +148,7 @@ def fake_python(path, reason=""):
 
 @pytest.fixture
 def elsewhere(monkeypatch, tmp_path):
-    """No Python in sight but those that a test makes: a home folder and a PATH."""
+    """Home folder and PATH in which only the Pythons of a test exist."""
     for name in ("VIRTUAL_ENV", "CONDA_PREFIX"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "executable", "")
@@ -156,7 +156,7 @@ def elsewhere(monkeypatch, tmp_path):
     return tmp_path
 
 
-def test_pythons_are_looked_for_beside_the_extension_at_home_and_on_the_path(pythons, elsewhere, monkeypatch):
+def test_pythons_are_searched_beside_the_extension_at_home_and_on_the_path(pythons, elsewhere, monkeypatch):
     own, home = elsewhere / "own", elsewhere / "home"
     expected = [
         fake_python(elsewhere / "active" / "bin" / "python"),
@@ -175,7 +175,7 @@ def test_pythons_are_looked_for_beside_the_extension_at_home_and_on_the_path(pyt
     assert list(pythons.candidates([own], home)) == expected
 
 
-def test_the_first_python_that_has_what_is_needed_is_taken(pythons, elsewhere):
+def test_the_first_python_with_the_required_packages_is_used(pythons, elsewhere):
     own, home = elsewhere / "own", elsewhere / "home"
     lacking = fake_python(own / ".venv" / "bin" / "python", "lacks torch")
     assert pythons.lacking(lacking) == "lacks torch" and pythons.find([own], home) is None
@@ -258,7 +258,7 @@ def test_other_threads_use_cached_preferences_without_reading_them(preferences, 
 
 @pytest.fixture
 def only_python(preferences, elsewhere, monkeypatch):
-    """Makes an executable script the one Python that a search can find; there is no other on this machine."""
+    """Make an executable script the only Python that a search can find."""
     monkeypatch.setattr(preferences, "_beside", lambda: [])
     monkeypatch.setattr(Path, "home", lambda: elsewhere / "home")
 
@@ -300,7 +300,7 @@ def test_a_python_found_in_the_background_runs_the_worker_and_is_stored(
     with open(gate, "w"):  # from here on the search waits for the end of this block
         assert not job.done and job.doing == worker.SEARCHING and job.python == ""
     assert job.answer()[0]["pid"] and job.python == str(found) == kept.found_python
-    again = worker.submit("view", HELLO)  # which would wait for ever at the gate, searched it anew
+    again = worker.submit("view", HELLO)  # a new search would wait for ever at the gate
     assert again.answer()[0]["pid"] and again.python == str(found)
     worker.stop()
 
@@ -329,7 +329,7 @@ def runs(pid):
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc to look at processes of others")
-def test_giving_up_ends_a_wrapper_script_and_the_python_that_it_runs(worker, wrapper, monkeypatch):
+def test_stopping_ends_a_wrapper_script_and_the_python_that_it_runs(worker, wrapper, monkeypatch):
     monkeypatch.setenv("R5DGS_PYTHON", wrapper)
     running = worker.current()
     child = running.hello["pid"]
