@@ -79,7 +79,7 @@ def test_clean_masks_come_back_as_they_are(bodies, views, times):
 
 
 @pytest.mark.parametrize(("bodies", "views", "times"), [(2, 4, 1), (2, 2, 2), (6, 3, 5), (12, 4, 3)])
-def test_views_that_number_for_themselves_get_one_numbering(bodies, views, times):
+def test_views_with_separate_numbering_get_a_common_one(bodies, views, times):
     seen = look(bodies, views, times)
     masks = renumbered(seen, 3)
     given = seen.bags(masks)
@@ -91,7 +91,7 @@ def test_views_that_number_for_themselves_get_one_numbering(bodies, views, times
     assert pairs.shape[1] == bodies + 1
 
 
-def test_names_of_a_view_change_nothing():
+def test_names_of_views_have_no_effect():
     seen = look(6, 3, 5)
     outcomes = [
         partition(new_masks(m, b := seen.bags(m), associate.associate(b)))
@@ -100,7 +100,7 @@ def test_names_of_a_view_change_nothing():
     assert outcomes[0] == outcomes[1]
 
 
-def test_the_order_of_images_changes_nothing():
+def test_the_order_of_images_has_no_effect():
     seen = look(6, 3, 5)
     masks = renumbered(seen, 3)
     given = seen.bags(masks)
@@ -140,7 +140,7 @@ def test_a_fragment_or_a_missed_object_does_not_split_an_object():
         assert shown.tolist() == ([0] if k == 3 else [2])
 
 
-def test_parts_vote_for_the_whole_where_it_is_seen_whole_elsewhere():
+def test_parts_join_the_whole_if_it_is_whole_in_other_images():
     seen = look(4, 2, 10)
     masks = renumbered(seen, 3)
     split = [2, 7, 13]
@@ -154,7 +154,7 @@ def test_parts_vote_for_the_whole_where_it_is_seen_whole_elsewhere():
         assert np.unique(made[k][(seen.truths[k] == 3)]).tolist() == whole.tolist()
 
 
-def test_objects_that_are_joined_now_and_then_stay_apart():
+def test_objects_that_are_sometimes_merged_stay_separate():
     seen = look(4, 2, 10)
     masks = renumbered(seen, 3)
     for k in (4, 12):
@@ -164,7 +164,7 @@ def test_objects_that_are_joined_now_and_then_stay_apart():
     assert len(found.objects) == 4
 
 
-def test_ids_without_any_geometry_behind_them_stay():
+def test_ids_without_supporting_geometry_are_kept():
     seen = look(5, 3, 4)
     rng = np.random.default_rng(0)
     masks = [rng.integers(0, 6, len(truth)) for truth in seen.truths]
@@ -173,7 +173,7 @@ def test_ids_without_any_geometry_behind_them_stay():
     assert all(row.done == "kept" and row.new_id == row.old_id for row in found.rows)
 
 
-def test_empty_masks_and_segments_without_gaussians_pass():
+def test_empty_masks_and_segments_without_gaussians_are_accepted():
     seen = look(3, 2, 4)
     masks = [truth.copy() for truth in seen.truths]
     masks[0][:] = 0
@@ -189,7 +189,7 @@ def test_empty_masks_and_segments_without_gaussians_pass():
 
 
 @pytest.mark.parametrize("rows", [[[1, 2]], [[1, 2], [3, 4]]])
-def test_images_of_objects_alone_that_share_nothing_keep_their_ids(rows):
+def test_images_that_share_no_gaussians_keep_their_ids(rows):
     given = [
         segment_stack.from_pixels(np.ones(2, int), np.array(own)[:, None], np.ones((2, 1)), 5, view=view, time=0)
         for view, own in enumerate(rows)
@@ -204,7 +204,7 @@ def test_images_without_any_segment_have_no_objects():
     assert found.rows == [] and not len(found.objects) and found.ids[0].tolist() == []
 
 
-def test_many_gaussians_in_patches_part_the_segments_alike():
+def test_grouping_gaussians_into_patches_gives_the_same_segments():
     seen = look(6, 3, 5)
     masks = renumbered(seen, 3)
     given = seen.bags(masks)
@@ -219,7 +219,7 @@ def test_many_gaussians_in_patches_part_the_segments_alike():
     assert partition(whole.ids) == partition(patched.ids) == partition(thinned.ids)
 
 
-def test_patches_hold_neighbours_that_move_together():
+def test_patches_group_neighbours_that_move_together():
     rng = np.random.default_rng(0)
     places = rng.random((300, 3))
     side = places[:, 0] > 0.5
@@ -240,7 +240,7 @@ def test_ids_too_large_for_masks_are_renumbered():
 
 
 @pytest.mark.parametrize("high", [60_000, 65_534])
-def test_new_objects_get_ids_that_name_them_however_high_the_incoming_ones_are(high):
+def test_new_objects_get_unused_ids_however_high_the_incoming_ones_are(high):
     seen = look(3, 3, 4)
     given_masks = []
     for truth, (view, _) in zip(seen.truths, seen.moments, strict=True):  # each view names two of the three objects

@@ -25,25 +25,25 @@ def evidence(objects: list[int], views: list[int], overlap: float, ids: list[int
 
 
 @pytest.mark.parametrize("overlap", [0.9, 0.5, 0.2, 0.08])
-def test_runs_join_by_what_is_usual_not_by_a_fixed_overlap(overlap):
+def test_runs_join_by_the_usual_overlap_not_by_a_fixed_one(overlap):
     objects, views = [0, 1, 2, 0, 1, 2, 2, 0, 1], [0, 0, 0, 1, 1, 1, 2, 2, 2]
     found = clustering.cluster(evidence(objects, views, overlap, noise=0.15))
     pairs = {(o, f) for o, f in zip(objects, found.tolist(), strict=True)}
     assert len(pairs) == len(set(objects)) == len(set(found.tolist()))
 
 
-def test_runs_side_by_side_stay_apart_however_alike():
+def test_runs_that_appear_together_stay_separate_however_similar():
     found = clustering.cluster(evidence([0, 0], [0, 0], 0.9))
     assert found[0] != found[1]
 
 
-def test_an_object_that_one_view_lacks_joins_no_other():
+def test_an_object_missing_in_one_view_joins_no_other():
     objects, views = [0, 1, 2, 0, 1, 3, 0, 1], [0, 0, 0, 1, 1, 1, 2, 2]
     found = clustering.cluster(evidence(objects, views, 0.4, noise=0.1))
     assert len({(o, f) for o, f in zip(objects, found.tolist(), strict=True)}) == 4 == len(set(found.tolist()))
 
 
-def test_ids_decide_where_geometry_does_not_and_views_share_them():
+def test_shared_ids_decide_if_geometry_does_not():
     objects, views = [0, 1, 2, 3] * 4, np.repeat([0, 1, 2, 3], 4).tolist()
     ids = [o + 1 for o in objects]
     made = evidence(objects, views, 0.3, ids, noise=0.3)

@@ -42,12 +42,12 @@ def mended(masks: list[np.ndarray], **changes: object) -> list[np.ndarray]:
     return out
 
 
-def test_right_masks_stay_as_they_are():
+def test_correct_masks_do_not_change():
     for mask in mended([truth() for _ in range(TIMES)]):
         np.testing.assert_array_equal(mask, truth())
 
 
-def test_missed_objects_are_filled_in():
+def test_missed_objects_are_added():
     masks = [truth() for _ in range(TIMES)]
     masks[3][masks[3] == 3] = 0
     np.testing.assert_array_equal(mended(masks)[3], truth())
@@ -89,7 +89,7 @@ def test_an_object_spread_evenly_over_several_segments_takes_no_pixels():
 
 
 @pytest.mark.parametrize("doubt", [{"fallback": True}, {"usual_iou": 0.99 * mending.TRUSTED}])
-def test_votes_that_are_not_trusted_move_no_outline(doubt):
+def test_untrusted_votes_move_no_outline(doubt):
     masks = [truth() for _ in range(TIMES)]
     masks[3][masks[3] == 3] = 0
     np.testing.assert_array_equal(mended(masks, **doubt)[3], masks[3])

@@ -63,7 +63,7 @@ def test_a_baked_scene_renders_like_the_trained_state(baked, trained):
 
 
 @pytest.mark.parametrize("overrides", [("train.sh_degree=2",), ("train.shading=false", "train.shadows=false")])
-def test_unfinished_runs_with_other_options_bake_to_what_they_show(tiny, tmp_path, monkeypatch, overrides):
+def test_unfinished_runs_with_other_options_bake_to_their_current_state(tiny, tmp_path, monkeypatch, overrides):
     def stop(*args):
         raise KeyboardInterrupt
 
@@ -111,14 +111,14 @@ def test_poses_at_the_knots_are_the_trained_ones_in_the_world(trained):
             assert (np.linalg.norm(played - moved[0], axis=1) <= 1e-5 * scene.extent).all()
 
 
-def test_at_t_max_nothing_is_moved(baked):
+def test_at_t_max_nothing_moves(baked):
     quats, displacements = scene_player.group_poses(baked, baked.t_max)
     np.testing.assert_array_equal(quats, rotations.identity(len(baked.groups)))
     np.testing.assert_array_equal(displacements, 0)
     np.testing.assert_array_equal(scene_player.frame(baked, baked.t_max).means, baked.gaussians.means)
 
 
-def test_objects_move_as_they_did_and_on_past_t_max(baked, tiny):
+def test_objects_keep_their_motion_and_continue_it_past_t_max(baked, tiny):
     for k in (tiny_datasets.BRICK, tiny_datasets.BALL):
         group = baked.groups[k]
         arm = tiny.center(k, tiny_datasets.T_MAX) - group.pivot

@@ -97,7 +97,7 @@ def test_an_object_that_only_slides_needs_no_rotation_and_no_shading():
     assert (found["tracks"], found["rotation"], found["shading"]) == ("on", "off", "off")
 
 
-def test_the_numbers_are_those_of_the_motion():
+def test_the_table_has_the_numbers_of_the_motion():
     rows = table(travel=1.5, turn=0.7)
     assert rows["tracks"]["value"] == pytest.approx(1.5)
     assert rows["rotation"]["value"] == pytest.approx(0.7)
@@ -107,7 +107,7 @@ def test_without_objects_nothing_moves():
     assert decisions(bodies=0)["tracks"] == "off"
 
 
-def test_a_classifier_is_on_where_one_was_trained():
+def test_a_classifier_is_on_if_it_was_trained():
     assert decisions(classified=False)["classifier"] == "off"
 
 
@@ -118,7 +118,7 @@ def test_disabled_parts_are_not_in_the_scene(baked):
     assert (found["sky_gradient"] == "on") == (len(baked.background_sh) > 1)
 
 
-def test_the_tiny_scene_is_judged_by_what_it_shows(baked):
+def test_the_tiny_scene_needs_the_features_that_it_shows(baked):
     found = {row["name"]: row["decision"] for row in baked.needs if "object" not in row}
     assert found["tracks"] == found["rotation"] == found["classifier"] == "on"
     assert found["view_dependent_colour"] == "off"
@@ -163,7 +163,7 @@ def test_parts_that_were_not_trained_cannot_be_switched_on(name):
         ("needs.shadows=no", "needs.shadows: expected auto or on or off, got 'no'"),
     ],
 )
-def test_needs_that_are_not_known_are_refused(override, message):
+def test_unknown_needs_are_refused(override, message):
     with pytest.raises(ConfigError, match=message.replace("?", r"\?")):
         config.load(None, [override])
 
@@ -198,7 +198,7 @@ def test_view_dependent_colour_is_learned_if_the_user_enables_it(tiny):
     assert kept.train.sh_degree == 2
 
 
-def test_a_run_can_be_baked_without_what_it_has_learned(trained, baked, tiny, tmp_path):
+def test_a_run_can_be_baked_without_learned_features(trained, baked, tiny, tmp_path):
     off = [f"needs.{name}=off" for name in NAMES]
     scene = bake.run_bake(trained.folder, tmp_path / "bare.r5dgs", None, off)
     assert scene.gaussians.identities is None and scene.shading is None and len(scene.background_sh) == 1
@@ -211,7 +211,7 @@ def test_a_run_can_be_baked_without_what_it_has_learned(trained, baked, tiny, tm
     ).max() > 0.1
 
 
-def test_bake_takes_no_other_override_than_needs(trained, tmp_path):
+def test_bake_accepts_only_overrides_of_needs(trained, tmp_path):
     with pytest.raises(ConfigError, match="--set train.seed=1: .*bake takes needs.NAME"):
         bake.run_bake(trained.folder, tmp_path / "x.r5dgs", None, ["train.seed=1"])
 

@@ -20,7 +20,7 @@ TIMES = np.array([0.0, 0.25, 0.5, 0.75])
 
 
 @pytest.mark.parametrize(("name", "bad"), [("translations", float("nan")), ("base_quats", float("inf"))])
-def test_a_bad_track_stays_where_it_is_and_the_others_keep_their_bits(trained, tmp_path, caplog, name, bad):
+def test_a_bad_track_is_held_in_place_and_the_others_keep_their_bits(trained, tmp_path, caplog, name, bad):
     state = checkpoint.load(trained.folder)
     state.tensors[f"tracks.{name}"] = state.tensors[f"tracks.{name}"].clone()
     state.tensors[f"tracks.{name}"][2, 3] = bad

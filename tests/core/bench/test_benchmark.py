@@ -55,14 +55,14 @@ def made(tiny, tmp_path_factory):
     return plan, case, between, benchmark.run_bench(plan, progress_kind="none")
 
 
-def test_a_stopped_benchmark_keeps_what_training_had_reached(made):
+def test_a_stopped_benchmark_keeps_the_progress_of_training(made):
     _, _, (record, state), _ = made
     assert not state.finished and state.iteration > 0
     assert [sitting["status"] for sitting in record["sittings"]] == [process.STOPPED]
     assert "measured" not in record
 
 
-def test_the_cost_of_a_case_is_that_of_all_its_sittings(made):
+def test_the_cost_of_a_case_adds_up_over_its_sessions(made):
     _, case, (between, _), result = made
     first, second = cases.read_record(case)["sittings"]
     assert first == between["sittings"][0] and second["status"] == 0
@@ -71,7 +71,7 @@ def test_the_cost_of_a_case_is_that_of_all_its_sittings(made):
     assert found["train"]["peak_mb"] == max(first["peak_mb"], second["peak_mb"]) > 50
 
 
-def test_a_record_holds_what_evaluate_and_playing_find(made, tiny):
+def test_a_record_holds_the_results_of_evaluation_and_playback(made, tiny):
     plan, case, _, result = made
     (found,) = result["results"]
     assert (found["scene"], found["representation"], found["variant"], found["mode"], found["seed"]) == (
@@ -136,7 +136,7 @@ def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path
     assert standard["test"]["psnr"] == literal["test"]["psnr"] != pytest.approx(rigid["test"]["psnr"])
 
 
-def test_a_case_that_fails_is_reported_and_the_others_go_on(made, tiny, capsys):
+def test_a_case_that_fails_is_reported_and_the_others_continue(made, tiny, capsys):
     plan, case, _, _ = made
     blocked = case.run.with_name("tracks_seed1")
     blocked.write_text("mine")
@@ -157,7 +157,7 @@ def test_a_case_that_fails_is_reported_and_the_others_go_on(made, tiny, capsys):
         blocked.unlink()
 
 
-def test_a_fault_in_one_case_does_not_cost_the_others(tiny, tmp_path, monkeypatch, made):
+def test_a_fault_in_one_case_does_not_affect_the_others(tiny, tmp_path, monkeypatch, made):
     _, _, _, result = made
 
     def run_case(plan, case, remeasure, progress):
@@ -198,7 +198,7 @@ def test_a_finished_run_of_other_data_is_refused_before_anything_is_done(made, t
         cases.make(plan_for(tiny, plan.out, scenes=(root,)))
 
 
-def test_a_run_that_was_begun_with_other_settings_is_refused_before_anything_is_done(made, tiny):
+def test_a_run_started_with_other_settings_is_refused_before_anything_is_done(made, tiny):
     plan, case, _, _ = made
     before = contents(plan.out)
     with pytest.raises(ConfigError, match="train.iterations = 20, expected 30"):
@@ -216,20 +216,20 @@ def test_a_run_that_was_begun_with_other_settings_is_refused_before_anything_is_
         ({"preset": "nonsense"}, ConfigError, "--preset nonsense"),
     ],
 )
-def test_a_plan_that_cannot_be_carried_out_is_refused_at_once(tiny, tmp_path, changes, kind, words):
+def test_an_impossible_plan_is_refused_at_once(tiny, tmp_path, changes, kind, words):
     with pytest.raises(kind, match=words):
         cases.make(plan_for(tiny, tmp_path / "out", **changes))
     assert not (tmp_path / "out").exists()
 
 
-def test_scenes_are_looked_at_before_anything_is_trained(tiny, tmp_path):
+def test_scenes_are_checked_before_anything_is_trained(tiny, tmp_path):
     with pytest.raises(DatasetError, match="nowhere"):
         cases.make(plan_for(tiny, tmp_path, scenes=(tiny.root, tmp_path / "nowhere")))
     with pytest.raises(ConfigError, match="are both called"):
         cases.make(plan_for(tiny, tmp_path, scenes=(tiny.root, tiny.root)))
 
 
-def test_cases_go_seed_by_seed_and_their_variants_win_over_the_users_settings(tiny, tmp_path):
+def test_cases_run_seed_by_seed_and_their_variants_override_the_users_settings(tiny, tmp_path):
     overrides = ("train.representation=tracks", "train.seed=7", "train.probe_every=9")
     made = cases.make(plan_for(tiny, tmp_path, variants=("r5dgs", "tracks"), seeds=(0, 1), overrides=overrides))
     assert [(case.seed, case.variant) for case in made] == [(0, "r5dgs"), (0, "tracks"), (1, "r5dgs"), (1, "tracks")]
@@ -262,7 +262,7 @@ def test_every_preset_can_be_benchmarked_and_the_method_is_the_same_in_all(tiny,
     assert plain.train.iterations == configs.load(None, (), preset).train.iterations
 
 
-def test_user_overrides_win_over_the_exceptions_of_a_preset_for_tracks(tiny, tmp_path):
+def test_user_overrides_replace_the_exceptions_of_a_preset_for_tracks(tiny, tmp_path):
     overrides = ("train.shading=false", "identity.training=off", "identity.weight=0.3")
     made = cases.make(cases.Plan((tiny.root,), tmp_path, preset="paper", overrides=overrides))
     found = {case.variant: configs.load(None, case.overrides, "paper") for case in made}
@@ -284,7 +284,7 @@ def test_the_method_does_not_depend_on_the_users_settings(name):
     assert set(given) - set(variants.settings(name, "paper")) == weights & set(given)
 
 
-def test_a_sitting_of_which_nothing_is_known_makes_the_sum_unknown():
+def test_a_session_without_known_cost_makes_the_sum_unknown():
     known = {"cpu_seconds": 2.0, "wall_seconds": 3.0, "peak_mb": 100.0, "peak_gpu_mb": None}
     more = {**known, "peak_mb": 150.0}
     assert cases.cost([known, more]) == {
@@ -321,7 +321,7 @@ def test_a_process_reports_its_own_memory_and_error(tmp_path):
 @pytest.mark.parametrize(
     ("status", "complaint", "words"), [(-9, "", "SIGKILL"), (-11, "", "SIGSEGV"), (3, "", "status 3"), (1, "no", "no")]
 )
-def test_the_end_of_a_process_is_put_into_words(status, complaint, words):
+def test_the_end_of_a_process_is_described(status, complaint, words):
     assert words in process.reason(process.Sitting(status, complaint, 1.0, 1.0, None, None))
 
 
@@ -342,7 +342,7 @@ def test_playing_draws_each_camera_in_the_order_of_time(baked, tiny, monkeypatch
     assert playback_speed.measure(baked, [], ["rigid"]) == {"rigid": {**dict.fromkeys(found), "frames": 0}}
 
 
-def test_modes_take_turns_round_by_round(baked, tiny, monkeypatch):
+def test_modes_alternate_in_each_round(baked, tiny, monkeypatch):
     still = baked.with_arrays(dynamics=np.zeros((len(baked.gaussians.means), 12), np.float32))
     drawn, frame = [], scene_player.frame
 

@@ -56,7 +56,7 @@ def lines_of(sheet):
     return [dict(zip(sheet.head, line, strict=True)) for block in sheet.blocks for line in block]
 
 
-def test_seeds_become_their_mean_and_half_their_range():
+def test_seeds_are_shown_as_their_mean_and_half_their_range():
     test, val, played = tables.sheets(result([record(seed=0, psnr=30.0), record(seed=1, psnr=31.0)]))
     (line,) = lines_of(test)
     assert line["PSNR"] == "30.50 ± 0.50" and line["CPU s"] == "10 ± 0" and line["LPIPS"] == "-"
@@ -94,7 +94,7 @@ def test_a_single_seed_has_no_spread():
     assert lines_of(played)[0]["mIoU test"] == "0.800"
 
 
-def test_the_papers_rows_come_first_and_ours_last():
+def test_the_papers_rows_come_first_and_our_rows_last():
     records = [record(variant="tracks")]
     records += [record(variant=v, mode=m) for v in ("r5dgs_extra", "r5dgs") for m in ("rigid", "rigid_paper")]
     records += [record(variant="r5dgs", mode="standard")]
@@ -127,7 +127,7 @@ def test_only_one_row_is_called_5dgs():
     assert tables.paper_row("r5dgs", "standard", ("r5dgs",)) == "5DGS"
 
 
-def test_the_mean_over_scenes_is_given_where_all_scenes_have_a_figure():
+def test_the_mean_over_scenes_is_given_if_all_scenes_have_a_value():
     records = [record("a", psnr=20.0), record("b", psnr=30.0), record("a", variant="r5dgs", mode="standard")]
     last = [line for line in lines_of(tables.sheets(result(records))[0]) if line["scene"] == "mean of 2"]
     assert [(line["method"], line["PSNR"]) for line in last] == [("tracks", "25.00")]
@@ -144,7 +144,7 @@ def test_failed_runs_are_listed_in_and_below_the_tables():
     assert "b, r5dgs, seed 0: loss: nan" in tables.markdown(found)
 
 
-def test_markdown_has_a_line_of_equal_width_for_every_line_of_the_tables():
+def test_every_line_of_a_markdown_table_has_the_same_width():
     found = result([record("a"), record("b|c")])
     text = tables.markdown(found)
     rows = [line for line in text.splitlines() if line.startswith("|")]
@@ -163,7 +163,7 @@ def test_the_terminal_shows_every_figure():
     assert all(cell in text for block in sheet.blocks for line in block for cell in line)
 
 
-def test_rows_mark_results_that_nothing_faster_equals():
+def test_rows_mark_results_without_a_faster_and_equally_good_one():
     records = [
         record(variant="tracks", psnr=40.0, cpu=5.0, ms=4.0),
         record(variant="r5dgs", psnr=35.0, cpu=50.0, ms=3.0),
@@ -178,7 +178,7 @@ def test_rows_mark_results_that_nothing_faster_equals():
     assert {row["ms"] for row in rows if "training" in row["task"]} == {5e3, 5e4}
 
 
-def test_rows_take_wall_time_where_processor_time_is_unknown_and_leave_out_what_has_none():
+def test_rows_use_wall_time_if_processor_time_is_unknown_and_are_omitted_without_either():
     records = [record(cpu=None), record(seed=1)]
     for split in ("test", "val"):
         records[1]["splits"][split]["psnr"] = None

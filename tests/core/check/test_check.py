@@ -441,7 +441,7 @@ def _(root):
 
 
 @pytest.mark.parametrize("code", codes.CODES)
-def test_every_code_is_found_where_its_fault_is(code, tmp_path, monkeypatch, request):
+def test_every_code_is_found_at_its_fault(code, tmp_path, monkeypatch, request):
     assert code in CASES, f"{code} has no case"
     make, options = CASES[code], {}
     if code.startswith("R"):
@@ -456,7 +456,7 @@ def test_every_code_is_found_where_its_fault_is(code, tmp_path, monkeypatch, req
         assert re.fullmatch(rf"{code} (error|warning) [^\n]+: .+ Remedy: .+", str(finding), re.DOTALL)
 
 
-def test_every_code_is_documented_as_it_is():
+def test_every_code_is_documented_with_its_texts():
     rows = [line.strip("| ").split(" | ") for line in DOCS.read_text().splitlines() if re.match(r"\| [A-Z]\d\d ", line)]
     assert [row[0] for row in rows] == list(codes.CODES)
     for name, severity, meaning, remedy in rows:

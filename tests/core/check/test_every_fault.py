@@ -141,7 +141,7 @@ def test_a_wrong_number_of_gaussians_is_one_fault(sound, tmp_path):
     assert len(problems(rewrite(sound, tmp_path / "b.r5dgs", change))) == 1
 
 
-def test_all_rules_that_one_motion_group_breaks_are_listed(sound, tmp_path):
+def test_all_rules_broken_by_one_motion_group_are_listed(sound, tmp_path):
     def change(tree):
         tree["groups"][1].update(role="ghost", object_id=77, anchor_index=10**6, seen=[2.0, 1.0], rigid_rms=-1.0)
         tree["groups"][1]["model"].update(velocity=[1e200, 0, 0], angular_velocity=[1e200, 0, 0])
@@ -215,7 +215,7 @@ def test_a_rule_about_two_keys_is_not_applied_to_a_key_without_a_value(tmp_path)
     assert {finding.place for finding in check.check(path)} == {"identity.iterations", "identity.training"}
 
 
-def test_a_hostile_file_cannot_make_the_list_grow_without_end(sound, tmp_path, monkeypatch):
+def test_the_list_of_a_hostile_file_is_bounded(sound, tmp_path, monkeypatch):
     monkeypatch.setattr(findings, "MOST_FINDINGS", 50)
 
     def change(tree):

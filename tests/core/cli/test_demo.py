@@ -12,7 +12,7 @@ def evaluation(**changes):
     return {"splits": {split: {"rigid": {"psnr": value}} for split, value in found.items()}}
 
 
-def test_a_run_falls_short_more_than_a_decibel_below_the_committed_figure():
+def test_a_run_falls_short_if_it_is_more_than_a_decibel_below_the_committed_figure():
     assert demo.shortfalls(evaluation()) == demo.shortfalls(evaluation(val=-0.9, test=-0.9)) == []
     assert [line.split(":")[0] for line in demo.shortfalls(evaluation(test=-1.1))] == ["test"]
     assert len(demo.shortfalls(evaluation(val=float("nan")))) == 1

@@ -33,7 +33,7 @@ def test_ply_holds_the_gaussians_of_a_time(path, scene, tmp_path):
         np.testing.assert_array_equal(found.object_ids, scene.gaussians.object_ids)
 
 
-def test_without_a_time_it_is_that_of_t_max(path, scene, tmp_path):
+def test_without_a_time_the_gaussians_at_t_max_are_written(path, scene, tmp_path):
     assert export(path, "--to", "ply", "--out", tmp_path / "a.ply") == 0
     np.testing.assert_array_equal(ply.read(tmp_path / "a.ply").means, scene.gaussians.means)
 
@@ -48,7 +48,7 @@ def test_each_frame_of_a_range_is_a_file(path, scene, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("words", ["", " , ", "not", "everything but"])
-def test_words_that_name_nothing_are_wrong_usage_of_query_and_export(path, tmp_path, capsys, words):
+def test_words_that_name_no_object_are_wrong_usage_of_query_and_export(path, tmp_path, capsys, words):
     given = ("export", path, "--to", "ply", "--out", tmp_path / "a.ply", "--objects", words)
     for arguments in (given, ("query", path, words)):
         line = complaint(capsys, *arguments, status=ExitStatus.USAGE)

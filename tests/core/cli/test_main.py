@@ -136,7 +136,7 @@ def test_missing_things_are_one_line(tmp_path, tiny, made, capsys):
     assert not (tmp_path / "run").exists() and not (tmp_path / "x.r5dgs").exists()
 
 
-def test_a_folder_that_is_not_ours_is_left_alone(tmp_path, tiny, capsys):
+def test_a_folder_of_another_program_does_not_change(tmp_path, tiny, capsys):
     (tmp_path / "letter.txt").write_text("mine")
     line = complaint(capsys, "train", tiny.root, "--out", tmp_path, *OPTIONS)
     assert "is not a run folder" in line and [p.name for p in tmp_path.iterdir()] == ["letter.txt"]
@@ -224,7 +224,7 @@ def test_the_developers_page_adds_a_command(made, monkeypatch, capsys):
     assert "print the duration of a scene" in parser.parser().format_help()
 
 
-def test_the_bundled_data_is_found_and_small():
+def test_the_bundled_data_is_found_and_is_small():
     found = demo.bundled_data()
     dataset = datasets.read(found)
     assert dataset.train and dataset.val and dataset.test and dataset.ground_truth is not None
@@ -237,7 +237,7 @@ def test_missing_bundled_data_raises(monkeypatch, capsys, tmp_path):
     assert "install r5dgs again" in complaint(capsys, "demo", "--out", tmp_path / "demo")
 
 
-def test_a_second_run_is_not_begun_over_the_first(made, tiny, capsys):
+def test_a_second_run_does_not_replace_the_first(made, tiny, capsys):
     before = (made[0] / "checkpoint.pt").read_bytes()
     line = complaint(capsys, "train", tiny.root, "--out", made[0], *OPTIONS)
     assert f"{made[0]}: holds a run at step 20; add --resume to go on, or --overwrite to begin again" in line
@@ -250,7 +250,7 @@ def test_resume_and_overwrite_exclude_each_other(made, tiny, capsys):
     assert stop.value.code == 2 and "not allowed with" in capsys.readouterr().err
 
 
-def test_paths_of_the_wrong_kind_are_one_line(made, tiny, tmp_path, capsys):
+def test_paths_of_the_wrong_kind_are_errors_of_one_line(made, tiny, tmp_path, capsys):
     file = tmp_path / "letter.txt"
     file.write_text("mine")
     assert f"{file}: not a run folder" in complaint(capsys, "bake", file, "--out", tmp_path / "x.r5dgs")
@@ -268,7 +268,7 @@ def test_an_evaluation_that_could_not_be_written_is_refused_before_the_work(made
     assert "--json" in complaint(capsys, "evaluate", made[0], "--json", tmp_path / place)
 
 
-def test_the_table_is_shown_even_where_the_file_cannot_be_written(made, tmp_path, capsys, monkeypatch):
+def test_the_table_is_shown_even_if_the_file_cannot_be_written(made, tmp_path, capsys, monkeypatch):
     def full_disk(*args):
         raise OSError(28, "No space left on device")
 
@@ -308,7 +308,7 @@ def small_demo(tiny, monkeypatch):
     return ["demo", *OPTIONS, "--progress", "json"]
 
 
-def test_the_demo_may_be_run_twice_and_leaves_other_runs_alone(small_demo, made, tmp_path, capsys, monkeypatch):
+def test_the_demo_may_be_run_twice_and_does_not_replace_other_runs(small_demo, made, tmp_path, capsys, monkeypatch):
     out = tmp_path / "my demo"
     for _ in range(2):
         assert main.main([*small_demo, "--out", str(out), "--set", "train.seed=3"]) == 0
@@ -330,7 +330,7 @@ def test_the_demo_may_be_run_twice_and_leaves_other_runs_alone(small_demo, made,
 
 
 @pytest.mark.parametrize("moment", [{"event": "step", "iteration": 10}, {"event": "evaluate", "done": 1}])
-def test_a_stopped_demo_names_the_command_that_goes_on(small_demo, tmp_path, capsys, monkeypatch, moment):
+def test_a_stopped_demo_prints_the_command_that_continues_it(small_demo, tmp_path, capsys, monkeypatch, moment):
     out = tmp_path / "my demo"
 
     @contextlib.contextmanager
@@ -346,7 +346,7 @@ def test_a_stopped_demo_names_the_command_that_goes_on(small_demo, tmp_path, cap
     assert (out / "contact_sheet.png").exists()
 
 
-def test_a_scene_goes_into_a_file_that_blender_finds(made, tmp_path, capsys):
+def test_bake_refuses_folders_and_other_suffixes(made, tmp_path, capsys):
     assert "is a folder" in complaint(capsys, "bake", made[0], "--out", tmp_path)
     wrong = ("bake", made[0], "--out", tmp_path / "scene.zip")
     assert ".r5dgs" in complaint(capsys, *wrong, status=ExitStatus.USAGE)
@@ -360,7 +360,7 @@ def test_a_moved_data_set_raises_with_the_option_for_its_path(made, tmp_path, ca
     assert "--data" in complaint(capsys, "evaluate", path.parent)
 
 
-def test_a_reader_that_goes_away_is_no_traceback(made):
+def test_a_closed_output_pipe_causes_no_traceback(made):
     command = f"{shlex.quote(sys.executable)} -m r5dgs_core.cli info {shlex.quote(str(made[1]))} | true"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=Path(main.__file__).parents[2])
     assert "Traceback" not in done.stderr

@@ -43,7 +43,7 @@ def test_a_run_is_measured_on_its_own_data(trained, capsys):
     assert 0 < rows["ball"]["iou"] <= 1 and 0 < rows["ball"]["confidence"] <= 1
 
 
-def test_the_legend_is_of_the_camera_time_and_size_that_were_asked_for(path, capsys, tmp_path):
+def test_the_legend_uses_the_requested_camera_time_and_size(path, capsys, tmp_path):
     text = said(capsys, "objects", path, "--legend", tmp_path / "l.png", "--camera", 1, "--time", 1.2, "--size", 120)
     camera = scene_file.read(path).cameras[1]
     assert f"camera {camera.name}, t = 1.2" in text.replace("\n", " ")
@@ -59,7 +59,7 @@ def test_a_query_reads_its_scene_once(path, tmp_path, monkeypatch):
     assert len(opened) == 1 and (tmp_path / "mug.png").exists()
 
 
-def test_a_query_draws_what_it_finds(path, capsys, tmp_path):
+def test_a_query_draws_its_matches(path, capsys, tmp_path):
     names = [item.name for item in scene_file.read(path).objects if item.id > 0]
     text = said(capsys, "query", path, names[0], "--render", tmp_path / "one.png", "--camera", 0, "--time", 0.4)
     assert "written" in text
@@ -84,7 +84,7 @@ def test_an_object_moves_in_its_pictures_and_goes_on_past_t_max(path, tmp_path):
     assert abs(places[1] - places[0]) > 2 and abs(places[2] - places[1]) > 2
 
 
-def test_nothing_found_is_no_picture(path, capsys, tmp_path):
+def test_without_a_match_no_picture_is_written(path, capsys, tmp_path):
     assert main.main(["query", str(path), "elephant", "--render", str(tmp_path / "none.png")]) == ExitStatus.NEGATIVE
     assert "nothing matches" in capsys.readouterr().out
     assert not (tmp_path / "none.png").exists()
@@ -106,7 +106,7 @@ def test_invalid_picture_paths_are_rejected_before_the_work(path, capsys, tmp_pa
         assert "--mode wild: expected one of" in complaint(capsys, *command, "--mode", "wild", status=ExitStatus.USAGE)
 
 
-def test_a_camera_mode_or_time_that_is_not_there_is_named(path, capsys, tmp_path):
+def test_an_unknown_camera_mode_or_time_is_named(path, capsys, tmp_path):
     out = tmp_path / "x.png"
     assert "expected 0 to 1, or a name" in complaint(capsys, "objects", path, "--legend", out, "--camera", "left")
     assert "--time nan" in complaint(capsys, "objects", path, "--legend", out, "--time", "nan")

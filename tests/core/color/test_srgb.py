@@ -10,7 +10,7 @@ def test_known_values_of_the_standard():
     )
 
 
-def test_both_directions_are_inverse_above_one_too():
+def test_both_directions_are_inverse_also_above_one():
     values = np.linspace(0, 4, 1001)
     np.testing.assert_allclose(srgb.to_linear(srgb.from_linear(values)), values, atol=1e-7)
     np.testing.assert_allclose(srgb.from_linear(srgb.to_linear(values)), values, atol=1e-7)

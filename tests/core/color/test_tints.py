@@ -13,7 +13,7 @@ def colors(sh, basis):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_the_colour_is_multiplied_from_every_direction(degree):
+def test_the_colour_is_multiplied_in_every_viewing_direction(degree):
     rng = np.random.default_rng(degree)
     count = (degree + 1) ** 2
     sh = rng.normal(size=(50, count, 3))
@@ -23,7 +23,7 @@ def test_the_colour_is_multiplied_from_every_direction(degree):
         np.testing.assert_allclose(colors(tints.tint_sh(sh, tint), basis), tint * colors(sh, basis), atol=1e-12)
 
 
-def test_each_gaussian_may_have_a_tint_of_its_own():
+def test_each_gaussian_may_have_its_own_tint():
     sh = np.random.default_rng(0).normal(size=(4, 9, 3)).astype(np.float32)
     factors = np.array([[1.0, 1, 1], [0, 0, 0], [0.5, 2, 1], [1, 0.1, 0]])
     together = tints.tint_sh(sh, factors)

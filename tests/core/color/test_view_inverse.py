@@ -71,13 +71,13 @@ def test_white_is_reached_at_any_brightness_of_the_view(of, forward):
     assert steps(forward(of(forward).scene_linear(white)), white).max() < 1
 
 
-def test_the_colour_itself_comes_back_where_it_is_displayed_alone(of):
+def test_inverting_restores_scene_linear_colours_of_an_invertible_view(of):
     light = seen()
     found = of(film).scene_linear(film(light))
     np.testing.assert_allclose(found, light, rtol=0.02, atol=1e-3)
 
 
-def test_light_below_nothing_reaches_more(of):
+def test_negative_light_reaches_more_colours(of):
     """Colours that are more saturated than the view shows of any scene without negative light."""
     light = seen(500)
     light[:, 2] = -0.04 * light[:, 0]

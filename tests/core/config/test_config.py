@@ -21,7 +21,7 @@ from r5dgs_core.errors import ConfigError
         }
     )
 )
-def test_configurations_survive_the_way_through_json(values):
+def test_configurations_survive_a_round_trip_through_json(values):
     made = config.from_dict(values)
     assert config.from_dict(json.loads(json.dumps(made.to_dict()))) == made
     assert made.train.iterations == values["train"]["iterations"]
@@ -102,7 +102,7 @@ def test_faults_of_a_file_are_named(tmp_path, text, message):
         config.load(path)
 
 
-def test_an_override_into_something_that_is_no_section_is_refused(tmp_path):
+def test_an_override_of_an_unknown_section_is_refused(tmp_path):
     path = tmp_path / "c.toml"
     path.write_text("train = 3")
     with pytest.raises(ConfigError, match="train"):
@@ -110,7 +110,7 @@ def test_an_override_into_something_that_is_no_section_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-1"])
-def test_numbers_that_no_key_can_use_are_refused(value):
+def test_numbers_outside_the_range_of_a_key_are_refused(value):
     with pytest.raises(ConfigError, match="rates.means"):
         config.load(None, [f"rates.means={value}"])
 
@@ -122,7 +122,7 @@ def test_every_key_is_documented(section):
     assert described == [f.name for f in dataclasses.fields(kind)]
 
 
-def test_every_rule_is_about_a_key_and_lets_its_default_pass():
+def test_every_rule_belongs_to_a_key_and_accepts_its_default():
     for name, (good, _) in rules.RULES.items():
         section, key = name.split(".")
         assert good(getattr(getattr(config.Config(), section), key)), name
@@ -156,14 +156,14 @@ def test_an_unknown_preset_is_refused_with_the_nearest_name():
         config.load(None, preset="fats")
 
 
-def test_a_file_with_faults_is_named_beside_a_preset_too(tmp_path):
+def test_a_file_with_faults_is_named_also_with_a_preset(tmp_path):
     path = tmp_path / "c.toml"
     path.write_text("train = 3")
     with pytest.raises(ConfigError, match="train: expected a section with keys, got 3"):
         config.load(path, preset="fast")
 
 
-def test_overrides_change_a_configuration_that_is_there():
+def test_overrides_change_an_existing_configuration():
     made = config.load(None, ["train.seed=3"]).override(["losses.ssim=0.5", "needs.shadows=off"])
     assert (made.train.seed, made.losses.ssim, made.needs.shadows) == (3, 0.5, "off")
 
@@ -177,7 +177,7 @@ def test_overrides_change_a_configuration_that_is_there():
         "#" * (1 << 20) + "\n",
     ],
 )
-def test_a_file_that_no_configuration_can_be_is_one_error(tmp_path, text):
+def test_a_file_that_cannot_be_a_configuration_is_one_error(tmp_path, text):
     path = tmp_path / "c.toml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=r"c\.toml|losses\.ssim"):
@@ -187,6 +187,6 @@ def test_a_file_that_no_configuration_can_be_is_one_error(tmp_path, text):
 @pytest.mark.parametrize(
     "text", ["train.iterations=" + "9" * 5000, "losses.ssim=1" + "0" * 400, "train.background=" + "[" * 5000]
 )
-def test_an_override_that_no_key_can_hold_is_one_error(text):
+def test_an_override_that_fits_no_key_is_one_error(text):
     with pytest.raises(ConfigError, match="--set"):
         config.load(None, [text])

@@ -105,7 +105,7 @@ def test_named_cameras_keep_their_name_and_moving_ones_stay_distinct(flat):
     assert [view.camera.name for view in data.train] == ["left", "walk", "left", "walk", "left", "walk@1"]
 
 
-def test_made_names_are_none_of_the_given_ones(flat):
+def test_generated_names_differ_from_the_given_ones(flat):
     names = ["cam0", "", "walk@1", "walk", "cam1", "walk"]
 
     def edit(content):
@@ -122,7 +122,7 @@ def test_made_names_are_none_of_the_given_ones(flat):
 
 @pytest.mark.parametrize("scale", [1e-7, 1.0, 1e5])
 @pytest.mark.parametrize("shift", [0.0, 20.0])
-def test_which_cameras_are_one_does_not_depend_on_the_unit_or_the_origin(flat, scale, shift):
+def test_the_identity_of_cameras_does_not_depend_on_the_unit_or_the_origin(flat, scale, shift):
     """Two cameras stand a hundredth of their distance from the scene apart; a third repeats one up to rounding."""
     positions = [
         (4.0, 0.0, 2.0),
@@ -174,7 +174,7 @@ def test_missing_times_are_spread_evenly(flat):
 @pytest.mark.parametrize(
     ("suffix", "given"), [(".png", True), (".PNG", True), (".jpg", True), (".jpg", False), (".exr", False)]
 )
-def test_images_are_found_by_any_suffix_given_or_not(flat, suffix, given):
+def test_images_are_found_with_any_suffix_or_none(flat, suffix, given):
     source = flat / "train" / "r_000.png"
     target = source.with_suffix(suffix)
     if suffix.lower() == ".png":
@@ -191,7 +191,7 @@ def test_images_are_found_by_any_suffix_given_or_not(flat, suffix, given):
     assert dataset.load_image(view).shape == (HEIGHT, WIDTH, 3)
 
 
-def test_intrinsics_of_the_file_win_and_follow_the_size_of_the_image(flat):
+def test_intrinsics_of_the_file_take_precedence_and_are_scaled_to_the_image(flat):
     lens = {"fl_x": 40.0, "fl_y": 44.0, "cx": 11.0, "cy": 9.0, "w": 2 * WIDTH, "h": 2 * HEIGHT}
     change(flat, lambda content: content.update(lens))
     k = dataset.read(flat).train[0].camera.intrinsics
@@ -233,7 +233,7 @@ def test_masks_are_optional_view_by_view(flat):
     assert all(view.mask_path is None for view in dataset.read(flat).train)
 
 
-def test_masks_of_another_size_are_brought_to_the_image(flat):
+def test_masks_of_another_size_are_resized_to_the_image(flat):
     small = np.arange(6, dtype=np.uint8).reshape(2, 3)
     images.write_png(flat / "object_mask" / "train" / "r_000.png", small)
     ids = dataset.load_mask(dataset.read(flat).train[0])
@@ -253,7 +253,7 @@ def test_masks_coded_by_colour_agree_between_splits(flat):
     assert dataset.load_mask(data.test[0])[0, :2].tolist() == [2, 1]
 
 
-def test_the_data_sets_own_masks_are_those_by_whatever_path(flat, tmp_path):
+def test_the_data_sets_own_masks_are_recognised_by_any_path(flat, tmp_path):
     """Colours are numbered over all splits then, too."""
     for path in (flat / "object_mask").rglob("*.png"):
         path.unlink()
@@ -426,7 +426,7 @@ def test_an_image_that_changed_since_reading_is_noticed(flat):
         dataset.load_image(data.train[0])
 
 
-def test_a_data_set_cannot_be_changed_in_place(flat):
+def test_a_data_set_is_immutable(flat):
     with pytest.raises(dataclasses.FrozenInstanceError):
         dataset.read(flat).name = "other"
 
@@ -445,7 +445,7 @@ def test_training_masks_may_come_from_another_folder(flat, tmp_path_factory):
     assert len({own.digest, other.digest, without.digest}) == 3
 
 
-def test_a_folder_of_masks_with_names_of_its_own_has_ids_of_its_own(flat, tmp_path_factory):
+def test_a_folder_of_masks_with_its_own_names_has_its_own_ids(flat, tmp_path_factory):
     write_json(flat / "ground_truth.json", {"times": [0.0], "t_max": 0.5, "objects": []})
     folder = tmp_path_factory.mktemp("masks")
     write_json(folder / "objects.json", {"3": "cup"})

@@ -73,7 +73,7 @@ def test_gray_becomes_opaque_rgba():
 
 
 @pytest.mark.parametrize("content", [b"", b"not an image at all", b"\x89PNG\r\n\x1a\n"])
-def test_a_file_that_is_no_image_is_named(tmp_path, content):
+def test_a_file_that_is_not_an_image_is_named(tmp_path, content):
     (tmp_path / "a.png").write_bytes(content)
     with pytest.raises(errors.DatasetError, match=r"a\.png"):
         images.read(tmp_path / "a.png")
@@ -101,7 +101,7 @@ def test_writing_leaves_no_temporary_file_and_replaces_the_old_one(tmp_path):
 
 
 @pytest.mark.parametrize("pixels", [np.zeros((2, 2, 5)), np.zeros((0, 2, 3)), np.zeros(3), np.zeros((2, 2), np.int64)])
-def test_arrays_that_are_no_picture_are_refused(tmp_path, pixels):
+def test_arrays_that_are_not_pictures_are_refused(tmp_path, pixels):
     with pytest.raises(ValueError, match="expected"):
         images.write_png(tmp_path / "a.png", pixels)
 
@@ -124,7 +124,7 @@ def test_a_full_disk_is_an_error_and_leaves_the_old_image(tmp_path):
     assert (images.read_raw(path) == old).all() and [p.name for p in tmp_path.iterdir()] == ["picture.png"]
 
 
-def test_a_folder_that_cannot_be_made_is_an_error(tmp_path):
+def test_a_folder_that_cannot_be_created_is_an_error(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(errors.DatasetError, match="x.png: cannot write the image"):
         images.write_png(tmp_path / "file" / "x.png", np.zeros((2, 2), np.uint8))

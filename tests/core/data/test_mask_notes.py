@@ -21,7 +21,7 @@ NOTES = mask_notes.MaskNotes(
 )
 
 
-def test_notes_come_back_as_they_were_written(tmp_path):
+def test_notes_can_be_read_back(tmp_path):
     assert mask_notes.read(tmp_path) == mask_notes.MaskNotes()
     mask_notes.write(NOTES, tmp_path)
     assert mask_notes.read(tmp_path) == NOTES
@@ -72,7 +72,7 @@ def test_unknown_of_16_bits_needs_no_notes(copied):
     np.testing.assert_array_equal(datasets.load_mask(view), ids)
 
 
-def test_masks_numbered_per_video_are_not_trained_with(copied, tmp_path):
+def test_masks_numbered_per_video_are_refused_in_training(copied, tmp_path):
     tiny_datasets.number_by_camera(copied, copied / "object_mask", (1, 2))
     dataset = datasets.read(copied)
     assert len({view.mask_video for view in dataset.train}) == 6
@@ -82,7 +82,7 @@ def test_masks_numbered_per_video_are_not_trained_with(copied, tmp_path):
     datasets.read(copied, "none").require_one_numbering()
 
 
-def test_masks_of_one_video_are_as_good_as_those_of_a_scene(copied):
+def test_masks_of_a_single_video_are_used_like_those_of_a_scene(copied):
     every = tuple(view.name for view in datasets.read(copied).train)
     notes = mask_notes.MaskNotes("sam2", mask_notes.VIDEO, videos={"all": mask_notes.Video(every, (1, 2))})
     mask_notes.write(notes, copied / "object_mask")

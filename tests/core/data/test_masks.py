@@ -55,7 +55,7 @@ def write_indexed(
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_one_channel_holds_ids_as_they_are(tmp_path, dtype):
+def test_the_values_of_one_channel_are_the_ids(tmp_path, dtype):
     ids = IDS * (300 if dtype == np.uint16 else 30)
     images.write_png(tmp_path / "m.png", ids.astype(dtype))
     read = masks.read(tmp_path / "m.png")
@@ -111,7 +111,7 @@ def test_colours_get_the_same_ids_in_all_masks(tmp_path):
     np.testing.assert_array_equal(masks.read(paths[1], colors), [[2, 2], [0, 3]])
 
 
-def test_the_meaning_of_masks_is_decided_for_all_of_them_at_once(tmp_path):
+def test_the_kind_of_masks_is_decided_for_all_of_them_at_once(tmp_path):
     """A colour-coded mask that happens to show white and gray objects alone is one of colours all the same."""
     gray, red, white = (90, 90, 90), (200, 0, 0), (255, 255, 255)
     pictures = {
@@ -156,7 +156,7 @@ def test_masks_of_ids_need_no_colours(tmp_path):
     assert masks.color_table([tmp_path / "m.png"]) == {}
 
 
-def test_a_colour_of_no_object_is_located(tmp_path):
+def test_a_colour_that_belongs_to_no_object_is_located(tmp_path):
     pixels = np.zeros((4, 4, 3), np.uint8)
     pixels[2, 1] = (9, 8, 7)
     images.write_png(tmp_path / "m.png", pixels)
@@ -173,7 +173,7 @@ def test_blended_colours_are_refused(tmp_path):
         masks.color_table([tmp_path / "m.png"])
 
 
-def test_resizing_takes_whole_pixels():
+def test_resizing_uses_nearest_neighbours():
     big = masks.resize(IDS, 10, 6, "m")
     np.testing.assert_array_equal(big, np.repeat(np.repeat(IDS, 2, 0), 2, 1))
     np.testing.assert_array_equal(masks.resize(big, 5, 3, "m"), IDS)
@@ -199,14 +199,14 @@ def test_damaged_palette_masks_are_named(tmp_path):
 
 
 @pytest.mark.parametrize(("highest", "kind"), [(7, np.uint8), (255, np.uint8), (256, np.uint16), (65535, np.uint16)])
-def test_masks_are_written_with_as_few_bits_as_hold_them(tmp_path, highest, kind):
+def test_masks_are_written_with_as_few_bits_as_possible(tmp_path, highest, kind):
     ids = np.where(IDS == 7, highest, IDS)
     masks.write(tmp_path / "deep" / "m.png", ids)
     assert images.read_png(tmp_path / "deep" / "m.png").dtype == kind
     np.testing.assert_array_equal(masks.read(tmp_path / "deep" / "m.png"), ids)
 
 
-def test_masks_of_ids_among_masks_of_colours_are_refused_as_what_they_mean_is_open(tmp_path):
+def test_ids_among_colour_masks_are_refused_as_ambiguous(tmp_path):
     rgb = np.zeros((6, 6, 3), np.uint8)
     rgb[:3], rgb[3:] = (200, 0, 0), (90, 90, 90)
     images.write_png(tmp_path / "rgb.png", rgb)

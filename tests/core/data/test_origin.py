@@ -80,7 +80,7 @@ def test_positions_are_read_relative_to_the_origin_and_can_be_measured_from_any_
     assert back.origin.tolist() == FAR.tolist() and back.relative_to(FAR) is back
 
 
-def test_cameras_with_names_by_place_are_the_same_however_far_they_are(tiny, tmp_path):
+def test_cameras_named_by_position_are_the_same_at_any_distance(tiny, tmp_path):
     near, far = datasets.read(tiny.root), datasets.read(made(tmp_path / "data", 1.0, 20 * FAR).root)
     assert [view.camera.name for view in far.train] == [view.camera.name for view in near.train]
     assert len(far.cameras) == len(near.cameras) == 7
@@ -107,7 +107,7 @@ def measured(baked, tiny):
 
 
 @pytest.mark.parametrize(("scale", "shift"), WORLDS)
-def test_a_run_bakes_plays_and_is_measured_alike_in_any_world(trained, baked, measured, tmp_path, scale, shift):
+def test_a_run_gives_the_same_results_in_any_world(trained, baked, measured, tmp_path, scale, shift):
     data = datasets.read(made(tmp_path / "data", scale, shift).root)
     state = checkpoint.load(trained.folder)
     x, y, z = (float(v) for v in scale * np.array(state.origin) + shift)
@@ -152,7 +152,7 @@ def test_training_gives_the_same_pictures_in_any_world(tiny, near, tmp_path, sca
             assert psnr(one, other) > 40  # rounding decides a few draws otherwise
 
 
-def test_scenes_from_before_the_origin_are_measured_in_the_world_that_they_are_in(baked, tiny, tmp_path, caplog):
+def test_scenes_without_an_origin_are_measured_in_their_own_world(baked, tiny, tmp_path, caplog):
     data = made(tmp_path / "data", 1.0, 0.2 * FAR)
     older = dataclasses.replace(
         baked.with_arrays(means=(baked.gaussians.means.astype(np.float64) + 0.2 * FAR).astype(np.float32)),
@@ -176,6 +176,6 @@ def test_scenes_near_the_origin_are_read_without_a_warning(baked, tmp_path, capl
     assert not caplog.records
 
 
-def test_info_prints_an_origin_where_there_is_one(baked):
+def test_info_prints_an_origin_if_there_is_one(baked):
     assert "origin" not in scene_info.info(baked)
     assert scene_info.info(baked.with_arrays(origin=FAR))["origin"] == FAR.tolist()

@@ -74,14 +74,14 @@ def test_unknown_pixels_have_no_gradient(seen):
     assert (gradient[:, ~half].abs().sum(-1) > 0).all()
 
 
-def test_unknown_masks_do_not_vote(seen, pose):
+def test_unknown_pixels_do_not_vote(seen, pose):
     count = len(pose(seen[0]).means)
     assert not label_votes.votes([unknown(v) for v in seen], pose, CLASSES, count).any()
     several = label_votes.votes([*seen[:6], *(unknown(v) for v in seen[6:])], pose, CLASSES, count)
     assert torch.equal(several, label_votes.votes(seen[:6], pose, CLASSES, count)) and several.any()
 
 
-def test_missed_masks_that_are_unknown_leave_the_labels_as_they_were(tiny, seen, pose):
+def test_masks_marked_unknown_do_not_change_the_labels(tiny, seen, pose):
     """Two of three masks of the ball are missed: as background they outvote the rest, as unknown they do nothing."""
     truth = torch.from_numpy(np.array([CLASSES[int(i)] for i in tiny.truth.gaussians.object_ids]))
     fallback = torch.zeros(len(truth), dtype=torch.int64)
@@ -105,7 +105,7 @@ def test_missed_masks_that_are_unknown_leave_the_labels_as_they_were(tiny, seen,
     assert all((labels[ball] == 2).float().mean() < 0.5 for labels in as_background)
 
 
-def test_unknown_is_no_object_and_has_no_place(tiny, seen):
+def test_unknown_pixels_are_no_object_and_have_no_position(tiny, seen):
     times = np.unique([v.t for v in seen])
     mixed = [unknown(v) if k % 4 == 1 else v for k, v in enumerate(seen)]
     without = [unmasked(v) if k % 4 == 1 else v for k, v in enumerate(seen)]
@@ -168,7 +168,7 @@ def test_points_of_a_reconstruction_are_not_judged_by_unknown_pixels(tiny, seen)
 
 
 @pytest.mark.slow
-def test_a_run_learns_with_unknown_masks_what_it_learns_with_all_of_them(tiny, tmp_path):
+def test_a_run_with_unknown_masks_learns_nearly_the_same_as_with_all_masks(tiny, tmp_path):
     """The ball is missed in two of three masks: named unknown that costs little, named background most of its mIoU."""
     found = {}
     for name, missed in (("whole", None), ("unknown", masks.UNKNOWN), ("background", 0)):

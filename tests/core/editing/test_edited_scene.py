@@ -120,7 +120,7 @@ def test_an_unedited_scene_is_saved_byte_for_byte(tmp_path, noise):
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_deleted_objects_are_gone_with_all_that_is_theirs():
+def test_deleted_objects_are_removed_with_all_their_data():
     scene = rich_scene()
     result, notes = edit(scene, [piece for piece in pieces_of(scene) if piece.object_id != 2])
     assert [item.id for item in result.objects] == [-1, 0, 1, 3]
@@ -137,7 +137,7 @@ def test_deleted_objects_are_gone_with_all_that_is_theirs():
         np.testing.assert_array_equal(scene_player.frame(result, t).means, scene_player.frame(scene, t).means[keep])
 
 
-def test_without_its_leader_a_shadow_goes_on_by_itself():
+def test_without_its_leader_a_shadow_keeps_its_motion():
     scene = rich_scene()
     result, _ = edit(scene, [piece for piece in pieces_of(scene) if piece.object_id != 1])
     shadow = next(group for group in result.groups if group.role == "shadow")
@@ -249,7 +249,7 @@ def test_scale_that_changes_with_time_is_reported():
     assert any("scale changes with time" in note for note in edit(scene, pieces)[1])
 
 
-def test_a_still_object_that_was_made_to_move_gets_a_group_of_its_own():
+def test_a_still_object_that_is_animated_gets_its_own_group():
     scene, t = rich_scene(), times_of(rich_scene())
     maps = np.tile(np.eye(4), (len(t), 1, 1))
     maps[:, 2, 3] = 0.5 * (t - 0.75)
@@ -267,7 +267,7 @@ def test_a_still_object_that_was_made_to_move_gets_a_group_of_its_own():
     )
 
 
-def test_a_copy_is_an_object_of_its_own_with_the_motion_and_the_meaning_of_the_first():
+def test_a_copy_is_a_separate_object_with_the_motion_and_embedding_of_the_original():
     scene = rich_scene()
     pieces = pieces_of(scene)
     first = next(piece for piece in pieces if piece.object_id == 3)
@@ -292,7 +292,7 @@ def test_a_copy_is_an_object_of_its_own_with_the_motion_and_the_meaning_of_the_f
         )
 
 
-def test_names_and_tints_are_taken_and_names_stay_unique():
+def test_names_and_tints_are_stored_and_names_stay_unique():
     scene = rich_scene()
     table = {k: dataclasses.replace(scene.object(k), name="cup", aliases=("beaker",)) for k in (1, 2)}
     pieces = [dataclasses.replace(p, tint=np.array([0.5, 1, 2])) if p.object_id == 1 else p for p in pieces_of(scene)]

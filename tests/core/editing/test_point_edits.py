@@ -64,7 +64,7 @@ def assert_same(actual, expected, atol=2e-5):
     np.testing.assert_allclose(covariances(actual), covariances(expected), atol=atol)
 
 
-def test_an_edit_that_changes_nothing_is_the_scenes_own_rows(scene):
+def test_an_edit_without_changes_uses_the_scenes_own_rows(scene):
     base = np.concatenate(
         [scene.gaussians.sh[ROWS, 0], 1 / (1 + np.exp(-scene.gaussians.opacity_logits[ROWS, None]))], axis=-1
     )
@@ -189,6 +189,6 @@ def test_no_points_are_left_of_an_edit_without_rows(scene):
         PointEdit(np.array([1]), means=np.full((1, 3), np.nan)),
     ],
 )
-def test_points_that_cannot_be_are_refused(scene, edit):
+def test_impossible_points_are_refused(scene, edit):
     with pytest.raises(ValueError, match="points: expected"):
         point_edits.extend(scene, [edit])

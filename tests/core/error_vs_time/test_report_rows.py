@@ -38,7 +38,7 @@ def test_spread_is_median_quartiles_and_worst():
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 25))
-def test_names_never_overlap_nor_hide_a_point_nor_leave_the_frame(seed, count):
+def test_labels_never_overlap_cover_a_point_or_leave_the_frame(seed, count):
     rng = np.random.default_rng(seed)
     points, sizes = rng.uniform(20, 380, (count, 2)), rng.uniform([10, 8], [90, 14], (count, 2))
     markers = np.concatenate([points - 3, points + 3], axis=1)

@@ -126,7 +126,7 @@ def test_the_state_of_a_model_is_its_twist():
     np.testing.assert_allclose(integrator_task.state_of(screw), [v, w, 0 * v, 0 * v], atol=1e-6)
 
 
-def test_single_gaussians_are_integrated_where_there_are_dynamics(scene, field):
+def test_single_gaussians_are_integrated_if_there_are_dynamics(scene, field):
     rows, absent = integrator_task.measure(field, 0.25, 1)
     steps = only(rows, method="Magnus-4, own dynamics", error_kind="position")
     assert steps.count == int((scene.gaussians.motion_ids > 0).sum())
@@ -353,7 +353,7 @@ def test_the_command_reports_a_scene_file(scene, data, tmp_path, capsys):
         (["x.r5dgs", "--out", "o", "--repeats", "0"], "--repeats: expected an integer of at least 1"),
     ],
 )
-def test_a_wrong_call_is_one_line(arguments, words, capsys):
+def test_a_wrong_call_is_an_error_of_one_line(arguments, words, capsys):
     assert words in complaint(capsys, "report", *arguments, status=ExitStatus.USAGE)
 
 

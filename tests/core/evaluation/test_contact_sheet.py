@@ -20,7 +20,7 @@ def test_the_contact_sheet_takes_two_observed_and_two_later_times_of_one_camera(
     assert width > 4 * 200 and height > 4 * 150 and channels == 3
 
 
-def test_the_contact_sheet_makes_do_with_what_there_is(scene, data, tmp_path):
+def test_the_contact_sheet_works_with_fewer_times(scene, data, tmp_path):
     assert [view.t for view in contact_sheet.choose_views(dataclasses.replace(data, test=()))] == [0.1, 0.6]
     only = dataclasses.replace(data, val=(), test=())
     assert len(contact_sheet.choose_views(only)) == 4

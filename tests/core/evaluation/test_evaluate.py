@@ -53,7 +53,7 @@ def test_a_scene_is_perfect_on_its_own_pictures(result):
         assert row["rotation_error_deg"] == pytest.approx(0, abs=1e-5)
 
 
-def test_a_wrong_future_costs_on_test_and_not_on_val(scene, data):
+def test_a_wrong_extrapolation_lowers_test_and_not_val(scene, data):
     wrong = changed_group(scene, 2, velocity=np.asarray(scene.groups[2].model.velocity) + [0.0, 0.0, 2.0])
     result = evaluate.evaluate(wrong, data, backend=BACKEND)
     assert result["splits"]["val"]["rigid"]["psnr"] == 100.0
@@ -74,7 +74,7 @@ def test_a_wrong_spin_is_a_rotation_error_of_that_many_degrees(scene, data):
     assert row["position_error"] == pytest.approx(0, abs=1e-6)
 
 
-def test_swapped_names_cost_the_same_id_score_only(scene, data):
+def test_swapped_ids_lower_only_the_same_id_score(scene, data):
     swapped = np.array([0, 2, 1, 3])
     ids = np.where(
         scene.gaussians.object_ids > 0, swapped[np.maximum(scene.gaussians.object_ids, 0)], scene.gaussians.object_ids
@@ -113,7 +113,7 @@ def test_metrics_without_reference_data_are_none(scene, data):
     assert all(row["position_error"] is None for row in result["objects"])
 
 
-def test_the_classifier_decides_the_id_map_where_there_is_one(scene):
+def test_the_classifier_decides_the_id_map_if_there_is_one(scene):
     classes = [item.id for item in scene.objects if item.id >= 0]
     codes = np.zeros((len(scene.gaussians.means), 16), np.float16)
     rows = scene.gaussians.object_ids >= 0
@@ -152,7 +152,7 @@ def test_progress_counts_every_image(scene, data):
     assert seen == [(i, 6) for i in range(1, 7)]
 
 
-def test_the_table_shows_every_number_that_there_is(result):
+def test_the_table_shows_every_available_number(result):
     console = Console(width=100, record=True, file=io.StringIO())
     console.print(evaluation_table.make(result))
     text = console.export_text()
@@ -161,7 +161,7 @@ def test_the_table_shows_every_number_that_there_is(result):
     assert "LPIPS" not in text
 
 
-def test_brackets_in_names_are_shown_as_they_are(result):
+def test_brackets_in_names_are_shown_unchanged(result):
     objects = [{**row, "name": f"{row['name']} [/left]"} for row in result["objects"]]
     console = Console(width=100, record=True, file=io.StringIO())
     console.print(evaluation_table.make({**result, "scene": "[red]", "objects": objects}))

@@ -54,7 +54,7 @@ def test_names_are_light_on_dark_and_stand_on_large_objects_and_beside_small_one
     assert beside.sum() > 20 and not (light & (ids == 2)).any()
 
 
-def test_every_object_is_listed_and_what_is_not_seen_is_faint(scene):
+def test_every_object_is_listed_and_invisible_ones_are_faint(scene):
     ids = board()
     strip = annotated(scene, ids)[len(ids) :]
     for object_id in (1, 2, 3):
@@ -68,7 +68,7 @@ def test_every_object_is_listed_and_what_is_not_seen_is_faint(scene):
     assert (seen > 230).all(axis=-1).sum() > (strip > 230).all(axis=-1).sum() + 20
 
 
-def test_names_that_mean_something_to_others_are_only_text(scene, recwarn):
+def test_names_with_markup_are_only_text(scene, recwarn):
     for name in ("$x_1$", "_under", "100 % {a}", "日本", "a" * 200):
         odd = tuple(dataclasses.replace(item, name=name) if item.id == 1 else item for item in scene.objects)
         assert annotated(dataclasses.replace(scene, objects=odd), board()).shape[1] == 960

@@ -82,7 +82,7 @@ def test_flip_grows_with_the_difference_where_it_is_installed():
         assert 0 < metrics.flip(0.9 * x + 0.1 * y, x) < metrics.flip(y, x) <= 1
 
 
-def test_flip_is_absent_rather_than_wrong_without_its_package(monkeypatch):
+def test_without_its_package_flip_is_null(monkeypatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     assert metrics.flip(picture(7), picture(8)) is None
 

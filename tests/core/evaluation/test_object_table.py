@@ -33,7 +33,7 @@ def test_pixels_are_those_of_the_id_maps_and_overlap_with_own_masks_is_whole(sce
     assert sum(row.pixels for row in rows) == pytest.approx(pictures.WIDTH * pictures.HEIGHT)
 
 
-def test_own_views_take_every_camera_and_times_all_over(scene):
+def test_own_views_use_every_camera_and_times_from_the_whole_range(scene):
     views = object_table.own_views(scene)
     assert [view.camera for view in views] == list(scene.cameras)
     many = object_table.own_views(dataclasses.replace(scene, cameras=scene.cameras * 50))
@@ -96,7 +96,7 @@ def test_motion_is_named_as_in_the_sidebar(scene):
         assert scene_summary.motion_of(noisy, [group]) == word
 
 
-def test_the_residual_is_a_share_of_the_radius_and_absent_where_nothing_bends(scene):
+def test_the_residual_is_a_share_of_the_radius_and_absent_if_nothing_bends(scene):
     groups = [dataclasses.replace(group, rigid_rms=0.0, rigid_max=0.0) for group in scene.groups]
     exact = dataclasses.replace(scene, groups=tuple(groups))
     rows = object_table.measure(exact, [])
@@ -108,7 +108,7 @@ def test_the_residual_is_a_share_of_the_radius_and_absent_where_nothing_bends(sc
     assert "10 %" in shown(bent, object_table.measure(bent, []))
 
 
-def test_names_are_shown_as_they_are_and_json_is_json(scene):
+def test_names_are_shown_unchanged_and_json_is_valid(scene):
     odd = tuple(
         dataclasses.replace(item, name="[red] mug", aliases=("cup",)) if item.id == 1 else item
         for item in scene.objects

@@ -100,7 +100,7 @@ def test_ascii_files_are_read(tmp_path):
         ply.read(path)
 
 
-def test_elements_before_the_vertices_are_passed_over(tmp_path):
+def test_elements_before_the_vertices_are_skipped(tmp_path):
     path = tmp_path / "a.ply"
     row = np.array(ROW[:8], "<f4").tobytes() + np.array(ROW[8:11], "<f8").tobytes()
     row += np.array(ROW[11:14], "<f4").tobytes() + b"\x07"

@@ -122,7 +122,7 @@ def test_wrong_shapes_are_named(deformed, changed, message):
         importer.import_run(deformed)
 
 
-def test_velocity_of_another_width_is_no_known_layout(traced):
+def test_a_velocity_network_of_another_width_is_refused(traced):
     path = traced / "deform" / "iteration_20000" / "vel.pth"
     foreign.write_weights(path, foreign.velocity_weights(3, 4, 128, 6, 13, 3))
     with pytest.raises(CheckpointError, match="expected a network from 4 to 12 numbers, found 4 to 13"):

@@ -77,7 +77,7 @@ def test_every_eighth_camera_is_held_out(flat):
     assert len(dataset.train) == 8 and dataset.test == ()
 
 
-def test_fewer_than_eight_cameras_are_all_trained_on(tmp_path):
+def test_fewer_than_eight_cameras_are_all_used_for_training(tmp_path):
     views = {f"{k}.png": camera(k) for k in range(7)}
     for name in views:
         picture(tmp_path / "images" / name)
@@ -100,7 +100,7 @@ def test_frames_of_a_standing_camera_share_its_pose_and_have_their_numbers_as_ti
         assert datasets.load_image(view)[0, 0, 0] == pytest.approx(int(frame[-2:]) / 20, abs=1 / 255)
 
 
-def test_an_image_beside_the_folders_stands_for_a_camera(rig):
+def test_an_image_beside_the_folders_gives_the_pose_of_a_camera(rig):
     root, views = rig
     beside = {name.split("/")[0] + ".png": view for name, view in views.items()}
     for name in beside:
@@ -145,7 +145,7 @@ def test_a_held_out_camera_is_never_trained_on(rig, caplog):
     assert "2 images of held-out cameras are left out" in caplog.text
 
 
-def test_held_out_cameras_are_trained_on_if_no_other_is_early(rig):
+def test_held_out_cameras_are_used_for_training_if_no_other_covers_the_time_range(rig):
     root, _ = rig
     times = {f"cam{k}/frame_0012.png": 1.2 for k in range(9)} | {"cam0/frame_0004.png": 0.4}
     (root / "times.json").write_text(json.dumps({"times": times, "t_max": 0.5}))
@@ -153,7 +153,7 @@ def test_held_out_cameras_are_trained_on_if_no_other_is_early(rig):
     assert [v.name for v in dataset.train] == ["cam0/frame_0004"] and dataset.val == () and len(dataset.test) == 9
 
 
-def test_masks_and_names_lie_beside_the_images(flat):
+def test_masks_and_names_are_found_beside_the_images(flat):
     root, _ = flat
     images.write_png(root / "object_mask" / "img_03.png", np.full((8, 12, 1), 2, np.uint8))
     (root / "objects.json").write_text(json.dumps({"2": "mug"}))
@@ -162,7 +162,7 @@ def test_masks_and_names_lie_beside_the_images(flat):
     assert (datasets.load_mask(view) == 2).all() and dataset.object_names == {2: "mug"}
 
 
-def test_smaller_images_take_the_lens_along(flat):
+def test_the_lens_is_scaled_for_smaller_images(flat):
     root, views = flat
     for name in views:
         picture(root / "images" / name, 6, 4)
@@ -171,7 +171,7 @@ def test_smaller_images_take_the_lens_along(flat):
     np.testing.assert_allclose(view.camera.intrinsics, expected, atol=1e-10)
 
 
-def test_camera_files_win_over_a_reconstruction(tiny, flat, tmp_path):
+def test_camera_files_take_precedence_over_a_reconstruction(tiny, flat, tmp_path):
     folder = tmp_path / "both"
     shutil.copytree(tiny.root, folder)
     shutil.copytree(flat[0] / "sparse", folder / "sparse")
@@ -270,7 +270,7 @@ def test_times_that_cannot_be_used_are_named(flat, content, message):
         datasets.read(flat[0])
 
 
-def test_frames_without_numbers_ask_for_times(rig):
+def test_frames_without_numbers_need_times(rig):
     root, _ = rig
     (root / "images" / "cam3" / "frame_0006.png").rename(root / "images" / "cam3" / "last.png")
     with pytest.raises(DatasetError, match=r"last.png: expected a number at the end .* give the times in .*times.json"):
@@ -292,7 +292,7 @@ def test_a_reconstruction_of_few_of_the_images_is_refused_with_the_remedy(flat):
     assert len(datasets.read(root, min_registered=0.1).train) == 8
 
 
-def test_images_that_times_json_leaves_out_need_no_pose(flat):
+def test_images_missing_in_times_json_need_no_pose(flat):
     root, views = flat
     for k in range(90):
         picture(root / "images" / f"lost_{k:02d}.png")
