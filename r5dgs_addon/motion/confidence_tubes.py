@@ -90,15 +90,16 @@ def path(anchor: bpy.types.Object, times: timeline.Times) -> tuple[np.ndarray, n
     """Positions of an anchor past t_max in its parent's axes, and half widths of their 95 % band.
 
     Returns:
-        Positions [H, 3] and half widths [H], from t_max to the end.
+        Positions [H, 3] and half widths [H], at even times from t_max to the end and at impacts.
 
     Raises:
         ConfigError: The motion is too fast to integrate, or the F-curves cannot be read.
     """
-    tau = np.linspace(0.0, times.t_end - times.t_max, STEPS + 1)
     start, _ = fcurves.pose_at(anchor, curve_place.find(anchor), times.frame(times.t_max))
     follow = physics.follow_matrix(anchor.r5dgs_motion)
     model = physics.model(physics.mover(anchor))
+    end = times.t_end - times.t_max
+    tau = np.union1d(np.linspace(0.0, end, STEPS + 1), models.kinks(model, end))
     if models.steps_needed(model, tau[-1:])[0] > _MOST_STEPS:
         raise errors.ConfigError(f"{anchor.name}: moves too fast for a path; lower the rates under Motion")
     _, displacements = models.evaluate(model, tau)

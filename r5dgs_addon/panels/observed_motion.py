@@ -43,7 +43,9 @@ class R5DGS_PT_observed_motion(sidebar.Sidebar, bpy.types.Panel):
 
 def _event(event: Event, times: timeline.Times) -> str:
     """Event in words, such as "Frame 31.2 ± 0.6: impact"."""
-    return f"Frame {times.frame(event.time):.1f} ± {event.sigma * times.frames_per_unit:.1f}: {event.kind}"
+    sigma = event.sigma * times.frames_per_unit
+    doubt = f" ± {sigma:.1f}" if sigma >= 0.05 else ""
+    return f"Frame {times.frame(event.time):.1f}{doubt}: {event.kind}"
 
 
 def _rates(segment: Segment, state: bpy.types.PropertyGroup, system: str) -> list[str]:

@@ -57,6 +57,16 @@ def test_a_bounce_plays_like_the_core_about_its_impacts(blender, scene_path):
     assert not mug.r5dgs_motion.too_fast
 
 
+def test_the_tube_of_a_bounce_touches_the_floor_at_its_impacts(blender, scene_path):
+    motions.load(blender, scene_path, t_end=1.2)
+    mug, tubes = blender.data.objects["mug anchor"], motions.addon("motion.confidence_tubes")
+    centers, _ = tubes.path(mug, motions.addon("motion.extrapolate").times_of(mug))
+    start, _ = tubes.path(mug, dataclasses.replace(motions.addon("motion.extrapolate").times_of(mug), t_end=0.76))
+    for impact in models.kinks(BOUNCE, 0.45)[:4]:
+        _, displacement = models.evaluate(BOUNCE, impact)
+        assert np.linalg.norm(centers - (start[0] + displacement), axis=-1).min() < 1e-5
+
+
 def test_an_edited_bounce_keeps_its_impacts_and_its_shadow_follows(blender, scene_path):
     scene = scene_file.read(scene_path)
     loaded = motions.load(blender, scene_path, t_end=1.2)
