@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
+from ...r5dgs_core.color import srgb
 from ...r5dgs_core.motion import rotations
 from ...r5dgs_core.scene import spherical_harmonics
 from ..scene import point_clouds
 
 TEXELS = 4  # of each Gaussian in the table: position and group; covariance xx xy xz yy; yz zz; color and opacity
 SHADED = 1  # further texels if any cloud has shading: vector and rest factor
+BALL = 0.3  # size of points without one, as a fraction of their mean distance on a surface
 # Further texels of the coefficients by degree, three channels each, without gaps.
 HARMONICS = {degree: -(-3 * ((degree + 1) ** 2 - 1) // 4) for degree in range(4)}
 
@@ -42,29 +44,48 @@ class CloudData:
         return spherical_harmonics.degree_of(self.harmonics.shape[1] + 1)
 
 
-def read(cloud: bpy.types.PointCloud) -> CloudData | None:
-    """Read an evaluated point cloud. Returns None if it lacks an attribute that splats need.
+def read(cloud: bpy.types.PointCloud, color: Sequence[float]) -> CloudData:
+    """Read an evaluated point cloud.
 
-    Gaussians with values that are not finite get opacity 0.
+    Points without size become small balls, and points without radiance get `display_color` or else the given color, so
+    that the output of any node is visible. Gaussians with values that are not finite get opacity 0.
+
+    Args:
+        cloud: Evaluated point cloud.
+        color: Linear color and opacity of points without any.
     """
-    found = [
-        point_clouds.attribute(cloud, name, kind)
-        for name, kind in (
-            ("position", "FLOAT_VECTOR"),
-            ("scale", "FLOAT_VECTOR"),
-            ("rotation", "QUATERNION"),
-            ("radiance:base", "FLOAT_COLOR"),
-        )
-    ]
-    if any(one is None for one in found):
-        return None
-    position, scale, rotation, radiance = found
-    positions = point_clouds.read(position, "vector", 3)
-    covariances = _covariances(point_clouds.read(scale, "vector", 3), point_clouds.read(rotation, "value", 4))
-    base = point_clouds.read(radiance, "color", 4)
+    positions = _values(cloud, "position", "FLOAT_VECTOR", "vector", 3)
+    if positions is None:
+        positions = np.zeros((0, 3), np.float32)
+    count = len(positions)
+    scales = _values(cloud, "scale", "FLOAT_VECTOR", "vector", 3)
+    quats = _values(cloud, "rotation", "QUATERNION", "value", 4)
+    base = _values(cloud, "radiance:base", "FLOAT_COLOR", "color", 4)
+    if scales is None:
+        scales = np.full((count, 3), _ball(positions), np.float32)
+    if quats is None:
+        quats = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
+    if base is None:
+        shown = _values(cloud, point_clouds.DISPLAY_COLOR, "FLOAT_COLOR", "color", 4)
+        base = np.tile(np.float32(color), (count, 1)) if shown is None else shown
+        base[:, :3] = (srgb.from_linear(base[:, :3].astype(np.float64)) - 0.5) / spherical_harmonics.C0
+    covariances = _covariances(scales, quats)
     bad = ~np.isfinite(np.concatenate([positions, covariances, base], 1)).all(1)
     positions[bad], covariances[bad], base[bad] = 0, 0, 0
     return CloudData(positions, covariances, base, _harmonics(cloud), _shading(cloud))
+
+
+def _values(cloud: bpy.types.PointCloud, name: str, kind: str, field: str, width: int) -> np.ndarray | None:
+    """Values of an attribute, or None if it is missing. [n, width]"""
+    found = point_clouds.attribute(cloud, name, kind)
+    return None if found is None else point_clouds.read(found, field, width)
+
+
+def _ball(positions: np.ndarray) -> float:
+    """Standard deviation of points without size: less than their distance on a surface of the cloud's size."""
+    places = positions[np.isfinite(positions).all(1)]
+    size = float(np.linalg.norm(np.ptp(places.astype(np.float64), axis=0))) if len(places) > 1 else 0.0
+    return BALL * size / np.sqrt(len(places)) if size else 1.0
 
 
 def _covariances(scales: np.ndarray, quats: np.ndarray) -> np.ndarray:

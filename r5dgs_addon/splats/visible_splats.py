@@ -44,7 +44,7 @@ class Shown:
 class _Layer:
     """Gaussians that a view layer shows: points by `session_uid` of the object, and the table with its slots."""
 
-    clouds: dict[int, gaussian_table.CloudData | None] = field(default_factory=dict)
+    clouds: dict[int, gaussian_table.CloudData] = field(default_factory=dict)
     table: tuple[tuple[Slot, ...], renderer.SplatTable] | None = None
 
     def drop(self, uids: set[int]) -> None:
@@ -119,8 +119,7 @@ def shown(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = 
     for one in clouds:
         if one.object.session_uid not in layer.clouds:
             evaluated = evaluated_points.evaluated(one.object, depsgraph)
-            layer.clouds[one.object.session_uid] = gaussian_table.read(evaluated)
-    clouds = [one for one in clouds if layer.clouds[one.object.session_uid] is not None]
+            layer.clouds[one.object.session_uid] = gaussian_table.read(evaluated, one.object.color)
     if not clouds:
         return None
     slots = _slots(clouds)

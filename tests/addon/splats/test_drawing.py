@@ -239,3 +239,55 @@ def test_nearer_than_the_clip_start_of_the_camera_is_nothing(blender, drawn, tmp
     assert drawn().any()
     blender.context.scene.camera.data.clip_start = 900
     assert not drawn().any()
+
+
+def nodes_without_attributes(bpy, mug):
+    """Replace a cloud's points by a row of new ones."""
+    tree = bpy.data.node_groups.new("row", "GeometryNodeTree")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    line, points, leave = (
+        tree.nodes.new(kind) for kind in ("GeometryNodeMeshLine", "GeometryNodeMeshToPoints", "NodeGroupOutput")
+    )
+    line.inputs["Count"].default_value = 40
+    line.inputs["Offset"].default_value = (0.02, 0, 0)
+    tree.links.new(line.outputs[0], points.inputs[0])
+    tree.links.new(points.outputs[0], leave.inputs[0])
+    mug.modifiers.new("row", "NODES").node_group = tree
+
+
+def test_points_without_attributes_are_seen_in_the_color_of_their_object(blender, drawn, tmp_path):
+    scene = scenes.make_scene(n=400, objects=3)
+    collection = motions.load(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
+    mug = next(cloud for cloud in motions.clouds(collection) if cloud.r5dgs.object_id == 1)
+    for cloud in motions.clouds(collection):
+        cloud.hide_render = cloud != mug
+    mug.color = (0.0, 1.0, 0.0, 0.9)
+    nodes_without_attributes(blender, mug)
+    found = drawn()
+    assert found[..., 3].max() > 0.5
+    np.testing.assert_allclose(found[..., 1], found[..., 3], atol=1e-3)
+    assert found[..., 0].max() < 1e-3 and found[..., 2].max() < 1e-3
+
+
+@pytest.mark.parametrize("link", [False, True], ids=["appended", "linked"])
+@pytest.mark.parametrize("instanced", [False, True], ids=["itself", "instanced"])
+def test_scenes_of_another_file_are_drawn(blender, drawn, tmp_path, link, instanced):
+    scene = scenes.make_scene(n=400, objects=3, sh_degree=1)
+    collection = motions.load(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
+    name, camera = collection.name, blender.context.scene.camera.matrix_world.copy()
+    wanted, blend = drawn(), str(tmp_path / "library.blend")
+    blender.data.libraries.write(blend, {collection})
+    blender.context.view_layer.layer_collection.children[name].exclude = True
+    assert not drawn().any()
+    with blender.data.libraries.load(blend, link=link) as (_, brought):
+        brought.collections = [name]
+    target = blender.context.scene.collection
+    if instanced:
+        instancer = blender.data.objects.new("instancer", None)
+        instancer.instance_type, instancer.instance_collection = "COLLECTION", brought.collections[0]
+        target.objects.link(instancer)
+    else:
+        target.children.link(brought.collections[0])
+    assert blender.context.scene.camera.matrix_world == camera
+    assert wanted.any()
+    np.testing.assert_allclose(drawn(), wanted, atol=1e-4)
