@@ -10,7 +10,7 @@ from . import errors
 
 @contextlib.contextmanager
 def required(user: str, extra: str, remedy: str = "", also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Report packages that the block imports and that are missing, with the command that installs them.
+    """Convert an ImportError of the block to a BackendError with the command that installs the missing package.
 
     Args:
         user: Feature that needs the packages, for the message.

@@ -51,7 +51,7 @@ def hold(folder: Path) -> Iterator[bool]:
             f"{folder}: in use by {_holder(path)}; wait until that ends or stop it, or use another folder"
         ) from error
     except OSError as error:
-        raise CheckpointError(f"{folder}: cannot be made or written: {error}; choose another --out") from error
+        raise CheckpointError(f"{folder}: cannot be created or written: {error}; choose another --out") from error
     try:
         yield locked
     finally:

@@ -58,13 +58,13 @@ def check_scene_output(out: Path) -> None:
     if out.suffix.lower() != SCENE_SUFFIX:
         raise errors.UsageError(f"{out}: expected a name that ends in {SCENE_SUFFIX}, which Blender filters files by")
     if not out.parent.is_dir():
-        raise errors.SceneFileError(f"{out}: expected the folder {out.parent} to exist; make it first")
+        raise errors.SceneFileError(f"{out}: expected the folder {out.parent} to exist; create it first")
 
 
 def check_output(option: str, path: Path | None) -> None:
     """Raise `ConfigError` if the file that an option names is a folder, or its folder is missing."""
     if path is not None and (path.is_dir() or not path.parent.is_dir()):
-        expected = "a file" if path.is_dir() else f"the folder {path.parent} to exist; make it first"
+        expected = "a file" if path.is_dir() else f"the folder {path.parent} to exist; create it first"
         raise errors.ConfigError(f"{option} {path}: expected {expected}")
 
 

@@ -138,7 +138,7 @@ def markdown(result: dict[str, Any]) -> str:
     given += [f"configuration {settings['config']}"] if settings["config"] else []
     given += settings["set"]
     parts.append(
-        "## How\n\n"
+        "## Method\n\n"
         f"Settings: {', '.join(given) or 'defaults'}. CPU s, wall s and MB refer to the training process, including "
         "start-up and labels; FPS refers to the measuring process.\n\n" + "\n".join(_machines(records)) + "\n"
     )

@@ -97,7 +97,7 @@ def draw(
 def best_standpoint(
     scene: Scene, object_ids: Collection[int], camera: str | None, t: float | None, mode: str
 ) -> Standpoint:
-    """Return the camera and the time that see the objects best; a given camera or time is kept."""
+    """Return the camera and the time that show the objects best; a given camera or time is kept."""
     from ..render import viewpoints
 
     return viewpoints.best(scene, viewpoints.candidates(scene, camera, t), object_ids, mode)

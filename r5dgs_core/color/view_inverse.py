@@ -23,8 +23,8 @@ BRIGHTEST = 16.3  # scene-linear colour that most view transforms display as whi
 MOST = 16.0  # white of the softest looks, in multiples of BRIGHTEST
 SIZE = 33  # grid nodes per channel
 STEP = 1 / 255  # 8-bit display step, the unit of errors
-VISIBLE = 1.5 * STEP  # smallest visible error
-SOLVED = 0.5 * STEP  # largest error of a node within the view's reach
+VISIBLE = 1.5 * STEP  # minimum visible error
+SOLVED = 0.5 * STEP  # maximum error of a node within the view's reach
 
 _CODES = 65536  # entries per curve, far finer than the precision of image files
 _CHUNK = 65536  # colours per block, sized for the CPU cache
@@ -131,7 +131,7 @@ def invert(forward: Forward, scale: float = 1.0) -> Inverse:
 
 
 def _top(shown: Forward) -> float:
-    """Smallest grey code, from that of `BRIGHTEST` on, that is displayed as the brightest tested one."""
+    """Code of white: the smallest grey code at or above `BRIGHTEST` that displays like the brightest tested one."""
     tried = np.arcsinh(BRIGHTEST * np.geomspace(1.0, MOST, 17) / KNEE)
     white = shown(np.repeat(tried[:, None], 3, axis=1))
     return float(tried[np.argmax(_far(white, white[-1]) < SOLVED)])
@@ -155,7 +155,7 @@ def _squared(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 def _solve(
     shown: Forward, wanted: np.ndarray, codes: np.ndarray, top: float, rounds: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find codes that are displayed as given, by Levenberg-Marquardt steps with finite differences.
+    """Find codes with given display colours, by Levenberg-Marquardt steps with finite differences.
 
     Args:
         shown: Maps codes to display colours.

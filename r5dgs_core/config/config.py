@@ -20,7 +20,7 @@ from .sections.motion import DiscoverySection, FieldSection, ResidualSection
 from .sections.needs import NeedsSection
 from .sections.training import CurriculumSection, DataSection, InitSection, LossSection, RatesSection, TrainSection
 
-_MOST_BYTES = 1 << 20  # largest size of a configuration file
+_MOST_BYTES = 1 << 20  # maximum size of a configuration file
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def require_needs(overrides: Sequence[str]) -> None:
     """Raise `UsageError` if an override for a finished run names a key outside of ``needs``."""
     for text in overrides:
         if not text.strip().startswith("needs."):
-            raise UsageError(f"--set {text}: the run keeps its configuration; bake takes needs.NAME=on|off alone")
+            raise UsageError(f"--set {text}: the run keeps its configuration; bake accepts only needs.NAME=on|off")
     _parsed(overrides)
 
 

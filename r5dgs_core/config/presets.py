@@ -1,10 +1,9 @@
 """Presets: named sets of configuration keys for ``--preset``.
 
 - ``paper``: hyper-parameters of R5DGS and of the methods that it builds on (TRACE, 3DGS, Gaussian Grouping), for a GPU:
-  40000 steps and networks of width 256. It departs from them in five points: the networks' heads start at zero; the sky
+  40000 steps and networks of width 256. It differs from them in five points: the networks' heads start at zero; the sky
   is learned; Adam has its usual epsilon for the networks; the learning rates of the centres decay over the whole run
-  (3DGS: over 30000 steps); and coordinates are normalised, in which the rates correspond to those for scenes of a few
-  units.
+  (3DGS: over 30000 steps); and coordinates are normalised, so that the rates are those for scenes of a few units.
 - ``cpu``: the same method with defaults made for CPUs.
 - ``fast``: a short run for a first impression of a data set.
 """

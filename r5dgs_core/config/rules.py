@@ -95,7 +95,10 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "field.gate": _SHARE,
     "field.trd_share": _SHARE,
     "field.trd_every": _SHARE,
-    "field.tracks_share": (lambda value: 0 <= value < 1, "0 to less than 1, as the rest of the run is the field's"),
+    "field.tracks_share": (
+        lambda value: 0 <= value < 1,
+        "0 to less than 1, as the rest of the run trains the field",
+    ),
     "field.chunk": _AT_LEAST_1,
     "losses.rigid_form": (lambda value: value in RIGID_FORMS, " or ".join(RIGID_FORMS)),
     "losses.rigid_start": _SHARE,

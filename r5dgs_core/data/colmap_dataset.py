@@ -220,7 +220,10 @@ def _split(frames: list[_Frame], t_max: float) -> dict[str, list[_Frame]]:
     val = [frame for frame in early if frame.camera in held]
     inside = [frame for frame in val if first <= frame.t <= last]
     if len(inside) < len(val):
-        _log.info("%d images of held-out cameras are left out: the others observe no such time", len(val) - len(inside))
+        _log.info(
+            "%d images of held-out cameras are left out: outside the times of the others",
+            len(val) - len(inside),
+        )
     return {
         "train": [frame for frame in early if frame.camera not in held],
         "val": inside,

@@ -143,9 +143,9 @@ def read(
     Args:
         root: Folder with ``transforms_train.json``, or with images and a COLMAP reconstruction (`layouts.colmap`).
         train_masks: Folder of the training views' masks, relative to ``root`` or absolute; ``none`` ignores masks.
-            The other splits keep the data set's masks, as they serve evaluation. An ``objects.json`` in the folder
+            The other splits keep the data set's masks, which evaluation uses. An ``objects.json`` in the folder
             marks its ids as its own; the true poses, which use the data set's ids, are then ignored.
-        min_registered: Smallest share of the images in ``images`` that a COLMAP reconstruction must have registered.
+        min_registered: Minimum share of the images in ``images`` that a COLMAP reconstruction must have registered.
         guard: Entered around each frame, image and file, for callers that continue after an error (`findings`).
 
     Returns:
@@ -234,7 +234,7 @@ def _near_origin(raw: RawDataset, root: Path) -> tuple[RawDataset, np.ndarray]:
     points = None if raw.points is None else raw.points - origin
     if not origin.any():
         return replace(raw, points=points), origin
-    _log.info("the cameras stand far from the world's origin: positions are measured from %s", origin.tolist())
+    _log.info("the cameras are far from the world's origin: positions are measured from %s", origin.tolist())
     entries = {split: [entry.moved(-origin) for entry in raw.entries[split]] for split in SPLITS}
     return replace(raw, entries=entries, points=points), origin
 

@@ -120,7 +120,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise errors.DatasetError(f"{path}: cannot write the image: its folder cannot be made ({error})") from error
+        raise errors.DatasetError(f"{path}: cannot write the image: its folder cannot be created ({error})") from error
     height, width, channels = pixels.shape
     kind = oiio.UINT8 if pixels.dtype == np.uint8 else oiio.UINT16
     spec = oiio.ImageSpec(width, height, channels, kind)
@@ -135,7 +135,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
             problem = target.geterror()  # a full disk is reported only here
             if not good or problem or not target.close():
                 problem = " ".join(problem.split()) or "no reason given"
-                raise errors.DatasetError(f"{path}: cannot write the image ({problem}); is there room?")
+                raise errors.DatasetError(f"{path}: cannot write the image ({problem}); check the free disk space")
     except OSError as error:
         raise errors.DatasetError(f"{path}: cannot write the image ({error})") from error
 

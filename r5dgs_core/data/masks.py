@@ -18,7 +18,7 @@ from . import images
 UNKNOWN = 65535
 MAX_ID = UNKNOWN - 1  # largest id in 16 bits
 MAX_COLORS = 4096
-MAX_BLENDED = 16  # accepted number of colours that fill no 2 x 2 pixels, as of distant objects
+MAX_BLENDED = 16  # accepted number of colours without a flat 2 x 2 block, such as those of distant objects
 _GRAY, _PALETTE, _GRAY_ALPHA = 0, 3, 4  # PNG colour types
 _ONE_CHANNEL = (_GRAY, _PALETTE, _GRAY_ALPHA)
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -60,7 +60,7 @@ def write(path: Path, ids: np.ndarray) -> None:
     low, high = int(ids.min(initial=0)), int(ids.max(initial=0))
     if low < 0 or high > UNKNOWN:
         raise errors.DatasetError(
-            f"{path}: expected object ids from 0 to {MAX_ID}, found {low if low < 0 else high}; number the objects anew"
+            f"{path}: expected object ids from 0 to {MAX_ID}, found {low if low < 0 else high}; renumber the objects"
         )
     images.write_png(path, ids.astype(np.uint8 if high < 256 else np.uint16))
 
@@ -84,10 +84,10 @@ def _read_gray(path: Path) -> np.ndarray:
 
 
 def color_table(paths: Iterable[Path]) -> dict[int, int]:
-    """Detect if the masks of a data set are coded by colour, and number the colours.
+    """Detect masks that are coded by colour, and number the colours.
 
-    They are if one of them contains a colour that is not gray. Black is then 0, and all others, including grays and
-    white, are 1, 2, ... by packed value.
+    The masks of a data set are coded by colour if one of them contains a colour other than gray. Black is then 0, and
+    all other colours, including grays and white, are 1, 2, ... by packed value.
 
     Returns:
         Object id of each packed colour; empty if no mask is coded by colour.
@@ -97,7 +97,7 @@ def color_table(paths: Iterable[Path]) -> dict[int, int]:
             do not share their colours.
     """
     found: set[int] = set()
-    flat: set[int] = set()  # colours that fill 2 x 2 pixels somewhere
+    flat: set[int] = set()  # colours with a flat 2 x 2 block
     gray, colored = [], Path()
     for path in map(Path, paths):
         header = _png_header(path)
@@ -227,7 +227,7 @@ def _read_indices(path: Path) -> np.ndarray:
     width, height, depth, _, interlace = header
     if interlace:
         raise errors.DatasetError(
-            f"{path}: interlaced palette masks are not read; save it without interlacing", code="D17"
+            f"{path}: interlaced palette masks are not supported; save the mask without interlacing", code="D17"
         )
     packed, at = bytearray(), 8
     while at + 12 <= len(data):

@@ -13,7 +13,7 @@ import numpy as np
 from .. import errors
 from ..scene import cameras
 
-FAR = 256.0  # largest distance of the cameras from the files' origin, in spreads, that needs no new origin
+FAR = 256.0  # maximum distance of the cameras from the files' origin without a new origin, in spreads
 SMALLEST, LARGEST = 1e-25, 1e13  # accepted units between cameras; scenes hold coordinates up to `cameras.FARTHEST`
 RESOLUTION = 1e-6  # required float64 resolution at the cameras, as a share of the spread
 LONE = 4.0  # assumed spread if all cameras coincide, as in `train.normalization`

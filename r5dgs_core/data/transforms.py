@@ -147,7 +147,8 @@ def _read_frames(
     with guard():
         if any(given) and not all(given):
             raise errors.DatasetError(
-                f"{place}: frame {given.index(False)} has no 'time', others have; give all or none", code="D04"
+                f"{place}: frame {given.index(False)} has no 'time', but others have; give all a time, or none",
+                code="D04",
             )
     entries = []
     for i, frame in enumerate(frames):

@@ -84,10 +84,10 @@ def _with_notes(views: dict[str, tuple[View, ...]], folder: Path | None, hasher:
     videos = notes.video_of()
     lone = "" if notes.numbering == mask_notes.SCENE else "other masks"
 
-    def told(view: View) -> View:
+    def with_notes(view: View) -> View:
         if view.mask_path is None:
             return view
         return replace(view, mask_unknown=notes.unknown, mask_video=videos.get(view.name, lone))
 
     hasher.update(f"{notes.numbering} {notes.unknown}".encode() * len(views))  # once per split
-    return {split: tuple(map(told, some)) for split, some in views.items()}
+    return {split: tuple(map(with_notes, some)) for split, some in views.items()}

@@ -13,7 +13,7 @@ from ..playback import affine_transform, posing
 from ..scene.scene import Scene
 from .piece_clusters import Cluster
 
-TOLERANCE = 1e-5  # smallest displacement that counts, relative to the scene's extent
+TOLERANCE = 1e-5  # minimum displacement that counts, relative to the scene's extent
 
 
 def gather(scene: Scene, clusters: Sequence[Cluster]) -> tuple[np.ndarray, dict[str, Any], bool]:

@@ -19,7 +19,7 @@ from ..scene.scene import Scene
 from ..scene.splats import to_opacities
 from . import edited_gaussians
 
-ROUNDING = 2e-6  # largest residual of centres under a map, relative to the largest coordinate
+ROUNDING = 2e-6  # maximum residual of centres under a map, relative to the largest coordinate
 FEWEST = 5  # number of points that determine and confirm an affine map
 TRIALS = 40  # number of RANSAC trials
 SAMPLE = 4096  # number of points that each map is tested on
@@ -201,7 +201,7 @@ def _edited(scene: Scene, rows: np.ndarray, edit: PointEdit) -> tuple[np.ndarray
         changed = means is not None
     if means is not None:
         part = part.with_arrays(means=np.ascontiguousarray(means, np.float32))
-    if shapes or changed:  # own motion was learned for the old centres
+    if shapes or changed:  # the learned motion of single points belongs to the old centres
         part = replace(part, dynamics=None)
     return matrix, part.with_arrays(**shapes, **looks) if shapes or looks or changed else None
 

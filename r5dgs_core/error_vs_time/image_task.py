@@ -20,8 +20,8 @@ KINDS = ("psnr", "psnr_objects", "ssim", "flip", "lpips", "miou")
 FRAMES = 6  # timed views
 ORACLE = "true poses"
 TRUE_POSES = (
-    "motion is given, not predicted. This is no upper limit: appearance learned with a track makes up for errors of "
-    "the track"
+    "motion is given, not predicted. This is no upper limit: appearance learned with a track compensates for "
+    "errors of the track"
 )
 _SAME = 1e-6  # tolerance for equal times
 Move = Callable[[float], scene_player.Frame]
@@ -85,7 +85,7 @@ def measure(
             shared = {"task": "images", "setting": split, "count": found["images"], **label, **times.get(mode, {})}
             rows += [Row(error_kind=kind, error=float(error), **shared) for kind, error in errors.items()]
     if missing:
-        absent.append(f"images: not computed: {', '.join(missing)} (docs/reference/evaluation.md says what each needs)")
+        absent.append(f"images: not computed: {', '.join(missing)} (requirements: docs/reference/evaluation.md)")
     return rows, absent
 
 
@@ -100,7 +100,7 @@ def _plans(
         if not dataset.views(split):
             absent.append(f"images of {split}: the data set has none")
         elif not past and len(moves) > len(plans[split]):
-            absent.append(f"images of {split} in other modes than rigid: up to t_max all are the same")
+            absent.append(f"images of {split} in other modes than rigid: all modes are the same up to t_max")
     return plans
 
 

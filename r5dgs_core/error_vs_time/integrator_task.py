@@ -25,7 +25,7 @@ from .report_rows import Row, spread
 
 STEPS = (1, 2, 4, 8, 16, 32, 64)
 FINE_STEPS = 4096
-POINT_STEPS = (1, 4, 15, 60)  # for single Gaussians; fewer settings, because Gaussians are many
+POINT_STEPS = (1, 4, 15, 60)  # for single Gaussians; few settings, because there are many Gaussians
 FINE_POINT_STEPS = 256
 POINTS_AT_ONCE = 512  # Gaussians per batch of the reference
 ROUNDING = 1e-15  # errors below this are rounding errors

@@ -1,7 +1,7 @@
 """The Pareto front of error against time, without differences below the noise.
 
 A line is a row of the report in each run of a scene, by the number of the run. Lines are compared run by run, so that
-what the runs share, such as an easy seed, does not count as noise.
+effects common to the lines of a run, such as an easy seed, do not count as noise.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Key = TypeVar("Key", bound=Hashable)
 def front(lines: Mapping[Key, Line]) -> set[Key]:
     """Return the keys of the lines on the Pareto front.
 
-    First, a line leaves if another one is better and not slower. Then, from fast to slow, a line is kept if it is
+    First, a line is removed if another one is better and not slower. Then, from fast to slow, a line is kept if it is
     better than every line kept so far. Both "better" and "faster" mean by more than the noise (`is_better`,
     `is_faster`).
 
@@ -53,7 +53,7 @@ def _badness(line: Line) -> float:
 
 
 def losses(one: Line, other: Line) -> list[float]:
-    """Return by how much a line is worse than another one, in each run that has both; negative if it is better."""
+    """Return the excess error of a line over another one in each run that has both; negative if it is better."""
     sign = [-1 if row.kind.more_is_better else 1 for row in one.values()][:1] or [1]
     return [sign[0] * (one[run].error - other[run].error) for run in sorted(one.keys() & other.keys())]
 
@@ -62,7 +62,7 @@ def is_better(one: Line, other: Line) -> bool:
     """Return True if the mean difference of the errors exceeds the noise.
 
     The noise is the range of the difference over the runs. Differences below `Kind.least` and `Kind.least_share` never
-    count; in a single run, they are all that is known of the noise.
+    count; with a single run, they are the only estimate of the noise.
     """
     found = losses(other, one)
     if not found:

@@ -19,7 +19,7 @@ from ..scene.scene import MotionGroup, Scene
 from .report_rows import Row, spread
 
 MODELS = tuple(candidates.BY_NAME)  # fitted one at a time
-ALONE = "for all objects"  # setting of a row of one model; which of them is best is known only afterwards
+ALONE = "for all objects"  # setting of a row of one model; the best of them is known only afterwards
 CHOSEN = "chosen of the family"
 STEADY = {"spring": "translation, quadratic", "pendulum": "hinge"}  # fallback of a model for objects that do not swing
 _SAME = 1e-9  # tolerance for equal times
@@ -58,7 +58,7 @@ def measure(
     bodies = ground_truth_poses.bodies(scene, ground_truth)
     later = ground_truth.times > scene.t_max + _SAME
     if not bodies or not later.any():
-        why = "none of them lies past t_max" if bodies else "none of them was observed, or of no object of the scene"
+        why = "none of them lies past t_max" if bodies else "none of them belongs to an observed object of the scene"
         return [], [f"poses: the data set has true poses, but {why}"]
     rows, absent = _of_modes(scene, bodies, later, rounds, clock)
     some, missing = _of_models(scene, bodies, later, rounds, clock)
@@ -120,7 +120,7 @@ def _of_models(
         rested = sum(fit is not None and fit.rested for fit in some.fits)
         notes = [f"chosen for {count} of {len(bodies)}"] if count else []
         notes += [f"{rested} found at rest"] if rested else []
-        notes += [f"{STEADY[name]} where nothing swings"] if name in STEADY else []
+        notes += [f"{STEADY[name]} if nothing swings"] if name in STEADY else []
         label = {"task": "poses", "mode": "rigid/fitted", "method": name, "setting": setting, "note": "; ".join(notes)}
         rows += errors(scene, bodies, later, predicted, {**label, **timed[name].columns(clock), "ms_once_cpu": some.ms})
     band, absent = _band(bodies, chosen, times, taus)

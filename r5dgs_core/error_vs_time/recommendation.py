@@ -16,11 +16,11 @@ from .run_spread import Key
 
 @dataclass(frozen=True)
 class Goal:
-    """What a task is judged by.
+    """Criterion of the recommendation for a task.
 
     Attributes:
         kind: Kind of error.
-        slack: Largest loss against the best method that speed is worth, in the unit of the error.
+        slack: Maximum loss against the best method that is accepted for speed, in the unit of the error.
         form: Formats an error.
         loss: Formats a difference of errors.
         seconds: True if times are in seconds.
@@ -62,8 +62,8 @@ def of(rows: Sequence[Row], lines: Mapping[Key, Line]) -> list[dict[str, Any]]:
     """Return a recommendation for each task with timed rows of one scene.
 
     The fastest method whose mean loss against the best is at most `Goal.slack` is recommended. Poses and families are
-    judged by the object with the largest error. Motion models that are used for all objects take no part, since only
-    the truth shows which of them is best.
+    judged by the object with the largest error. Rows of one motion model for all objects are excluded, because choosing
+    the best of them requires the truth.
 
     Args:
         rows: Rows of the scene, combined over its runs.

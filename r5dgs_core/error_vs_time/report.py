@@ -43,7 +43,7 @@ SHARE = 1 / 3  # horizon past t_max without test views, as a share of the observ
 
 @dataclass(frozen=True)
 class Options:
-    """What to measure.
+    """Scope and settings of a measurement.
 
     Attributes:
         tasks: Tasks from `report_rows.TASKS`.
@@ -93,14 +93,14 @@ def measure(
     Args:
         scene: The scene.
         dataset: Its data set, with images and true poses to compare with; None skips these comparisons.
-        options: What to measure; all of the split "test" if None.
+        options: Scope and settings; if None, all tasks on the split "test".
         place: Path of its run folder or scene file, or None.
         progress: Called with events.
     """
     options = options or Options()
     tau, why = horizon(scene, dataset)
     rows: list[Row] = []
-    absent = [f"{task}: not asked for" for task in report_rows.TASKS if task not in options.tasks]
+    absent = [f"{task}: not requested" for task in report_rows.TASKS if task not in options.tasks]
     for task in (task for task in report_rows.TASKS if task in options.tasks):
         if task != "images":
             progress({"event": "report", "text": task})
@@ -113,8 +113,8 @@ def measure(
     busy = _busy(rows)
     if busy > timing.BUSY and options.clock == "wall":
         absent.append(
-            f"wall times of an idle machine: here they are {busy:.1f} times the processor times (median); "
-            "measure again when nothing else runs, or with --clock cpu"
+            f"wall times of an idle machine: these are {busy:.1f} times the processor times (median); "
+            "measure again without other load, or with --clock cpu"
         )
     views = () if dataset is None else dataset.views(options.splits[0]) or dataset.train
     facts = {
@@ -139,7 +139,7 @@ def collect(measured: Sequence[RunMeasurement], options: Options) -> dict[str, A
 
     Returns:
         In JSON types ``rounds clock machine kinds scenes rows recommendations``. ``scenes`` has the facts of a scene
-        (`RunMeasurement`), its ``name``, ``runs`` and what is ``absent``. ``rows`` holds `report_rows.Row`, with
+        (`RunMeasurement`), its ``name``, ``runs`` and ``absent`` measurements. ``rows`` holds `report_rows.Row`, with
         medians and ranges over the runs. The rows of each run are in ``runs`` if there are several.
     """
     scenes, rows, recommendations = [], [], []

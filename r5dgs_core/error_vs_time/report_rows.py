@@ -25,8 +25,8 @@ class Kind:
     Attributes:
         label: Label for users.
         more_is_better: True if larger values are better, as for PSNR.
-        least: Smallest difference that counts, in the unit of the error.
-        least_share: Smallest difference that counts, as a share of the larger error.
+        least: Minimum difference that counts, in the unit of the error.
+        least_share: Minimum difference that counts, as a share of the larger error.
     """
 
     label: str
@@ -35,7 +35,7 @@ class Kind:
     least_share: float = 0.0
 
 
-# Differences below the last printed digit do not count, nor do those of rounding.
+# Differences below the last printed digit, or due to rounding, do not count.
 KINDS = {
     "position": Kind("position error, share of the object's size", least=1e-9, least_share=0.01),
     "rotation": Kind("rotation error, degrees", least=1e-7, least_share=0.01),

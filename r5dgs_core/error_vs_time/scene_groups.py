@@ -9,7 +9,7 @@ _IGNORED = {"train.seed", "train.threads"}  # keys of the configuration that may
 
 
 def identity(name: str, provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the runs of a group share: name of the scene, digest of its data, and the configuration by key."""
+    """Return the common properties of the runs of a group: scene name, digest of the data, configuration by key."""
     sections = provenance.get("config") or {}
     keys = {f"{section}.{key}": value for section, values in sections.items() for key, value in values.items()}
     shared = {key: value for key, value in keys.items() if key not in _IGNORED}

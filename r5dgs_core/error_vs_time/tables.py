@@ -97,7 +97,7 @@ def markdown(report: dict[str, Any]) -> str:
         parts.append("## Not measured\n\n" + "\n".join(f"- {text}" for text in missing) + "\n")
     machine = report["machine"]
     parts.append(
-        f"## How\n\nMedians of {report['rounds']} rounds in which all methods took turns; fronts by "
+        f"## Method\n\nMedians of {report['rounds']} rounds in which all methods took turns; fronts by "
         f"{CLOCKS[report['clock']]}. On {machine['processor']}, "
         f"{machine['cores']} usable cores, {machine['raster_threads']} threads of the rasterizer, "
         f"GPU: {machine['gpu'] or 'none'}. Docs: docs/user/report.md.\n"

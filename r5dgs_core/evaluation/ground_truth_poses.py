@@ -58,7 +58,7 @@ def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> t
     """Return the motion groups of a scene whose true motion is known.
 
     Args:
-        ground_truth: True poses. For a scene with discovered objects, positions decide which object is which.
+        ground_truth: True poses. Discovered objects of a scene are matched to the true ones by position.
         every: Return all bodies of an object instead of only the one with most of its Gaussians.
 
     Returns:
@@ -113,9 +113,9 @@ def pose(pivot: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def _renumbered(scene: Scene, ground_truth: GroundTruth) -> GroundTruth:
     """Return the ground truth of the objects that a scene discovered, renumbered to the scene's ids.
 
-    Discovered objects have no names, so positions decide: at the true time nearest to the bind state, objects and
-        groups
-    are assigned one to one with minimal total distance. Pairs further apart than the radius of the group are dropped.
+    Discovered objects have no names, so they are matched by position: at the true time nearest to the bind state,
+    objects and groups are assigned one to one with minimal total distance. Pairs further apart than the radius of the
+    group are dropped.
     """
     bodies = [group for group in scene.groups if group.role == "body" and group.object_id > 0]
     at = int(np.argmin(np.abs(ground_truth.times - scene.t_max)))

@@ -9,7 +9,7 @@ import numpy as np
 
 RADII = (7.0, 13.0, 20.0, 30.0, 42.0, 56.0, 72.0, 90.0, 112.0, 138.0, 170.0)  # tried distances, pixels
 ANGLES = np.radians([0, 180, 30, 330, 150, 210, 60, 300, 120, 240, 90, 270])  # tried directions, radians
-MARGIN = 1.5  # least distance between boxes, pixels
+MARGIN = 1.5  # minimum distance between boxes, pixels
 
 
 def place(

@@ -197,7 +197,7 @@ def _recorded(scene: Scene, key: str) -> dict[str, Any] | None:
 def _caption(scene: Scene, rows: Sequence[ObjectRow], views: int) -> str:
     parts = [f"count: Gaussians; pixels: mean over {views} views"]
     if any(row.rigid_rms is not None for row in rows):
-        parts.append("bends: rms distance from the rigid motion, of the radius; - where rigid by construction")
+        parts.append("bends: rms distance from the rigid motion, of the radius; - if rigid by construction")
     else:
         parts.append("all members move rigidly by construction: no residual")
     if any(row.confidence is not None for row in rows):

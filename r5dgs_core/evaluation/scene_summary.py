@@ -12,7 +12,7 @@ from ..motion.models import KINDS
 from ..scene import quality
 from ..scene.scene import MotionGroup, Scene
 
-STILL = 0.05  # largest motion of a still object, as a share of its radius
+STILL = 0.05  # maximum motion of a still object, as a share of its radius
 
 
 def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:

@@ -97,7 +97,8 @@ FORMAT = registry.Format(
 
 
 def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Splats:
-    """Read a PLY of Gaussians, ascii or binary of either byte order. Raises `SceneFileError` naming what is missing.
+    """Read a PLY of Gaussians, ascii or binary of either byte order. Raises `SceneFileError` if it is damaged or lacks
+    a column.
 
     Args:
         path: The file.

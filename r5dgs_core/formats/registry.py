@@ -43,8 +43,8 @@ class Format:
         name: Name on the command line.
         label: Name in Blender's menus.
         suffix: Suffix of its files, with the dot.
-        keeps: What a file holds of the scene.
-        loses: What it does not hold.
+        keeps: Parts of a scene that a file holds.
+        loses: Parts of a scene that a file does not hold.
         write: Writes a scene and yields the path of each file when it is complete. Files are replaced atomically.
         per_frame: True if each frame is a file of its own.
         has_objects: True if a file holds objects, so that `Options.object_ids` applies.

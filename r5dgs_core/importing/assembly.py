@@ -17,7 +17,7 @@ from ..scene.scene import Classifier, Dynamics, Gaussians, MotionGroup, Residual
 from .foreign_run import Foreign, State
 
 CHUNK = 16384  # rows per evaluation at all knots; bounds the memory
-STILL = 1e-4  # motion of a Gaussian's ellipsoid that is dropped, as a share of the scene's extent
+STILL = 1e-4  # maximum motion of a Gaussian's ellipsoid that is dropped, as a share of the scene's extent
 
 Progress = Callable[[int, int], None]
 
@@ -49,7 +49,7 @@ def sample(foreign: Foreign, times: np.ndarray, tolerance: float, progress: Prog
     Args:
         foreign: A run with a `state`.
         times: Knots, the last is t_max. [S]
-        tolerance: Largest motion of a static Gaussian's ellipsoid, world units.
+        tolerance: Maximum motion of a static Gaussian's ellipsoid, world units.
         progress: Called with the number of finished Gaussians and their total.
     """
     assert foreign.state is not None

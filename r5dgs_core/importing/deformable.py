@@ -16,7 +16,7 @@ from . import networks, weights
 from .foreign_run import SPLATTING_NEAR, Foreign, State
 from .run_folder import RunFolder
 
-_SMALLEST = 1e-12  # smallest standard deviation, if exp(s) + ds vanishes, world units
+_SMALLEST = 1e-12  # minimum standard deviation, if exp(s) + ds vanishes, world units
 _ROUNDING = 1e-14  # share of the trace below which off-diagonal elements are rounding errors of float64
 _SWEEPS = 8  # Jacobi converges quadratically; float64 needs far fewer for 3 x 3
 

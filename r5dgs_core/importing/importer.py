@@ -22,7 +22,7 @@ from .foreign_run import Foreign
 from .run_folder import RunFolder
 
 MOST_KNOTS = 10_000  # limit without --knots
-ROUNDING = 1e-9  # smallest motion, as a share of the extent
+ROUNDING = 1e-9  # minimum motion, as a share of the extent
 _log = logging.getLogger(__name__)
 
 
@@ -125,7 +125,7 @@ def _among_cameras(scene: Scene, folder: Path) -> Scene:
     if not origin.any():
         return scene
     _log.warning(
-        "%s: the run lies far from the origin of its world; its Gaussians were stored to %.2g units there. "
+        "%s: the run is far from the origin of its world, so its positions are stored to %.2g units only. "
         "Train it nearer to the origin for sharp pictures",
         folder,
         np.spacing(np.float32(np.abs(origin).max())),
@@ -149,7 +149,7 @@ def _times(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: O
         knots = max(2, round(datasets.FRAMES_PER_UNIT * t_max) + 1)
         if knots > MOST_KNOTS:
             raise CheckpointError(
-                f"{run.folder}: expected a last time that {MOST_KNOTS} knots reach, found {t_max:g}; give their number "
+                f"{run.folder}: the last time {t_max:g} requires more than {MOST_KNOTS} knots; give their number "
                 "with --knots, or the time with --t-max"
             )
         return np.linspace(0.0, t_max, knots)

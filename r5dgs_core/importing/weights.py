@@ -103,7 +103,7 @@ def load(path: Path) -> Weights:
     except pickle.UnpicklingError as error:
         raise CheckpointError(
             f"{path}: refused, as it holds code or objects besides tensors ({_reason(error)}); "
-            "ask for a file that was saved with torch.save(model.state_dict(), ...)"
+            "use a file saved with torch.save(model.state_dict(), ...)"
         ) from error
     except Exception as error:  # torch raises many types for damaged files
         raise CheckpointError(f"{path}: cannot be read ({type(error).__name__}); is it truncated?") from error

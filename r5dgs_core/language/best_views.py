@@ -16,12 +16,12 @@ from ..render import highlight, scene_renderer, viewpoints
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
 
-VIEWS = 6  # most views per object
+VIEWS = 6  # maximum number of views per object
 _LOOK = 256  # longer side of the small pictures, pixels
-_CAMERAS = 8  # most cameras to try
+_CAMERAS = 8  # maximum number of cameras to try
 _TIMES = 4  # number of times to try
-_TRIED = 10  # most views per object that are also rendered without occluders
-_LEAST_PIXELS = 12  # smallest visible area in a small picture
+_TRIED = 10  # maximum number of views per object that are also rendered without occluders
+_LEAST_PIXELS = 12  # minimum visible area in a small picture
 _WANTED_SIDE = 32  # object size in the camera's picture, pixels; smaller objects get a lower score
 _CUT = 0.3  # factor on the score of an object cut by the border
 _AGAIN = 0.4  # factor on the score for each chosen view of the same camera
@@ -38,7 +38,7 @@ class Sighting:
         camera: The scene's camera.
         t: Scene time.
         box: Square around the object: left, top, right, bottom in pixels of the camera.
-        worth: Score: visible pixels, reduced for objects that are occluded, cut or tiny.
+        worth: Score: number of visible pixels, reduced for objects that are occluded, cut or tiny.
     """
 
     camera: Camera
@@ -60,7 +60,7 @@ def find(
         progress: Called with the number of finished pictures and their total.
 
     Returns:
-        At most `VIEWS` per object, the best first; an empty list for objects that no camera sees.
+        At most `VIEWS` per object, the best first; an empty list for objects that no camera shows.
     """
     seen: dict[int, list[tuple[Sighting, np.ndarray]]] = {object_id: [] for object_id in object_ids}
     places = _standpoints(scene)

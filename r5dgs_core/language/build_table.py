@@ -32,7 +32,7 @@ class Made:
 
     Attributes:
         scene: The scene.
-        notes: Sentences for the user: objects without an embedding and why.
+        notes: Sentences for the user: objects without an embedding, with the reason.
     """
 
     scene: Scene

@@ -1,4 +1,4 @@
-"""Calibration of match thresholds: the cosine from which a phrase matches an object, estimated from common nouns.
+"""Calibration of match thresholds: the minimum cosine of a phrase and an object, estimated from common nouns.
 
 Cosines of one encoder lie close together, and their level differs between objects. A cosine is therefore standardized
 by the mean and standard deviation of the nouns' cosines with the same embedding. The limit in these units is a quantile
@@ -29,8 +29,8 @@ class Calibration:
     """Thresholds estimated from the cosines of nouns.
 
     Attributes:
-        limit: Smallest match, in standard deviations above the mean.
-        thresholds: Smallest cosine of a match, for each embedding. [R]
+        limit: Minimum of a match, in standard deviations above the mean.
+        thresholds: Minimum cosine of a match, for each embedding. [R]
         margin: Accepted distance of further matches below a query's best cosine.
     """
 

@@ -1,7 +1,8 @@
 """Taxonomy of common nouns.
 
-A lookup table answers these words without an encoder, and is calibrated with them, as any scene contains few of them.
-Format: one line per kind, ``kind < broader kind: members``; "_" joins the parts of a word.
+Lookup tables store embeddings of these nouns, so that searching them needs no encoder, and are calibrated with them,
+because any scene contains few of them. Format: one line per kind, ``kind < broader kind: members``; "_" joins the parts
+of a word.
 """
 
 from __future__ import annotations

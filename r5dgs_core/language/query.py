@@ -20,7 +20,7 @@ def find(
         text: One or several things: "red mug", "mugs and lemon".
         encoder: Encoder for words that the scene does not store: the one that made its table. Names, aliases and stored
             words work without it.
-        threshold: Smallest score of a match.
+        threshold: Minimum score of a match.
 
     Raises:
         BackendError: The encoder did not make the scene's table, or the scene has no table.
@@ -40,8 +40,8 @@ def check(stored: EncoderCard, asked: EncoderCard, place: str) -> None:
     """Raise `BackendError` if an encoder is not the one that made a table."""
     if stored.digest != asked.digest or stored.kind != asked.kind:
         raise errors.BackendError(
-            f"{place}: its lookup table was made by {_said(stored)}, and cannot be used with {_said(asked)}; give "
-            "the one that made it, or make the table again: r5dgs lookup SCENE --encoder DIR"
+            f"{place}: its lookup table was made by {_describe(stored)}, and cannot be used with {_describe(asked)}; "
+            "give the one that made it, or make the table again: r5dgs lookup SCENE --encoder DIR"
         )
 
 
@@ -61,5 +61,5 @@ def _embed(scene: Scene, encoder: encoder_base.Encoder | None) -> object_search.
     return lambda phrase: encoder_base.embed_phrases(encoder, [phrase])[0]
 
 
-def _said(card: EncoderCard) -> str:
+def _describe(card: EncoderCard) -> str:
     return f"the {card.kind} encoder {card.name!r} (SHA-256 {card.digest[:12]}...)"

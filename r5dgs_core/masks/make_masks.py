@@ -227,7 +227,7 @@ def _begin(views: Sequence[datasets.View], backend: MaskBackend, folder: Path, o
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise errors.DatasetError(f"{folder}: cannot be made: {error}") from error
+        raise errors.DatasetError(f"{folder}: cannot be created: {error}") from error
     mask_notes.write(fresh, folder)
     _remove(folder / OBJECTS)  # names of the replaced ids
     return fresh

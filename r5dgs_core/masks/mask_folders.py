@@ -93,8 +93,8 @@ class Captured(Precomputed):
         if lacking or self._colors:
             what = f"{lacking[0]} has no mask" if lacking else "its masks are coded by colour"
             raise errors.DatasetError(
-                f"{root}: expected a data set of the capture, but {what}. Remedy: --backend precomputed takes such "
-                "masks"
+                f"{root}: expected a data set of the capture, but {what}. Remedy: use --backend precomputed for "
+                "such masks"
             )
         self._names = read_objects(Path(root))[0]
 
@@ -106,6 +106,6 @@ class Captured(Precomputed):
             if foreign:
                 raise errors.DatasetError(
                     f"{self._paths[view.name]}: id {min(foreign)} has no name in objects.json, as those of a capture "
-                    "have. Remedy: --backend precomputed takes such masks"
+                    "have. Remedy: use --backend precomputed for such masks"
                 )
             yield ids

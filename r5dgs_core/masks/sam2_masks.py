@@ -21,9 +21,9 @@ class TrackSettings:
 
     Attributes:
         key_frames: Number of images in which all objects are segmented.
-        overlap: IoU from which a segment of a key frame is taken for an already tracked object.
-        objects: Most objects per video.
-        together: Objects tracked at once; bounds the memory.
+        overlap: Minimum IoU at which a segment of a key frame counts as an already tracked object.
+        objects: Maximum number of objects per video.
+        together: Number of objects tracked at once, which bounds the memory.
         gap: Longest gap in an object's track, in images, whose likely pixels are marked unknown instead of background.
     """
 

@@ -26,10 +26,10 @@ class SegmentSettings:
 
     Attributes:
         points: Grid points per side.
-        score: Smallest IoU predicted by the network.
-        stability: Smallest IoU of the masks at a lower and a higher threshold.
-        min_area: Smallest area, as a share of the image; smaller masks are noise.
-        max_area: Largest area, as a share of the image; larger masks are background.
+        score: Minimum IoU predicted by the network.
+        stability: Minimum IoU of the masks at a lower and a higher threshold.
+        min_area: Minimum area, as a share of the image; smaller masks are noise.
+        max_area: Maximum area, as a share of the image; larger masks are background.
     """
 
     points: int = 32
@@ -93,7 +93,7 @@ def new_ones(segments: Sequence[Segment], known: Sequence[np.ndarray], overlap: 
     Args:
         segments: Found segments.
         known: Masks of known objects. Sequence of [s, s] bool
-        overlap: IoU from which a segment matches a mask.
+        overlap: Minimum IoU at which a segment matches a mask.
     """
     pairs = [(segment, segment.mask) for segment in segments]
     return [segment for segment, mask in pairs if all(iou(mask, other) < overlap for other in known)]

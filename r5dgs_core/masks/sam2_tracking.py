@@ -130,7 +130,7 @@ class Canvas:
         self._sure[index][better] = sure[better]
 
     def mark_gaps(self, longest: int) -> None:
-        """Mark background pixels as unknown in images that lack an object which was there before and after.
+        """Mark background pixels as unknown in images that lack an object of earlier and later images.
 
         The object may be hidden by something that is not an object, or lost by the tracker.
 

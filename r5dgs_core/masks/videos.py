@@ -10,8 +10,8 @@ import numpy as np
 from ..data import dataset as datasets
 from ..data import images
 
-STEP_DEG = 15.0  # largest turn of a camera between two images of a video, degrees
-STEP = 0.3  # largest step of a camera between them, as a share of its distance from the common focus
+STEP_DEG = 15.0  # maximum turn of a camera between two images of a video, degrees
+STEP = 0.3  # maximum step of a camera between them, as a share of its distance from the common focus
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ class DeformationField(nn.Module):
         generator: Source of the initial weights.
 
     Source: TRACE and FreeGave (f_def), after Deformable 3D Gaussians (Yang et al. 2024). Unlike there, heads start at
-        zero, so that nothing jumps when the deformation is enabled.
+        zero, so that enabling the deformation changes nothing.
     """
 
     def __init__(self, shape: FieldShape, generator: torch.Generator):

@@ -51,7 +51,7 @@ def run_objects(
         target: Run folder or ``.r5dgs`` file.
         data: Data set whose views are used to count pixels and whose masks are compared; that of the run if None.
         legend: PNG file of the picture, or None.
-        camera: Name or number of the picture's camera; the one that sees most objects if None.
+        camera: Name or number of the picture's camera; the one that shows most objects if None.
         t: Scene time of the picture; if None, the best of the first, middle and last observed time.
         mode: Playback mode past t_max.
         size: Pixels of the picture along its longer side.

@@ -69,9 +69,8 @@ def run_query(
         path: The scene file.
         text: One or more things to find.
         encoder: Folder of the encoder that made the scene's lookup table, or "text". It embeds phrases that match
-        neither a name nor a stored word. An encoder other than the table's is refused, even if no phrase needs an
-        encoder. If None, the encoder
-            of the user's settings is used if it made the table.
+            neither a name nor a stored word. Any other encoder is an error, even if no phrase needs one. If None, the
+            encoder of the user's settings is used if it made the table.
         threshold: Minimum score of a match; the default threshold if None.
         as_json: Print JSON instead of a table.
         render: PNG file of the picture, or None.
@@ -120,7 +119,7 @@ def _find(
     if found:
         note = "\n".join(f"nothing matches {phrase!r}" for phrase in query.unanswered(scene, text, opened, least))
     elif object_search.is_nothing(object_search.labels_of(scene), text):
-        note = f"{text.strip()!r} asks for no object"
+        note = f"{text.strip()!r} selects no objects"
     else:
         note = _explain_nothing(scene, text, unknown if encoder is None and opened is None else [])
     names = {item.id: item.name for item in scene.objects}
@@ -151,15 +150,15 @@ def _explain_nothing(scene: Scene, text: str, unknown: Sequence[str]) -> str:
     """Return the message for a text without matches; ``unknown`` are the phrases that need an encoder."""
     from ...search import object_search
 
-    said = object_search.explain_nothing(
+    reason = object_search.explain_nothing(
         [label for label in object_search.labels_of(scene) if label.object_id > 0], text
     )
     if not unknown:
-        return said
-    asked = " and ".join(repr(phrase) for phrase in unknown)
+        return reason
+    phrases = " and ".join(repr(phrase) for phrase in unknown)
     if scene.lookup is None:
-        return f"{said}\nthe scene has no lookup table, only names count; make one: r5dgs lookup SCENE --encoder DIR"
-    return f"{said}\n{asked} is not among the stored words; give the table's encoder for others: --encoder DIR"
+        return f"{reason}\nonly names are searched without a lookup table; make one: r5dgs lookup SCENE --encoder DIR"
+    return f"{reason}\n{phrases} is not among the stored words; give the table's encoder for others: --encoder DIR"
 
 
 def _user_encoder(card: EncoderCard) -> Any:

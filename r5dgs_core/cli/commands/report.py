@@ -15,8 +15,8 @@ NAME = "report"
 SHORT = "measure error against run time, or test numerical stability"
 LONG = (
     "Measure error against run time of motion models, playback modes, rasterizer settings and training. Several runs\n"
-    "of a scene are combined into medians with their spread. With --stability,\n"
-    "run the stiff and extreme cases of the motion code instead; the exit status is 1 if a case fails."
+    "of a scene are combined into medians with their spread. With --stability, run the stiff and extreme cases of\n"
+    "the motion code instead; the exit status is 1 if a case fails."
 )
 EXAMPLE = "RUN [RUN ...] --out report"
 PAGE = "user/report.md"
@@ -138,7 +138,7 @@ def _check_targets(targets: Sequence[tuple[Path, Path | None]]) -> None:
     names = [target.resolve() for target, _ in targets]
     twice = next((target for target, _ in targets if names.count(target.resolve()) > 1), None)
     if twice is not None:
-        raise errors.UsageError(f"report: {twice}: is given twice; its spread would be too small")
+        raise errors.UsageError(f"report: {twice}: is given twice, which would make the spread too small")
 
 
 def run_stability(json_path: Path | None = None, *, threads: int | None = None, progress_kind: str = "none") -> bool:

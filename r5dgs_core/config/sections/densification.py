@@ -18,9 +18,9 @@ class DensifySection:
         stop: Last step of densification, as a share of the run.
         every: Steps between two rounds.
         gradient: Mean screen-space gradient above which a Gaussian grows, per half image width (as in 3DGS).
-        share: Largest share of the Gaussians that grow in a round.
+        share: Maximum share of the Gaussians that grow in a round.
         split_pixels: Standard deviation in pixels above which a growing Gaussian is split; smaller ones are cloned.
-        max_gaussians: Largest number of Gaussians. 0 chooses it from the image size (3/4 of an image's pixels, at most
+        max_gaussians: Maximum number of Gaussians. 0 chooses it from the image size (3/4 of an image's pixels, at most
             60000).
         prune_opacity: Opacity below which a Gaussian is removed.
         prune_width: Standard deviation, as a share of the image width, above which a Gaussian is removed.
@@ -51,7 +51,7 @@ class DensifyDefaultSection:
         start: Step after which Gaussians grow.
         stop: Share of the run after which they no longer grow (15000 of 30000 steps).
         every: Steps between two rounds.
-        gradient: Mean screen-space gradient from which on a Gaussian grows, per half image width.
+        gradient: Minimum mean screen-space gradient at which a Gaussian grows, per half image width.
         percent_dense: Standard deviation, as a share of the cameras' extent, above which a growing Gaussian is split;
             smaller ones are cloned.
         prune_opacity: Opacity below which a Gaussian is removed.
@@ -59,7 +59,7 @@ class DensifyDefaultSection:
         prune_extent: Standard deviation, as a share of the cameras' extent, above which a Gaussian is removed, after
             the first reset of the opacities.
         reset_every: Steps between two resets of the opacities while Gaussians grow. 0 turns resets off.
-        reset_opacity: Largest opacity after a reset.
+        reset_opacity: Maximum opacity after a reset.
     """
 
     start: int = 500
@@ -80,7 +80,7 @@ class DensifyMcmcSection:
 
     Attributes:
         start: Step after which Gaussians are relocated and added.
-        stop: Share of the run after which they no longer are (25000 of 30000 steps).
+        stop: Share of the run after which neither happens (25000 of 30000 steps).
         every: Steps between two rounds.
         grow: Share of the Gaussians that a round adds, up to ``densify.max_gaussians``.
         dead_opacity: Opacity below which a Gaussian is dead; dead Gaussians are relocated onto live ones.

@@ -1,4 +1,4 @@
-"""Sections of the motion: deformation field, discovery of what moves, residual motion."""
+"""Sections of the motion: deformation field, discovery of moving objects, residual motion."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class FieldSection:
         width: Width of the hidden layers of both networks, at the depth of ``size``. 0 takes that of ``size``.
         horizon: Last scene time of the deformation field; later observed frames train the extrapolation. 0 leaves out
             the last fifteenth of the observed span (0.70 of 0.75 in NVFi).
-        step: Time that the TRD bridges in a training step: a scene time if all times lie in [0, 1], else a share of the
-            observed span. 0 uses two observed intervals.
+        step: Time step of the TRD in training: a scene time if all times lie in [0, 1], else a share of the observed
+            span. 0 uses two observed intervals.
         warm_up: Steps without deformation at the start of the run, which make the first time the canonical state.
         trd_share: Share of the steps up to the horizon that train field and TRD together; the others train the field
             alone. 1 is TRACE's scheme.
@@ -77,7 +77,7 @@ class DiscoverySection:
         iterations: Steps of the short run. 0 trains data without masks as one static scene.
         gate: Share of the short run after which Gaussians at rest are frozen.
         still: Displacement over the observed times below which a Gaussian is at rest, normalised units.
-        fewest: Smallest number of Gaussians of an object; smaller parts join the background.
+        fewest: Minimum number of Gaussians of an object; smaller parts join the background.
     """
 
     iterations: int = 1200

@@ -1,4 +1,4 @@
-"""Section of what the scene needs."""
+"""Section of the needs of a scene."""
 
 from __future__ import annotations
 

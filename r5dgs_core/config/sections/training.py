@@ -29,8 +29,8 @@ class TrainSection:
         checkpoint_every: Steps between checkpoints.
         log_every: Steps between lines of the log.
         probe_every: Steps between measurements of the PSNR on held-out views (split ``val``). 0 turns them off.
-        probe_views: Largest number of held-out views to measure.
-        shading: Learn how the colours of an object change as it turns in fixed light.
+        probe_views: Maximum number of held-out views to measure.
+        shading: Learn the change of an object's colours as it turns in fixed light.
         shadows: Learn shadow Gaussians, which follow their objects on the supporting plane.
     """
 
@@ -55,7 +55,7 @@ class DataSection:
 
     Attributes:
         masks: Folder with the masks of the training views, inside the data set or elsewhere. ``none`` ignores masks.
-        min_registered: Smallest share of the images that a COLMAP reconstruction must have registered.
+        min_registered: Minimum share of the images that a COLMAP reconstruction must have registered.
     """
 
     masks: str = "object_mask"
@@ -74,7 +74,7 @@ class InitSection:
         shadow_points: Gaussians per shadow.
         sweep_depths: Depths per ray that the plane sweep compares.
         opacity: Initial opacity of objects and background.
-        min_mask_pixels: Size of the smallest mask that helps to locate an object, as a share of the image's pixels.
+        min_mask_pixels: Minimum size of a mask that is used to locate an object, as a share of the image's pixels.
     """
 
     placement: str = "scene"
@@ -109,7 +109,7 @@ class RatesSection:
         decay: Final learning rate as a factor of the initial one; the decay is exponential. It applies to the geometry
             (centres, tracks, light, residuals) and the appearance (sizes, colours, opacities, sky).
         decay_networks: The same factor for the two networks of ``field``.
-        decay_floor_appearance: Smallest factor to which the decay lowers the rates of the appearance.
+        decay_floor_appearance: Minimum factor to which the decay lowers the rates of the appearance.
         decay_from: Share of the run at which the decay begins (for ``residual``: ``residual.start``).
     """
 

@@ -19,7 +19,7 @@ def detect(root: Path) -> bool:
 
 
 def read(root: Path, min_registered: float = 0.0, guard: findings.Guard = findings.STRICT) -> RawDataset:
-    """Read the camera files. A split without a file is empty, and keys of earlier splits win.
+    """Read the camera files. A split without a file is empty, and keys of earlier splits take precedence.
 
     Args:
         root: Folder of the data set.

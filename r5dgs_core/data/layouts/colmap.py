@@ -17,7 +17,7 @@ from pathlib import Path
 from ... import errors, findings
 from .raw_dataset import RawDataset
 
-MIN_REGISTERED = 0.5  # smallest share of registered images; fewer mean a failed reconstruction
+MIN_REGISTERED = 0.5  # minimum share of registered images; fewer mean a failed reconstruction
 
 
 def detect(root: Path) -> bool:
@@ -42,8 +42,8 @@ def read(root: Path, min_registered: float = MIN_REGISTERED, guard: findings.Gua
 
     Args:
         root: Folder of the data set.
-        min_registered: Smallest share of the images that must have a pose. With ``times.json``, images that it does not
-            list do not count.
+        min_registered: Minimum share of the images that must have a pose. Images missing in ``times.json`` do not
+            count.
         guard: Entered around each image that may lack a pose or a time.
 
     Raises:

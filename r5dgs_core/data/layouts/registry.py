@@ -1,4 +1,4 @@
-"""The known layouts, and the one that a folder has."""
+"""Registry of the layouts, and detection of the layout of a folder."""
 
 from __future__ import annotations
 

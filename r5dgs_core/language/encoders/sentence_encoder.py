@@ -11,8 +11,8 @@ from ... import errors, extras
 from ...scene.lookup_table import EncoderCard
 from . import encoder_base
 
-# Such models are trained on pairs of captions, so templates that are sentences separate things better. Templates that
-# mention a person or a hand match persons and hands everywhere.
+# Sentence models are trained on pairs of captions, so templates that are sentences separate objects better. Templates
+# that mention a person or a hand would match persons and hands in every scene.
 TEMPLATES = ("a photo of a {}", "A {} is in the picture.", "looking at a {}")
 _BATCH = 64
 _TYPES = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta", "albert", "electra", "deberta-v2", "modernbert")
@@ -67,7 +67,7 @@ class SentenceEncoder:
     def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
         """Raise `BackendError`, as sentence models embed text only."""
         raise errors.BackendError(
-            f"encoder {self.card.name}: a sentence model cannot look at pixels; give a CLIP or SigLIP folder for that"
+            f"encoder {self.card.name}: a sentence model cannot embed images; use a CLIP or SigLIP folder"
         )
 
     def _texts(self, texts: Sequence[str]) -> np.ndarray:

@@ -181,7 +181,7 @@ def test_a_need_can_be_overridden_when_baking(made, tmp_path, capsys):
         scene_file.read(bare).gaussians.identities is None and scene_file.read(made[1]).gaussians.identities is not None
     )
     wrong = ("bake", made[0], "--out", bare, "--set", "train.seed=1")
-    assert "bake takes needs" in complaint(capsys, *wrong, status=ExitStatus.USAGE)
+    assert "bake accepts only needs" in complaint(capsys, *wrong, status=ExitStatus.USAGE)
 
 
 def test_an_unknown_mode_is_an_error_that_names_the_known_ones(made, capsys):

@@ -94,7 +94,7 @@ def test_invalid_picture_paths_are_rejected_before_the_work(path, capsys, tmp_pa
     monkeypatch.setattr(scene_file, "read", lambda *_: pytest.fail("work began"))
     for option, command in (("--legend", ["objects", path]), ("--render", ["query", path, "mug"])):
         assert "ends in .png" in complaint(capsys, *command, option, tmp_path / "x.jpg", status=ExitStatus.USAGE)
-        assert "make it first" in complaint(capsys, *command, option, tmp_path / "no" / "x.png")
+        assert "create it first" in complaint(capsys, *command, option, tmp_path / "no" / "x.png")
         (tmp_path / "folder.png").mkdir(exist_ok=True)
         assert "expected a file" in complaint(capsys, *command, option, tmp_path / "folder.png")
         small = (*command, option, tmp_path / "x.png", "--size", 5)

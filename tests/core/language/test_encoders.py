@@ -119,7 +119,7 @@ def test_sentence_pooling_follows_the_configuration_of_the_folder(opened, tmp_pa
 
 
 def test_embedding_images_with_a_sentence_model_raises(opened):
-    with pytest.raises(errors.BackendError, match="cannot look at pixels; give a CLIP"):
+    with pytest.raises(errors.BackendError, match="cannot embed images; use a CLIP"):
         opened["text"].embed_images([picture(0)])
 
 

@@ -139,5 +139,5 @@ def test_unknown_phrases_that_are_left_out_are_asked_of_the_encoder(scene):
 def test_the_command_reports_a_prompt_that_selects_no_object(scene, tmp_path, capsys):
     path = scene_file.write(scene, tmp_path / "scene.r5dgs")
     assert query_command.run_query(path, "none") == []
-    assert "'none' asks for no object" in capsys.readouterr().out
+    assert "'none' selects no objects" in capsys.readouterr().out
     assert len(query_command.run_query(path, "not the mug")) == len(ALL) - 1

@@ -214,7 +214,7 @@ def test_the_exit_code_follows_the_rows(monkeypatch, tmp_path, capsys):
 def test_an_unwritable_path_is_rejected_before_the_work(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(stability, "run", lambda *_, **__: pytest.fail("ran"))
     assert main.main(["report", "--stability", "--json", str(tmp_path / "none" / "rows.json")]) == 3
-    assert "make it first" in capsys.readouterr().err
+    assert "create it first" in capsys.readouterr().err
 
 
 def test_scenes_of_the_table_are_scenes_that_a_file_may_hold():
