@@ -128,7 +128,7 @@ def describe(event: Event) -> str:
     if "iterations" in event and "loss" not in event:
         parts.append(f"{event['iterations']} steps")
     if event.get("from"):
-        parts.append(f"going on at step {event['from']}")
+        parts.append(f"continuing at step {event['from']}")
     if "total" in event:
         parts.append(f"of {event['total']} {event.get('unit', 'images')}")
     return terminal.printable(", ".join(parts))

@@ -52,7 +52,7 @@ CODES: dict[str, Code] = {
     "S10": Code(WARNING, "object without Gaussians", "train longer, or check its masks"),
     "S11": Code(WARNING, "Gaussians larger than the scene", "train longer, or delete them in Blender"),
     "S12": Code(WARNING, "name empty or with control characters", "rename the object with 'r5dgs name'"),
-    "S13": Code(WARNING, "motion leaves the range of numbers past t_max", "lower the rates under Motion in Blender"),
+    "S13": Code(WARNING, "motion is not finite past t_max", "lower the rates under Motion in Blender"),
     "S14": Code(WARNING, "motion too fast for keys", "lower the rates, or train with more frames per unit of time"),
     "S15": Code(WARNING, "frames past Blender's last one", "train with fewer frames per unit of time"),
     "S16": Code(WARNING, "nearly all Gaussians transparent", "train longer"),

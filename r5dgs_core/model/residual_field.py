@@ -157,7 +157,7 @@ def spread(
         motion_ids: Their motion groups. [N] int64
         opacities: Members below `SEEN_OPACITY` get no node, unless the body has no others. [N]
         bodies: Motion groups that get nodes, if they have members.
-        count: Most nodes per body.
+        count: Maximum number of nodes per body.
         knots: Number of knots S.
     """
     nodes, owners = [means.new_zeros(0, 3)], [torch.zeros(0, dtype=torch.int64)]

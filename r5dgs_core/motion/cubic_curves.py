@@ -12,7 +12,7 @@ import numpy as np
 
 from . import rotations
 
-_ROUNDING = 1e-9  # largest relative change of a curve by a dropped key
+_ROUNDING = 1e-9  # maximum relative change of a curve by a dropped key
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,9 @@ def fit(
     Args:
         taus: Times since t_max, > 0, increasing. [S]
         quats: Rotations since t_max, unit wxyz, any sign. [S, 4]
-        displacements: Of the pivot since t_max, world units. [S, 3]
-        radius: Of the group, world units, > 0.
-        tolerance: Error that is good enough, world units.
+        displacements: Displacements of the pivot since t_max, world units. [S, 3]
+        radius: Radius of the group, world units, > 0.
+        tolerance: Accepted error, world units.
 
     Returns:
         The model, and its largest error at a point ``radius`` away from the pivot.

@@ -17,9 +17,9 @@ import numpy as np
 
 from . import rotations
 
-DISTINCT = 0.1  # least relative difference of moments that makes a visible tumble
-LINE = 1e-3  # smallest ratio of the smallest to the largest moment; collinear bodies are below it
-_GAP = 1e-9  # least relative gap between moments; Euler's solution divides by their differences
+DISTINCT = 0.1  # minimum relative difference of moments for a visible tumble
+LINE = 1e-3  # minimum ratio of the smallest to the largest moment; collinear bodies are below it
+_GAP = 1e-9  # minimum relative gap between moments; Euler's solution divides by their differences
 _SAMPLES = 256  # per period; the Fourier series converges like exp(-n), more slowly near a separatrix
 _LEAST = 1e-300
 _LEAST_M1 = 1e-20  # keeps spins off the separatrix, where the period is infinite
@@ -29,7 +29,7 @@ def inertia(points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray
     """Inertia of a point cloud about its centroid, scaled to trace 1; that of a ball if the cloud has no extent.
 
     Args:
-        points: In the world. [n, 3]
+        points: Positions in the world. [n, 3]
         weights: Masses, >= 0, or None for equal ones. [n]
 
     Returns:

@@ -62,7 +62,7 @@ class Band:
 
     Attributes:
         times: Scene times, increasing, the first is t_max. [H]
-        half_width: Half width of the place of a point of the body, world units. [H]
+        half_width: Half width of the position of a point of the body, world units. [H]
         half_angle: Half width of the rotation, rad. [H]
         level: Probability that the truth lies inside.
         predictable_until: Scene time after which the motion is not predictable; None if it is up to the last knot.
@@ -75,7 +75,7 @@ class Band:
     predictable_until: float | None = None
 
     def widths(self, times: np.ndarray) -> np.ndarray:
-        """Half widths of the place at scene times; constant after the last knot. [H]"""
+        """Half widths of the position at scene times; constant after the last knot. [H]"""
         return np.interp(times, self.times, self.half_width)
 
     def angles(self, times: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ class Band:
 
 @dataclass(frozen=True)
 class History:
-    """What the observed poses tell about a motion besides its model.
+    """Evidence of the observed poses on a motion, besides its model.
 
     Attributes:
         events: Changes of the motion, in order.

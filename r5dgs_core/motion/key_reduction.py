@@ -75,7 +75,7 @@ def reduce(
             time [S, 4], [S, 3]. It should be smooth between t0 and t1, except at the kinks.
         t0: First time.
         t1: Last time, > t0.
-        tolerance: Largest allowed position error of any point, world units, > 0.
+        tolerance: Maximum position error of any point, world units, > 0.
         radius: Largest distance of a point from the pivot, world units.
         kinks: Increasing times at which slopes jump. Those inside (t0, t1) get a key with the slopes of both sides, but
             not those within ``nearest`` of the previous one, and no more than one per `FEWEST_INTERVALS` of ``most``.
@@ -259,7 +259,7 @@ class _Curve:
     def _without_seams(self, positions: np.ndarray, seams: np.ndarray) -> np.ndarray:
         """Remove stripe boundaries that need no key.
 
-        Odd and even ones are tested alternately, so that no two neighbours are removed at once.
+        Odd and even boundaries are tested alternately, so that no two neighbours are removed at once.
         """
         parity = 0
         while len(seams):

@@ -75,13 +75,13 @@ def solve_all(
     Args:
         residuals: Function from parameters [L, K, P] and the starts [L] that they belong to, to residuals
             [L, K, S, D]. Both should be of order one, residuals in units of their noise. Steps to residuals that are
-            not finite are refused.
+            not finite are rejected.
         starts: Initial guesses, with finite residuals. [B, P]
         weights: Weights of the observations, > 0, or None for equal ones. [S]
         precision: Inverse standard deviations of the parameters about 0, for a Gaussian prior; None for no prior. [P]
         softness: Squared length of the residuals of an observation at which its weight is one half; infinite for least
             squares.
-        steps: Largest number of steps. Each calls ``residuals`` once, with P + 1 parameter vectors per start.
+        steps: Maximum number of steps. Each calls ``residuals`` once, with P + 1 parameter vectors per start.
         enough: Predicted gain below which a start is finished.
 
     Source: Marquardt 1963, with damping relative to the diagonal of the normal matrix and forward differences. The

@@ -44,7 +44,7 @@ def rk2(
     """Integrate points by the midpoint rule and rotations by exponentials of the midpoint spin: TRACE's integrator.
 
     Points and rotations are integrated separately, so a body is rigid only to second order in the step; `propagate`
-    keeps it exactly rigid. The same code serves numpy and torch. For numpy arrays it warns once about spins of more
+    keeps it exactly rigid. Supports numpy and torch. For numpy arrays it warns once about spins of more
     than `MAX_TURN` per step, because bodies then grow visibly in playback.
 
     Args:
@@ -84,7 +84,7 @@ def propagate(dynamics: np.ndarray, duration: float, tolerance: float) -> tuple[
     Args:
         dynamics: Velocity, angular velocity and the rates of both about the centre of each point, side by side. [N, 12]
         duration: Signed duration.
-        tolerance: Largest allowed error of a point, in the units of its velocity times time.
+        tolerance: Maximum error of a point, in the units of its velocity times time.
 
     Returns:
         Unit quaternions wxyz [N, 4] and displacements [N, 3], float64. Exactly the identity for a duration of 0, for
@@ -107,7 +107,7 @@ def _warn_of_coarse_steps(step: float) -> None:
 def step_sizes(duration: float, step: float) -> list[float]:
     """Signed steps that add up to a duration: full steps and a shorter last one; empty for a duration of 0.
 
-    They are counted in advance because an accumulated time eventually misses or repeats a step.
+    Steps are counted in advance, because accumulating the time eventually misses or repeats a step.
     """
     count = max(1, math.ceil(abs(duration) / step - 1e-9)) if duration != 0 else 0
     if count == 0:

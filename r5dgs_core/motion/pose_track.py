@@ -30,7 +30,7 @@ class Window:
 
     @property
     def middle(self) -> float:
-        """Middle of the window, at which rates are named that are nearly independent of the others there."""
+        """Middle of the window: the reference time of rates that are nearly uncorrelated with the others there."""
         return 0.5 * self.first
 
     @property
@@ -39,7 +39,7 @@ class Window:
         return self.low < self.high
 
     def frequency(self, pace: np.ndarray) -> np.ndarray:
-        """Frequency of a free parameter of any value, a logit."""
+        """Frequency for an unbounded parameter, its logit."""
         return self.low + (self.high - self.low) / (1 + np.exp(-np.clip(pace, -30, 30)))
 
     def pace(self, frequency: float) -> float:

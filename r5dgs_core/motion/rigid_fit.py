@@ -60,7 +60,7 @@ def fit_rigid(
         source: Points before. [n, 3]
         target: The same points after. [n, 3]
         weights: Point weights, >= 0 with a positive sum, or None for equal ones. [n]
-        rounds: Largest number of reweighting rounds; reweighting stops once no residual is far above the median.
+        rounds: Maximum number of reweighting rounds; reweighting stops once no residual is far above the median.
         hint: Expected rotation, unit wxyz; None for the identity.
 
     Returns:
@@ -111,8 +111,8 @@ def _check(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> None:
 def aliased_step(times: np.ndarray, quats: np.ndarray) -> tuple[float, float, float] | None:
     """Return the largest rotation between neighbouring poses if it exceeds 120 degrees, else None.
 
-    A rotation of more than 180 degrees looks like a smaller one backwards. A body with steps near that limit may in
-    truth spin the other way; more frequent poses would resolve it.
+    A rotation of more than 180 degrees looks like a smaller one backwards. A body with steps near that limit may
+    actually spin the other way; only more frequent poses resolve this.
 
     Args:
         times: Times of the poses, increasing. [S]

@@ -7,7 +7,7 @@ import numpy as np
 from . import point_dynamics, rotations
 
 State = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # points, rotations, v, w
-MOST_STEPS = 20000  # largest number of cached steps; motion stops after the last
+MOST_STEPS = 20000  # maximum number of cached steps; motion stops after the last
 
 
 class SteppedPath:

@@ -183,11 +183,11 @@ def steps_needed(
         a: Rate of v. [3]
         durations: Signed durations. [...]
         radius: Radius of the body.
-        tolerance: Largest allowed position error, in the units of radius.
+        tolerance: Maximum position error, in the units of radius.
 
     Returns:
         n >= 1 for each duration, numpy. It is 1 if twist and rate commute, because one step is then exact, and
-        `MOST_STEPS` if even that many would not suffice or the rates are not finite. [...] int64
+        `MOST_STEPS` if that many do not suffice or the rates are not finite. [...] int64
 
     Source: leading omitted term D = [C1, a2]/240 + [a1, [a1, C1]]/720 with C1 = [a1, a2], a1 = m, a2 = b at h = 1:
         n = ceil((c T^5 / tol)^(1/4)), c the mean over [0, T] of radius |D_w| + |D_v|; at least |w| T / 2 steps.

@@ -34,9 +34,9 @@ class Propagator:
 
     Args:
         dynamics: Velocity, angular velocity and the rates of both, about the centre of each point. [N, 12]
-        tolerance: Largest allowed error of a point, in the units of its velocity times time, > 0. A number or [N]
+        tolerance: Maximum error of a point, in the units of its velocity times time, > 0. A number or [N]
         radius: Lever arm that converts rotation errors to position errors. A number or [N]
-        most_steps: Largest number of steps to any time, >= 1; if more are needed, errors exceed the tolerance.
+        most_steps: Maximum number of steps to any time, >= 1; if more are needed, errors exceed the tolerance.
     """
 
     def __init__(

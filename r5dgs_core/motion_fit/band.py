@@ -21,12 +21,12 @@ from .evidence import Evidence
 from .fitted_motion import FADE_PER_SPAN
 
 LEVEL = 0.95
-WIDE = 0.4  # half width from which a motion is not predictable, in radii
+WIDE = 0.4  # half width above which a motion is not predictable, in radii
 _MULTIPLE = 1.65  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
-_DRIFT = 5.0  # drift of a track over its span, in its least noise
+_DRIFT = 5.0  # drift of a track over its span, in units of the lower bound of its noise
 _SOFT = 4.0  # difference of scores that reduces a candidate's weight by e
-_FARTHEST = 8.0  # radii; largest counted distance of another candidate
-_MOST_SCALE = 36.0  # limit of the misses of earlier predictions, which scale the covariance
+_FARTHEST = 8.0  # maximum counted distance of another candidate, in radii
+_MOST_SCALE = 36.0  # maximum factor on the covariance from the errors of earlier predictions
 
 
 def of(
@@ -39,7 +39,7 @@ def of(
 ) -> Widths:
     """Band of a chosen solution, up to one observed span past t_max.
 
-    If the noise has a lower bound, the track may drift slowly: ``least`` is taken for a share of this drift.
+    A lower bound ``least`` of the noise indicates a slow drift of the track, proportional to it.
     """
     tau = np.linspace(0.0, 1.0, MOST_KNOTS)
     place, turn = _variance(chosen, evidence, tau)
@@ -61,7 +61,7 @@ class Widths:
 
     Attributes:
         tau: Times since t_max. [H]
-        half_width: Half width of the place of a point of the body. [H]
+        half_width: Half width of the position of a point of the body. [H]
         half_angle: Half width of the rotation, rad. [H]
         trusted: Time since t_max up to which the motion is predictable; None if up to the last one.
     """
@@ -95,7 +95,7 @@ def _poses(solution: Solution, tau: np.ndarray) -> se3.Pose:
 
 
 def _variance(solution: Solution, evidence: Evidence, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Variance of the place and of the rotation vector, summed over components, from the covariance. [H]"""
+    """Variance of the position and of the rotation vector, summed over components, from the covariance. [H]"""
     law, theta = solution.candidate.law, solution.law_theta
     quats, d = law.path(theta, tau)
     step = 1e-5
@@ -110,7 +110,7 @@ def _variance(solution: Solution, evidence: Evidence, tau: np.ndarray) -> tuple[
 def _spread(
     chosen: Solution, all_solutions: Sequence[Solution], evidence: Evidence, tau: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean squared distance of the near candidates' places and rotations from the chosen one's. [H]"""
+    """Mean squared distance of the near candidates' positions and rotations from the chosen one's. [H]"""
     scores = [evidence.score(s) for s in all_solutions]
     best = min(scores)
     weights = np.exp(-(np.array(scores) - best) / _SOFT)

@@ -19,7 +19,7 @@ from ..motion.models.first_guesses import Guess
 from ..motion.pose_track import PoseTrack, Window
 
 SOFTNESS = 24.0  # squared residual of a pose, in variances of its six numbers, at which its weight is one half
-_ENOUGH = 0.02  # gain of a step, in variances, below which candidates are compared
+_ENOUGH = 0.02  # gain of a step, in variances, below which a fit is good enough to compare candidates
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Candidate:
 
     @property
     def last_choice(self) -> int:
-        """Least number of first poses that determine all discrete choices."""
+        """Minimum number of first poses that determine all discrete choices."""
         return 0
 
     @property
@@ -129,7 +129,7 @@ STATIC = BY_NAME["static"]
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of a track per component: places in radii, rotations in rad."""
+    """Noise of a track per component: positions in radii, rotations in rad."""
 
     place: float
     turn: float
@@ -189,7 +189,7 @@ class Solution:
 
     @functools.cached_property
     def law_slopes(self) -> np.ndarray:
-        """Derivatives of the law's parameters. [P', P]"""
+        """Derivatives of the law's parameters with respect to those of the candidate. [P', P]"""
         if self.candidate.law is self.candidate:
             return np.eye(len(self.theta))
         step = 1e-6
@@ -223,7 +223,7 @@ def solve(
         track: The poses.
         noise: Noise of the poses, which sets the weights.
         starts: Initial guesses, or None for those of the candidate. [P] each
-        steps: Largest number of steps.
+        steps: Maximum number of steps.
         enough: Gain of a step, in variances, below which the fit ends.
 
     Returns:

@@ -15,8 +15,8 @@ import numpy as np
 
 from .candidates import Solution
 
-STRONG = 10.0  # difference of scores that a break needs
-NEAR = 6.0  # difference of scores within which the simplest law is taken
+STRONG = 10.0  # minimum difference of scores for a break
+NEAR = 6.0  # maximum difference of scores within which the simplest law is chosen
 _LEAST_LEVEL = 0.05
 _MOST_LAG = 0.8
 
@@ -37,7 +37,7 @@ class Evidence:
 
     @staticmethod
     def of(solutions: Sequence[Solution], least: float = 0.0) -> Evidence:
-        """Noise level from solutions, of which one must be close to the truth, and at least ``least``."""
+        """Noise level, at least ``least``, from solutions of which one must be close to the truth."""
         count = len(solutions[0].weights)
         numbers = 6 * count
         level = max(_LEAST_LEVEL, least, min(s.loss / max(numbers - s.parameters, 1) for s in solutions))
@@ -61,7 +61,7 @@ class Evidence:
         return self.of_sums(solution.loss, solution.parameters, solution.candidate.placed)
 
     def of_sums(self, loss: float, parameters: int, placed: int = 0) -> float:
-        """B of a loss with a number of parameters, of which some are choices of a pose."""
+        """Score B from a loss, the number of parameters and the number of choices of a pose."""
         penalty = parameters * math.log(6 * self.count / self.inflation)
         return loss / self.variance + penalty + 2 * placed * math.log(self.count)
 

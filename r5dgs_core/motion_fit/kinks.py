@@ -1,8 +1,8 @@
 """Breaks of a motion inside the observed window, as candidates that fit all poses together.
 
-The pose is continuous at the break, and rates or laws change there. Both sides share what they have in common, so two
-poses after the break suffice. Notation: c the time of the break, b = min(tau - c, 0), f = max(tau, c); rates without a
-prefix hold after the break and are named at t_max, D rates are added before it.
+The pose is continuous at the break, and rates or laws change there. Both sides share parameters, so two poses after the
+break suffice. Notation: c the time of the break, b = min(tau - c, 0), f = max(tau, c); rates without a prefix apply
+after the break and are values at t_max, D rates are added before it.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def search(track: PoseTrack, noise: Noise, first_gap: int = 2) -> list[Solution]
     Args:
         track: The poses.
         noise: Their noise.
-        first_gap: Least number of poses before a break.
+        first_gap: Minimum number of poses before a break.
     """
     gaps = np.arange(first_gap, len(track) - LEAST_AFTER + 1)
     if len(gaps) == 0 or len(track) < 5:
@@ -208,7 +208,7 @@ class _Sides:
         return found
 
     def _line(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Place at t_max, velocity and spin of some poses."""
+        """Position at t_max, velocity and spin of some poses."""
         tau, places = self._track.tau[start:stop], self._track.displacements[start:stop]
         middle, mean = tau.mean(), places.mean(0)
         v = (tau - middle) @ (places - mean) / max(float(((tau - middle) ** 2).sum()), 1e-12)

@@ -1,9 +1,9 @@
 """Select the motion model of a group past t_max from its observed poses.
 
-Every candidate law (`candidates`) and every kind of break in every gap (`kinks`) is fitted to all poses. The evidence
-for each (`evidence`) decides: a break needs strong evidence, and of the laws without one, the simplest near the best is
-taken. After a break, the last part of the track is searched again. Notation: S poses, tau = t - t_max <= 0; radius
-weights rotations against displacements.
+Every candidate law (`candidates`) and every kind of break in every gap (`kinks`) is fitted to all poses. They are
+compared by their evidence (`evidence`): a break is chosen only with strong evidence, otherwise the simplest law near
+the best one. After a break, the last part of the track is searched again. Notation: S poses, tau = t - t_max <= 0;
+radius weights rotations against displacements.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ def fit(
         candidates: Names in `candidates.BY_NAME`, without breaks; None for `candidates.FAMILY` and all breaks.
         inertia: Inertia of the group in the bind state, up to a factor (`free_top.inertia`), or None. If given and
             not nearly that of a ball, the free top is a candidate. [3, 3]
-        least_noise: Lower bounds of the noise of displacements (per component, world units) and rotations (rad), if
-            more is known than the scatter about a smooth motion shows.
+        least_noise: Lower bounds of the noise of displacements (per component, world units) and rotations (rad), for
+            noise that the scatter about a smooth motion does not show.
         up: Upward direction, or None if unknown. A body that slows down on a vertical line falls back; on any other
             line, and if ``up`` is None, friction may stop it. [3]
 

@@ -13,7 +13,7 @@ _MEDIAN = 1.538  # median length of three numbers with unit variance
 
 
 def contrasts(track: PoseTrack) -> Noise:
-    """Noise from combinations of four neighbouring poses that no motion quadratic in time enters.
+    """Noise from combinations of four neighbouring poses that vanish for motions quadratic in time.
 
     It is too large for motions that are fast between poses and too small for noise that is correlated in time.
     """
@@ -30,5 +30,5 @@ def contrasts(track: PoseTrack) -> Noise:
 
 
 def of_images(radius: float, place: float = 0.0, turn: float = 0.0) -> tuple[float, float]:
-    """Least noise of a track from images, for `model_selection.fit`, if it is known to be at least (place, turn)."""
+    """Lower bounds of the noise of a track from images, for `model_selection.fit`; at least (place, turn)."""
     return max(place, 2 * radius * IMAGES[0]), max(turn, IMAGES[1])

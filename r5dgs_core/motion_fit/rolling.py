@@ -12,20 +12,21 @@ from .candidates import Noise, Solution
 from .evidence import Evidence
 
 HELD_OUT = 0.2  # share of the last poses that are predicted
-_FEWEST = 8  # poses of a track that can be refitted to fewer
-_MOST_SQUARE = 600.0  # limit of the square of a miss, in variances
+_FEWEST = 8  # minimum number of poses of a track for this test
+_MOST_SQUARE = 600.0  # maximum squared prediction error, in variances
 
 
 def misses(chosen: Solution, track: PoseTrack, noise: Noise, evidence: Evidence) -> float:
-    """Mean square of the misses of a law that is refitted to earlier poses, over that expected; 1 for short tracks.
+    """Mean squared error, relative to its expectation, of predictions by the law refitted to earlier poses.
 
-    The expected square of a miss is that of the noise plus the variance of the refitted prediction.
+    The expected squared error is the variance of the noise plus that of the refitted prediction. Returns 1 for short
+    tracks.
     """
     count = len(track)
     if count < _FEWEST:
         return 1.0
     shares = []
-    most = count - chosen.candidate.last_choice  # poses that may be left out
+    most = count - chosen.candidate.last_choice  # maximum number of poses to leave out
     for held in sorted({1, max(3, math.ceil(HELD_OUT * count)), count // 3}):
         if chosen.parameters > 4 * (count - held) or held > most:
             continue

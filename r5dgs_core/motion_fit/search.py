@@ -16,28 +16,28 @@ from . import kinks, noise, rolling
 from .candidates import Candidate, Noise, Solution
 from .evidence import Evidence
 
-FREQUENCY_ERROR = 0.25  # largest relative standard deviation of a determined frequency
-_SEEN = 0.9  # periods of each of two oscillations that must be seen
-_FEW = 8  # poses below which breaks are not searched, and large candidates not tried
-_PER_POSE = 3  # parameters per pose of the largest candidate for few poses
+FREQUENCY_ERROR = 0.25  # maximum relative standard deviation of a determined frequency
+_SEEN = 0.9  # minimum number of observed periods of each of two oscillations
+_FEW = 8  # number of poses below which neither breaks nor large candidates are tried
+_PER_POSE = 3  # maximum number of parameters per pose of a candidate for few poses
 STEEP = 0.9  # cosine of the angle to the vertical below which a motion is vertical
-_ROUNDS = 3  # of the noise
-_MEDIAN_SQUARE = 0.455  # of a number with unit variance
-_NOTHING_FITS = 9.0  # squared misfit of the best candidate above which the noise is taken for larger
+_ROUNDS = 3  # rounds of noise estimation
+_MEDIAN_SQUARE = 0.455  # median square of a normal variable with unit variance
+_NOTHING_FITS = 9.0  # squared misfit of the best candidate above which the estimated noise is increased
 _TOO_LARGE = 0.4  # variance of the residuals below which the noise is estimated again
-_EXACT = 1e-4  # gain at which the selected candidate is final
-_CONTRADICTED = 3.0  # squared miss of later poses, in that of the best law, above which a law is not taken
+_EXACT = 1e-4  # gain of a step below which the selected candidate is final
+_CONTRADICTED = 3.0  # squared prediction error, relative to the best law's, above which a law is rejected
 _SMALL_JUMP = 0.15  # relative change of the rates below which a break needs stronger evidence
-_POOR = 3.0  # noise level, in that of neighbouring poses, from which a track may have several breaks
+_POOR = 3.0  # noise level, relative to that of neighbouring poses, above which a track may have several breaks
 _HOPELESS_LOSS = 200.0  # excess of the loss of a candidate above which it is not refitted
-_HOPELESS = 30.0  # excess of plain parts above which a track is not cut
-_CUTS = 4  # breaks at which such a track is cut
-_FEWEST = 4  # poses of its parts
+_HOPELESS = 30.0  # score excess of plain parts above which a track is not cut
+_CUTS = 4  # number of breaks at which such a track is cut on trial
+_FEWEST = 4  # minimum number of poses of its parts
 _PLAIN = ("static", "translation + spin", "ballistic + spin", "drag")  # laws that decide where to cut
-_WELL = 1.5  # loss of a part, in that of noise, below which it is not searched again
+_WELL = 1.5  # loss of a part, relative to that of noise, below which it is not searched again
 _AHEAD = 1 / 3  # time past t_max, in spans, over which a law must be plausible
-_RUNAWAY = 2.5  # way in this time, in the largest seen, above which it is not
-_LEAST_PART = 7  # poses after a break that are searched for a law of their own
+_RUNAWAY = 2.5  # distance in this time, relative to the largest observed, above which a law is not plausible
+_LEAST_PART = 7  # minimum number of poses after a break to search them for a separate law
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def select(
     Args:
         track: The poses.
         family: Laws to try.
-        least: Least noise.
+        least: Lower bound of the noise.
         breaks: True to try breaks.
         up: See `model_selection.fit`.
     """
@@ -126,25 +126,25 @@ def _try_all(
 
 
 def _misfit(solutions: Sequence[Solution]) -> tuple[float, float]:
-    """Median squares of the place and turn residuals of the solution with the least ones, per component."""
+    """Median squared position and rotation residuals per component, of the solution with the smallest ones."""
     medians = [np.median(s.residuals.reshape(-1, 2, 3) ** 2, 0).mean(-1) / _MEDIAN_SQUARE for s in solutions]
     place, turn = min(medians, key=lambda pair: float(np.prod(np.maximum(pair, 1.0))))
     return float(place), float(turn)
 
 
 def _margin(kink: Solution) -> float:
-    """Evidence that a break needs; small jumps need more, since drifting tracks imitate them."""
+    """Minimum evidence for a break; small jumps need more, because drifting tracks imitate them."""
     assert isinstance(kink.candidate, kinks.Kink)
     return evidences.STRONG * max(1.0, _SMALL_JUMP / max(kink.candidate.jump(kink.theta), 1e-3)) ** 2
 
 
 def _floor(level: Noise, least: Noise) -> float:
-    """Least variance of residuals in units of the noise, if the noise has a lower bound."""
+    """Minimum variance of residuals in units of the noise, from the lower bound of the noise."""
     return min(least.place / level.place, least.turn / level.turn) ** 2
 
 
 def _with_parts(whole: Selected, family: tuple[Candidate, ...], up: np.ndarray | None) -> Selected:
-    """Search the parts before and after a break for more breaks, and the last part for a law of its own.
+    """Search the parts before and after a break for more breaks, and the last part for a separate law.
 
     The break's own fit of a part is replaced only by one with strong evidence.
     """
@@ -184,7 +184,7 @@ def _cut(
         broken: Breaks that were tried in it.
         family: Laws to try.
         up: See `model_selection.fit`.
-        least: Least variance of the residuals.
+        least: Minimum variance of the residuals.
 
     Returns:
         None if this is not clearly better than the best single candidate.
@@ -235,7 +235,7 @@ def _excess(parts: Sequence[Solution], single: Solution, least: float) -> float:
 def _refined(
     solutions: Sequence[Solution], best: Solution, track: PoseTrack, level: Noise, finer: Noise
 ) -> list[Solution]:
-    """Refits to the same poses with less noise; solutions far worse than the best are only scored anew."""
+    """Refits to the same poses with less noise; residuals of solutions far worse than the best are only rescaled."""
     scales = np.repeat([level.place / finer.place, level.turn / finer.turn], 3)
     return [
         _again(s, track, finer) if s.loss < best.loss + _HOPELESS_LOSS else replace(s, residuals=scales * s.residuals)
@@ -256,7 +256,7 @@ def _best(*groups: Sequence[Solution]) -> Solution:
 
 
 def _shares(solutions: Sequence[Solution]) -> tuple[float, float]:
-    """Variances of the place and turn residuals of the best solution, in units of the noise."""
+    """Variances of the position and rotation residuals of the best solution, in units of the noise."""
     best = _best(solutions)
     weights = (best.weights * best.robust)[:, None]
     free = max(1 - best.parameters / best.residuals.size, 0.1)
@@ -267,8 +267,8 @@ def _shares(solutions: Sequence[Solution]) -> tuple[float, float]:
 def _determined(solution: Solution, evidence: Evidence) -> bool:
     """Return True if the frequencies are inside their range and known to `FREQUENCY_ERROR`, or if none is free.
 
-    Of bounces, at least one flight between two of them must be longer than two gaps between poses. Of a sum of
-    oscillations, nearly a full period of each must be seen, since slower ones can imitate any curve.
+    For bounces, at least one flight between two of them must be longer than two gaps between poses. For a sum of
+    oscillations, nearly a full period of each must be observed, because slower ones can imitate any curve.
     """
     candidate = solution.candidate
     rows = candidate.parts(np.arange(candidate.parameters))
@@ -294,8 +294,8 @@ def _determined(solution: Solution, evidence: Evidence) -> bool:
 def _simplest(laws: Sequence[Solution], evidence: Evidence, track: PoseTrack, level: Noise) -> Solution:
     """Law with the fewest parameters among those near the best whose refits to earlier poses predict the later ones.
 
-    Evidence alone trusts small systematic errors of a track, which the later poses reveal. Among laws with equally many
-    parameters, the evidence decides.
+    Evidence alone may follow small systematic errors of a track, which predicting later poses reveals. Among laws with
+    equally many parameters, the evidence decides.
     """
     best = min(evidence.score(s) for s in laws)
     near = [s for s in laws if evidence.score(s) <= best + evidences.NEAR]
@@ -306,7 +306,7 @@ def _simplest(laws: Sequence[Solution], evidence: Evidence, track: PoseTrack, le
 
 
 def _rises(solution: Solution, up: np.ndarray | None) -> bool:
-    """Return True for friction without spin on a vertical line, which is the way of a body thrown upwards."""
+    """Return True for friction without spin on a vertical line, as of a body thrown upwards."""
     if up is None or solution.candidate.kind != "friction" or "w" in solution.candidate.blocks:
         return False
     v = solution.candidate.parts(solution.theta)["v"]
@@ -314,7 +314,7 @@ def _rises(solution: Solution, up: np.ndarray | None) -> bool:
 
 
 def runs_away(solution: Solution, track: PoseTrack) -> bool:
-    """Return True if the body would go or turn much further than it ever did in an equal time."""
+    """Return True if the body would move or turn much further past t_max than in any equal observed time."""
     ends = np.searchsorted(track.tau, track.tau + _AHEAD)
     starts = np.flatnonzero(ends < len(track))
     if len(starts) == 0:

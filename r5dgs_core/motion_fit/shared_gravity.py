@@ -16,7 +16,7 @@ from . import model_selection, noise
 
 # Each candidate with a free acceleration, and the candidate without it.
 FALLING = {"translation, quadratic": "translation", "ballistic + spin": "translation + spin"}
-AGREE = 11.34  # largest squared Mahalanobis distance: 99 % quantile of chi2 with three degrees of freedom
+AGREE = 11.34  # maximum squared Mahalanobis distance: 99 % quantile of chi2 with three degrees of freedom
 
 
 @dataclass(frozen=True)

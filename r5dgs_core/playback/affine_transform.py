@@ -1,7 +1,6 @@
 """Gaussians transformed by an affine map, with shapes, harmonics and shading applied.
 
-The result can be drawn by renderers without support for rotation, tint or shading: no rotation, tint or shading is left
-to apply.
+The result can be drawn by renderers without support for rotation, tint or shading.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from ..scene.splats import to_opacities
 from . import visibility
 from .modes import SOURCES
 
-FARTHEST = 1e30  # largest predicted displacement per axis; float32 can hold it
+FARTHEST = 1e30  # maximum predicted displacement per axis, within the range of float32
 HORIZON = 1 / 3  # fraction of the observed span past t_max over which "kabsch" follows the members
 _FUTURES = 6  # number of times within the horizon
 _ROUNDS = 6  # reweighting rounds
@@ -42,7 +42,7 @@ def models_of(scene: Scene, source: str = "fitted") -> tuple[MotionModel, ...]:
         source: "fitted": the model fitted to the observed poses. The others combine the members' dynamics about the
             pivot into a "world_twist": "representative" takes that of the group's representative; "median" the median
             by component; "least_squares" the twist that best fits the members' velocities and accelerations; "kabsch"
-            the twist whose motion best fits the positions that the members' own dynamics lead to.
+            the twist whose motion best fits the positions predicted by the members' own dynamics.
 
     Returns:
         One model per group; static for pinned groups and for those that follow another.
@@ -193,8 +193,8 @@ def _least_squares(
 ) -> np.ndarray:  # [12]
     """Twist v, a, w, e about the pivot that best fits the members' velocities and accelerations.
 
-    Training observes only v + w x r, so a member's own spin does not show how the body rotates. It is used only about
-    axes that the members' velocities leave undetermined.
+    Training observes only v + w x r, so a member's own spin is used only about axes that the members' velocities leave
+    undetermined.
 
     Source: velocity v + w x r, acceleration a + e x r + w x (v + w x r).
     """

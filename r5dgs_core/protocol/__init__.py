@@ -1,1 +1,1 @@
-"""Requests between Blender and the worker: dataclasses of both sides, and checks of everything that is received."""
+"""Requests between Blender and the worker: dataclasses of both sides, and checks of all received data."""

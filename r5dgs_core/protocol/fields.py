@@ -121,7 +121,7 @@ def stamp_of(path: Any) -> tuple[str, int, int]:
             "'Scene File' in the R5DGS tab"
         ) from error
     if not stat.S_ISREG(status.st_mode):  # a pipe or device could block forever
-        raise errors.SceneFileError(f"{path}: expected a .r5dgs file, found something that is no file")
+        raise errors.SceneFileError(f"{path}: expected a .r5dgs file, found a folder or device")
     return path, status.st_mtime_ns, status.st_size
 
 

@@ -69,11 +69,11 @@ class Backend:
         return "CPU without kernels"
 
     def suits(self, like: Array) -> bool:
-        """Return True if the backend is made for the device and dtype of an input. "auto" tries no others."""
+        """Return True if the backend is made for the device and dtype of an input. "auto" skips all others."""
         return True
 
     def obstacle(self, like: Array) -> str | None:
-        """Return why inputs like this one cannot be rasterized here, and the remedy; None if they can."""
+        """Return the reason why inputs like this one cannot be rasterized here, and the remedy; None if they can."""
         return None
 
     def rasterize_splats(

@@ -121,7 +121,7 @@ def find_kernels() -> Kernels | str:
     if _backend._C is None:
         return (
             f"gsplat {version} finds no CUDA toolkit to compile its kernels with; remedy: install CUDA "
-            f"{torch.version.cuda} with nvcc and set CUDA_HOME, or a gsplat wheel that holds compiled kernels"
+            f"{torch.version.cuda} with nvcc and set CUDA_HOME, or a gsplat wheel with compiled kernels"
         )
     return Kernels(
         gsplat.isect_tiles, gsplat.isect_offset_encode, gsplat.rasterize_to_pixels, version, **_read_thresholds()

@@ -16,7 +16,8 @@ class RasterSettings:
     Attributes:
         near_plane: Gaussians whose centre has a smaller depth are culled, world units.
         dilation: Low-pass filter: variance added along both image axes, px^2. At least 0.01, because rounding errors of
-            the exponent grow as Gaussians get thinner, and the kernels' float64 margin covers none thinner than that.
+            the exponent grow as Gaussians get thinner, and the float64 margin of the kernels does not cover thinner
+            ones.
         frustum_slack: Slopes are clamped to the image border plus this share of half the field of view before the
             projection is linearised: 0.3 means 1.3 times the field of view.
         alpha_min: Contributions below this are dropped.
@@ -39,7 +40,7 @@ class RasterSettings:
         """Lower bound on transmittance: ``transmittance_min`` with a margin for rounding.
 
         Two capped layers leave (1 - 0.99)^2 = 1e-4, which rounds below 1e-4 in float32 and above it in float64. 3DGS
-        and gsplat compute in float32 and stop there, so all backends must.
+        and gsplat compute in float32 and stop there, so all backends stop there too.
         """
         return self.transmittance_min * (1 + 1e-6)
 

@@ -36,7 +36,7 @@ def isolate(
         object_ids: The objects.
         camera: The camera, in the scene's world.
         t: Scene time, may exceed t_max.
-        mode: Extrapolation mode after t_max.
+        mode: Playback mode past t_max.
         backend: Rasterizer.
 
     Returns:

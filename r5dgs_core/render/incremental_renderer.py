@@ -23,7 +23,7 @@ from ..scene.scene import NEAR_PLANE, Scene
 from . import coverage, posed_scene, scene_renderer
 
 OWN_SKY = Sky()  # of the first scene
-WORTH_A_LAYER = 0.7  # largest share of moving Gaussians; above it, the static layer costs more than it saves
+WORTH_A_LAYER = 0.7  # maximum share of moving Gaussians; above it, the static layer costs more than it saves
 
 
 class Stage:

@@ -1,4 +1,4 @@
-"""Renderer of posed scenes: the only place where evaluation, the worker and export turn a `Scene` into pixels.
+"""Renderer of posed scenes, shared by evaluation, the worker and export.
 
 Colour of a Gaussian: tint * max(0, 0.5 + SH(A^-1 d)) * max(0, shading factor), as in training. d is the viewing
 direction in the world and A the map that moved the Gaussian from its bind state. The background is the scene's sky:

@@ -19,8 +19,8 @@ from ..scene.scene import Scene
 from . import scene_renderer
 
 LOOK = 160  # longest side of the small pictures, pixels
-MOST_CAMERAS = 16  # number of cameras to try
-NOTICED = 5e-4  # smallest share of the picture that counts as visible
+MOST_CAMERAS = 16  # maximum number of cameras to try
+NOTICED = 5e-4  # minimum share of the picture that counts as visible
 
 Item = TypeVar("Item")
 
@@ -95,7 +95,7 @@ def best(
         scene: The scene.
         among: At least one viewpoint; the first wins a tie.
         object_ids: The objects.
-        mode: Extrapolation mode after t_max.
+        mode: Playback mode past t_max.
         backend: Rasterizer.
     """
     if len(among) == 1:

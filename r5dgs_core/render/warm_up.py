@@ -13,7 +13,7 @@ from ..scene.cameras import Camera
 
 _VIEW = Camera(4, 4, np.array([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]), np.eye(4))
 _ROW = np.ones((1, 3), np.float32)
-_SH = 4  # coefficients: degree 1, the least that has kernels
+_SH = 4  # coefficients: degree 1, the lowest with kernels
 
 
 def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = None) -> float:

@@ -27,7 +27,7 @@ from ..errors import SceneFileError
 
 ALLOWANCE = 32 << 20
 RATIO = 64
-_BLOCK = 1 << 20  # largest single read in bytes, and largest zip directory
+_BLOCK = 1 << 20  # maximum size of a single read and of the zip directory, bytes
 _MOST_DIMENSIONS = 8
 _MAGIC = b"\x93NUMPY\x01\x00"
 _HEADER = re.compile(
@@ -204,5 +204,5 @@ def _read_exactly(stream: BinaryIO, target: bytearray | memoryview) -> bytes:
         view[at : at + len(piece)] = piece
         at += len(piece)
     if stream.read(1):
-        raise ValueError(f"the data goes on after the declared {len(view)} bytes")
+        raise ValueError(f"the data continues after the declared {len(view)} bytes")
     return bytes(target) if isinstance(target, bytearray) else b""

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-FARTHEST = 1e15  # largest coordinate that is drawn; float32 can square it
-MOST_PIXELS = 1 << 16  # largest image side
+FARTHEST = 1e15  # maximum coordinate that is drawn; its square is within the range of float32
+MOST_PIXELS = 1 << 16  # maximum image side
 _MOST_FOCAL = 1e12  # pixels; the smallest focal length is its reciprocal
-_RIGID_TOLERANCE = 1e-3  # largest entry of R R^T - 1
+_RIGID_TOLERANCE = 1e-3  # maximum entry of R R^T - 1
 _ROUNDING = 1e-9  # tolerance of matrix entries that must be 0 or 1
 FAR = 1e4  # camera distance that replaces infinity for parallel projections, in half depth ranges
 
@@ -80,7 +80,7 @@ def check(camera: Camera) -> None:
     if off > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
         raise ValueError(
             f"{place}: T_cam_world: expected a rotation in its first three rows and columns, found one that is off by "
-            f"{off:.2g} or mirrors; take scale and mirroring out of it"
+            f"{off:.2g} or mirrors; remove scale and mirroring"
         )
     if abs(camera.intrinsics[1, 0]) > _ROUNDING:
         raise ValueError(f"{place}: intrinsics: expected 0 at index (1, 0), found {camera.intrinsics[1, 0]}")

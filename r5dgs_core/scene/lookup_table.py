@@ -43,7 +43,7 @@ class View:
 
     Attributes:
         source: Name of the camera, or the phrase.
-        threshold: Least cosine of a match with this embedding.
+        threshold: Minimum cosine of a match with this embedding.
         t: Scene time of the image, None for a phrase.
         box: Crop of the image: left, top, right, bottom in pixels of that camera; None for a phrase.
     """
@@ -63,8 +63,8 @@ class Table:
         canonical: The C phrases that every query is compared with.
         views: Views of each object, corresponding to the rows of `Scene.view_embeddings`; empty for an object without
             an embedding.
-        thresholds: Least cosine of a match with each object's embedding, None for an object without one.
-        margin: Largest cosine difference from the best match at which other objects still match.
+        thresholds: Minimum cosine of a match with each object's embedding, None for an object without one.
+        margin: Maximum cosine difference from the best match at which other objects still match.
         pooling: Embeddings that are compared: "mean" for the object's own, "max" for the best of its views.
     """
 

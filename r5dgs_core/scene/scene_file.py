@@ -1,8 +1,8 @@
 """Reading and writing `.r5dgs`: one zip of `.npy` arrays and a `scene.json` (docs/reference/scene_format.md).
 
-Members hold what `Scene` holds, under the same names. Some are stored with fewer bits and restored to float32 on
-reading: quats, log_scales and opacity_logits as int16 fixed point, sh, shading and residuals as float16 (rotations of
-residuals as int16).
+Members have the content and the names of the fields of `Scene`. Some are stored with fewer bits and restored to float32
+on reading: quats, log_scales and opacity_logits as int16 fixed point, sh, shading and residuals as float16 (rotations
+of residuals as int16).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
     path = Path(path)
     validation.check(scene, f"{path} (not written)")
     if not path.parent.is_dir():
-        raise errors.SceneFileError(f"{path}: expected an existing folder, found none; make {path.parent} first")
+        raise errors.SceneFileError(f"{path}: expected an existing folder, found none; create {path.parent} first")
     try:
         with atomic_files.replacing(path) as stream:
             _write_zip(scene, stream, exact)
@@ -65,7 +65,7 @@ def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
 
 
 def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Scene:
-    """Read and validate a scene. Raises `SceneFileError` naming the member and what was expected.
+    """Read and validate a scene. Raises `SceneFileError` naming the member and its expected content.
 
     Args:
         path: The file.

@@ -1,7 +1,7 @@
 """Colours of Gaussians from real spherical harmonics up to degree 3.
 
 The basis is that of `scene.spherical_harmonics`. Colours are display-referred sRGB with an offset of one half, so that
-all-zero coefficients are mid-grey. The same code serves numpy and torch.
+all-zero coefficients are mid-grey. Supports numpy and torch.
 """
 
 from __future__ import annotations

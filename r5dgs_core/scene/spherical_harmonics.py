@@ -1,7 +1,7 @@
 """Basis of real spherical harmonics up to degree 3, and coefficients under linear maps.
 
 The basis has the order and signs of 3DGS files: K = (degree + 1)^2 functions, ordered by degree l and then by order
-m = -l .. l, with the Condon-Shortley sign (the three linear terms are -y, z, -x). The same code serves numpy and torch.
+m = -l .. l, with the Condon-Shortley sign (the three linear terms are -y, z, -x). Supports numpy and torch.
 """
 
 from __future__ import annotations

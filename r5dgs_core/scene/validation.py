@@ -22,13 +22,13 @@ from .scene import DTYPES, EMBEDDINGS, GROUPS, ROLES, MotionGroup, Scene
 _fail = array_shapes.fail
 _UNIT_TOLERANCE = 1e-3
 
-# Largest numbers of a scene: float32 can square them, and no motion overflows within its times.
+# Maximum numbers of a scene: their squares are within the range of float32, and no motion overflows within its times.
 _LARGE = 1e9  # colours, logits, embeddings
 _LOG_SCALE, _LEAST_LOG_SCALE = 40.0, -1e4  # thinner Gaussians than float32 resolves are drawn at the minimum width
 _SPIN = 1e6  # rad per unit of time, and per its square
-_LEAST_LENGTH = 1e-30  # smallest near plane and radius
-MOST_TIME = 1e12  # largest time
-_LEAST_STEP = 1e-12  # smallest step between observed times
+_LEAST_LENGTH = 1e-30  # minimum near plane and radius
+MOST_TIME = 1e12  # maximum time
+_LEAST_STEP = 1e-12  # minimum step between observed times
 _RATES = np.repeat([cameras.FARTHEST, _SPIN, cameras.FARTHEST, _SPIN], 3)
 _POSE = np.repeat([_LARGE, cameras.FARTHEST], [4, 3])
 _LIMITS: dict[str, float | np.ndarray] = {

@@ -22,7 +22,7 @@ PASS = 0.5  # score at the threshold
 _BEST = 0.95  # score far above the threshold, below that of a name match
 _SPREAD = 0.25  # spread of cosines for a file without encoder metadata
 _MOST_EXPONENT = 700.0  # largest exponent with a finite exponential
-_BESIDE = 0.4  # largest score of an object far below the best match
+_BESIDE = 0.4  # maximum score of an object far below the best match
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Meant:
 
     Attributes:
         object_id: Id of the object.
-        score: In [0, 0.95]; a match from `PASS` on.
+        score: In [0, 0.95]; a match if at least `PASS`.
         cosine: Cosine between the best embedding of the object and that of the phrase.
         relevancy: See the module; None if no canonical phrases are stored.
     """

@@ -23,7 +23,7 @@ from . import english, prompts, spelling
 THRESHOLD = stored.PASS
 EVERYTHING = "all"  # prefix of the reason of a match by "everything"
 Embed = Callable[[str], np.ndarray | None]  # returns the unit embedding of a phrase [D], or None if unavailable
-_SETTLED = 0.9  # least score of a complete match by name
+_SETTLED = 0.9  # minimum score of a complete match by name
 _HEAD_WEIGHT = 0.65  # weight of the last word, the head noun: "coffee mug" is a mug
 
 
@@ -66,14 +66,14 @@ def search(scene: Scene, text: str, threshold: float = THRESHOLD, embed: Embed |
     Args:
         scene: The scene; its stored embeddings are used for words in its vocabulary.
         text: One or several names: "red mug", "mugs and lemon".
-        threshold: Least score of a match.
+        threshold: Minimum score of a match.
         embed: Returns the embedding of other words, from the encoder of the scene's embeddings.
 
     Returns:
         Matches with score >= threshold, ranked by score, then by id; empty if nothing matches.
 
     Raises:
-        ConfigError: Nothing matches a phrase that is to be left out.
+        ConfigError: An excluded phrase has no match.
     """
     labels, meanings = labels_of(scene), Meanings.of(scene)
     check_exclusions(labels, text, not_excluded(labels, text, threshold, meanings, embed))
@@ -91,14 +91,14 @@ def search_labels(
 
     Excluded phrases without a match are ignored here; the caller checks `not_excluded`.
     """
-    asked, best = _asked(labels, text), {}
-    if asked.everything:
-        why = f"{EVERYTHING} others" if asked.excluded else EVERYTHING
+    prompt, best = _parsed(labels, text), {}
+    if prompt.everything:
+        why = f"{EVERYTHING} others" if prompt.excluded else EVERYTHING
         best = {label.object_id: Match(label.object_id, 1.0, why) for label in labels if label.object_id > 0}
-    for match in _matches(labels, asked.wanted, threshold, meanings, embed):
+    for match in _matches(labels, prompt.wanted, threshold, meanings, embed):
         if match.object_id not in best or match.score > best[match.object_id].score:
             best[match.object_id] = match
-    for match in _matches(labels, asked.excluded, threshold, meanings, embed):
+    for match in _matches(labels, prompt.excluded, threshold, meanings, embed):
         best.pop(match.object_id, None)
     return _ranked(best.values())
 
@@ -110,9 +110,9 @@ def unanswered(
     meanings: Meanings | None = None,
     embed: Embed | None = None,
 ) -> list[str]:
-    """Phrases to find that nothing matches; arguments as for `search_labels`."""
-    wanted = _asked(labels, text).wanted
-    return [said for said, wish in wanted if not _matches(labels, [(said, wish)], threshold, meanings, embed)]
+    """Wanted phrases without a match; arguments as for `search_labels`."""
+    wanted = _parsed(labels, text).wanted
+    return [phrase for phrase, wish in wanted if not _matches(labels, [(phrase, wish)], threshold, meanings, embed)]
 
 
 def not_excluded(
@@ -122,13 +122,13 @@ def not_excluded(
     meanings: Meanings | None = None,
     embed: Embed | None = None,
 ) -> list[str]:
-    """Phrases to leave out that nothing matches; arguments as for `search_labels`."""
-    excluded = _asked(labels, text).excluded
-    return [said for said, wish in excluded if not _matches(labels, [(said, wish)], threshold, meanings, embed)]
+    """Excluded phrases without a match; arguments as for `search_labels`."""
+    excluded = _parsed(labels, text).excluded
+    return [phrase for phrase, wish in excluded if not _matches(labels, [(phrase, wish)], threshold, meanings, embed)]
 
 
 def check_exclusions(labels: Sequence[Label], text: str, missing: Sequence[str]) -> None:
-    """Reject a text with excluded phrases that match nothing, because it would select unintended objects.
+    """Reject a text with excluded phrases without a match, because it would select unintended objects.
 
     Args:
         labels: Labels of the objects.
@@ -143,16 +143,16 @@ def check_exclusions(labels: Sequence[Label], text: str, missing: Sequence[str])
 
 def is_nothing(labels: Sequence[Label], text: str) -> bool:
     """True if a text selects no object at all, such as "none" and "not everything"."""
-    asked = _asked(labels, text)
-    return bool(english.words_of(text)) and not asked.wanted and not asked.everything
+    prompt = _parsed(labels, text)
+    return bool(english.words_of(text)) and not prompt.wanted and not prompt.everything
 
 
 def unknown(labels: Sequence[Label], text: str, meanings: Meanings | None) -> list[str]:
     """Phrases that need an encoder: no name matches them completely and no stored word has an embedding for them."""
-    asked = _asked(labels, text)
+    prompt = _parsed(labels, text)
     return [
-        said
-        for said, wish in (*asked.wanted, *asked.excluded)
+        phrase
+        for phrase, wish in (*prompt.wanted, *prompt.excluded)
         if not any(match.score >= _SETTLED for match in _named(labels, wish))
         and (meanings is None or vocabulary_row(meanings.vocabulary, wish) is None)
     ]
@@ -164,7 +164,7 @@ def suggest(labels: Sequence[Label], text: str, count: int = 3) -> list[str]:
     Args:
         labels: Labels of the objects.
         text: Text as typed.
-        count: Largest number of suggestions.
+        count: Maximum number of suggestions.
 
     Returns:
         The most similar name or alias of each object within a few typos of the text, best first.
@@ -179,11 +179,11 @@ def suggest(labels: Sequence[Label], text: str, count: int = 3) -> list[str]:
 
 def explain_nothing(labels: Sequence[Label], text: str) -> str:
     """Message for a text without matches: similar names, else the existing names."""
-    said = f"nothing matches {text.strip()!r}"
+    problem = f"nothing matches {text.strip()!r}"
     meant = suggest(labels, text)
     if meant:
-        return f"{said}; did you mean {' or '.join(repr(name) for name in meant)}?"
-    return f"{said}; the scene has: {', '.join(label.name for label in labels) or 'no objects'}"
+        return f"{problem}; did you mean {' or '.join(repr(name) for name in meant)}?"
+    return f"{problem}; the scene has: {', '.join(label.name for label in labels) or 'no objects'}"
 
 
 def wishes(text: str) -> list[list[str]]:
@@ -207,7 +207,7 @@ def _vocabulary_rows(vocabulary: tuple[str, ...]) -> dict[tuple[str, ...], int]:
     return rows
 
 
-def _asked(labels: Sequence[Label], text: str) -> prompts.Prompt:
+def _parsed(labels: Sequence[Label], text: str) -> prompts.Prompt:
     return prompts.parse(text, [name for label in labels for name in (label.name, *label.aliases)])
 
 
@@ -219,19 +219,19 @@ def _matches(
     embed: Embed | None,
 ) -> list[Match]:
     """Matches of any of the phrases with a score of at least ``threshold``."""
-    found = [match for said, wish in phrases for match in _fulfil(labels, said, wish, meanings, embed)]
+    found = [match for phrase, wish in phrases for match in _phrase_matches(labels, phrase, wish, meanings, embed)]
     return [match for match in found if match.score >= threshold]
 
 
-def _fulfil(
-    labels: Sequence[Label], said: str, wish: list[str], meanings: Meanings | None, embed: Embed | None
+def _phrase_matches(
+    labels: Sequence[Label], phrase: str, wish: list[str], meanings: Meanings | None, embed: Embed | None
 ) -> list[Match]:
     """All matches of one phrase, regardless of score."""
     named = _named(labels, wish)
     if meanings is None or any(match.score >= _SETTLED for match in named):
         return named
     row = vocabulary_row(meanings.vocabulary, wish)
-    query = meanings.vocabulary_embeddings[row] if row is not None else embed(said) if embed is not None else None
+    query = meanings.vocabulary_embeddings[row] if row is not None else embed(phrase) if embed is not None else None
     if query is None:
         return named
     known = {label.object_id: label for label in labels}
@@ -239,12 +239,12 @@ def _fulfil(
     if row is not None:  # a word with a stored embedding is not matched as a typo or prefix of another word
         fitting = {one.object_id for one in meant if one.score >= stored.PASS}
         named = [m for m in named if m.object_id in fitting or _ends_with(known[m.object_id], wish[-1])]
-    word = said if row is None else meanings.vocabulary[row]
+    word = phrase if row is None else meanings.vocabulary[row]
     return [*named, *(_by_meaning(one, word) for one in meant)]
 
 
-def _by_meaning(one: stored.Meant, said: str) -> Match:
-    why = f"meaning of {said!r} ({one.cosine:.2f})"
+def _by_meaning(one: stored.Meant, phrase: str) -> Match:
+    why = f"meaning of {phrase!r} ({one.cosine:.2f})"
     return Match(one.object_id, one.score, why, one.cosine, one.relevancy)
 
 

@@ -55,7 +55,7 @@ def parse(text: str, names: Iterable[str] = ()) -> Prompt:
     """
     if len(text) > MOST_LETTERS:
         raise errors.UsageError(
-            f"a prompt of {len(text)} letters: expected at most {MOST_LETTERS}; ask for fewer objects at a time"
+            f"a prompt of {len(text)} letters: expected at most {MOST_LETTERS}; name fewer objects at a time"
         )
     known = {_spelled(name) for name in names}
     found = None if _spelled(text) in known else _first(text)

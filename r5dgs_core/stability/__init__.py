@@ -62,7 +62,7 @@ class Row:
         method: Tested functions, relative to the package.
         quantity: Measured quantity; less is better.
         measured: Measured value; NaN if the case raised an error.
-        tolerance: Largest value that passes.
+        tolerance: Maximum value that passes.
         source: Origin of the tolerance.
         trace_rk2: The same value for TRACE's integrator, or None if it does not apply.
         passed: True if the value is within the tolerance and the case took at most `MOST_SECONDS`.

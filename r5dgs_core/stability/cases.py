@@ -34,7 +34,7 @@ class Case:
         name: Description of the case.
         method: Tested functions, relative to the package, separated by commas; a remark may follow in parentheses.
         quantity: Measured quantity; less is better.
-        tolerance: Largest measured value that passes.
+        tolerance: Maximum measured value that passes.
         source: Origin of the tolerance.
         measure: Runs our code and returns the measured value. An exception is a failure.
         trace_rk2: Returns the same value for TRACE's integrator on each point (`point_dynamics.rk2`), or None if it

@@ -31,7 +31,7 @@ from .motion_model import EXTRA_RATES, RATES, SCALARS, MotionModel
 Curve = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Quaternions [..., 4], displacements [..., 3], angular velocities in the world frame [..., 3], velocities [..., 3]."""
 _ZEROS, _NONE = np.zeros(3), np.zeros(1)
-_MOST_EXPONENT = 600.0  # of a decay backwards in time
+_MOST_EXPONENT = 600.0  # maximum exponent of a decay backwards in time
 
 
 class Block(NamedTuple):

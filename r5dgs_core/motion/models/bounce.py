@@ -24,7 +24,7 @@ class Bounce(MotionKind):
     """d_f = v tau + a tau^2 / 2 up to the next bounce, R_f = exp(w tau)."""
 
     label = "Bounce"
-    tooltip = "Flies and bounces off a floor that is perpendicular to its acceleration, ever lower"
+    tooltip = "Flies and bounces off a floor that is perpendicular to its acceleration, lower each time"
     word = "bounce"
     fields = ("velocity", "acceleration", "angular_velocity", "bounce_time", "restitution")
     fits = {"bounces": ("w", "v", "a", "bounce", "logit_rho")}

@@ -90,7 +90,7 @@ def _held(*parts: np.ndarray) -> tuple[np.ndarray, ...]:
 @functools.cache
 def _warn_of_wild_motion() -> None:
     log.warning(
-        "a motion model leaves the range of numbers; its body stays where it is at t_max. Remedy: smaller rates"
+        "a motion model gives poses that are not finite; its body stays at its pose at t_max. Remedy: smaller rates"
     )
 
 
@@ -100,8 +100,8 @@ def evaluate_with_rates(model: MotionModel, tau: float | np.ndarray, most_steps:
     Args:
         model: The motion.
         tau: Time since t_max, >= 0, any shape. [...]
-        most_steps: Largest number of integration steps for all times together, or None for no limit. If more are
-            needed, times share steps; if even that is not enough, poses are rigid but inaccurate.
+        most_steps: Maximum number of integration steps for all times together, or None for no limit. If more are
+            needed, times share steps; if that does not suffice, poses are rigid but inaccurate.
 
     Returns:
         Quaternions [..., 4], displacements [..., 3], angular velocities in the world frame, rad per unit [..., 3], and

@@ -100,10 +100,10 @@ def _sweep(track: PoseTrack, path: np.ndarray, window: Window, clocks: Clocks, d
 
 
 def swings(blocks: Sequence[str], track: PoseTrack, window: Window, clocks: Clocks) -> list[Guess]:
-    """Guesses of a motion with a free frequency, most promising first; empty if it does not seem to swing.
+    """Guesses of a motion with a free frequency, most promising first; empty if no oscillation is found.
 
-    They are the local minima of the misfit of the displacements or rotations over frequency. The motion seems to swing
-    if an oscillation fits one of these significantly better than a parabola.
+    They are the local minima of the misfit of the displacements or rotations over frequency. An oscillation is found if
+    it fits one of these significantly better than a parabola.
     """
     if not window.may_swing:
         return []
@@ -140,7 +140,7 @@ def _swinging(blocks: Sequence[str], track: PoseTrack, window: Window, sweep: _S
 
 
 def pairs(track: PoseTrack, window: Window, clocks: Clocks) -> list[Guess]:
-    """Guesses of a sum of two oscillations of places and turns, most promising first.
+    """Guesses of a sum of two oscillations of positions and rotations, most promising first.
 
     Empty if the best pair of frequencies fits no better than one of them.
     """

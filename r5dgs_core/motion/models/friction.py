@@ -1,4 +1,4 @@
-"""A body that constant friction brings to rest: it slides or rolls ever slower, then stays."""
+"""A body that slides or rolls under constant friction until it rests."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Friction(MotionKind):
     """R_f = exp(w s), d_f = v s, s = u - u^2 / (2 T), u = min(tau, T), with the stop time T; T = 0 for no friction."""
 
     label = "Friction"
-    tooltip = "Slides or rolls ever slower until it rests"
+    tooltip = "Slides or rolls more and more slowly until it rests"
     word = "friction"
     fields = ("velocity", "angular_velocity", "stop_time")
     fits = {"slide, friction": ("v", "log_stop"), "slide + turn, friction": ("v", "w", "log_stop")}
@@ -33,7 +33,7 @@ class Friction(MotionKind):
         return rotations.rotvecs_to_quats(rates.w * way), rates.v * way, rates.w * left, rates.v * left
 
     def rates(self, parts: Mapping[str, np.ndarray], window: Window) -> Rates:
-        """ "v" and "w" are named at the first pose; "log_stop" is the logarithm of the time from there to the stop."""
+        """ "v" and "w" are values at the first pose; "log_stop" is the logarithm of the time from there to the stop."""
         length = np.exp(np.clip(parts["log_stop"], -4.0, 4.0))
         stop = np.maximum(window.first + length, 0.0)
         left = np.maximum(1 + window.first / length, 0.0)

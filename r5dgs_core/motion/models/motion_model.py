@@ -198,7 +198,7 @@ class MotionModel:
 
     @property
     def is_basic(self) -> bool:
-        """True if R5DGS 0.1.0 knows the kind and all of its rates."""
+        """True if R5DGS 0.1.0 supports the kind and all of its rates."""
         added = (*EXTRA_RATES, *(name for name in SCALARS if name != "frequency"))
         return self.kind in _BASIC_KINDS and not any(np.any(getattr(self, name)) for name in added)
 

@@ -12,7 +12,12 @@ from ..pose_track import PoseTrack, Window
 from . import first_guesses
 from .base import Block, Curve, MotionKind, MotionModel, Rates
 
-_SHARES = (0.0, 0.5, -0.5, 1.0)  # tried shares of the mean spin in the precession, which its rate does not show
+_SHARES = (
+    0.0,
+    0.5,
+    -0.5,
+    1.0,
+)  # tried shares of the mean spin in the precession; the rate of the spin leaves them open
 
 
 class Precession(MotionKind):

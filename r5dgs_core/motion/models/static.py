@@ -1,4 +1,4 @@
-"""A body that stays where it is at t_max."""
+"""A body that stays at its pose at t_max."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from .base import Curve, MotionModel, Rates
 from .twist import Twist
 
 _STEP_TOLERANCE = 1e-9  # allowed Magnus-4 error, in radii
-_MOST_STEPS = 1 << 20  # Magnus steps to one time
+_MOST_STEPS = 1 << 20  # maximum number of Magnus steps to one time
 _FIT_STEPS = 16  # number of Magnus steps per time when candidates are compared
 
 
@@ -85,7 +85,7 @@ def _poses(model: MotionModel, tau: np.ndarray, most_steps: int | None) -> se3.P
 def _shared_steps(model: MotionModel, taus: np.ndarray, needed: np.ndarray, most: int) -> se3.Pose:
     """Magnus-4 poses at times >= 0, each integrated from the previous one: [S] -> [S, 4], [S, 3].
 
-    All intervals between times take the same number of steps: enough for the step length that the hardest time needs,
+    All intervals between times take the same number of steps: enough for the shortest step length that any time needs,
     or as many as ``most`` allows.
     """
     v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration

@@ -45,10 +45,13 @@ def blend_backward(
     Gaussians. T_i is recovered as T_{i+1} / (1 - alpha_i).
 
     Args:
-        as in `blend`; d_image [H, W, D], d_alpha [H, W] and d_depth [H, W] are the gradients of the results, the
-            latter two empty if absent; with_geometry is True if more than the channels need gradients, otherwise
-            the moments are zero; slots [S, 16 k] is the result, see `projection.MOMENTS`; filled [S], initially
-            False, marks the slots that were written: those of pairs that contribute.
+        tile_starts, pair_rows, pair_slots: Pairs and their slots, see `tiles.assign_tiles`. [tiles + 1], [P], [P]
+        tile_ends, pair_blocks, geometry, channels, depths, background, limits: Inputs and results of `blend.blend`,
+            like alpha, depth, transmittance and last_pairs.
+        d_image, d_alpha, d_depth: Gradients of the results; the latter two empty if absent. [H, W, D], [H, W], [H, W]
+        with_geometry: True if more than the channels need gradients; otherwise the moments are zero.
+        slots: Result, see `projection.MOMENTS`. [S, 16 k]
+        filled: Result, initially False: mask of the written slots, those of pairs that contribute. [S]
     """
     height, width, n_channels = d_image.shape
     n_values, n_slots = padded(n_channels), slots.shape[1]

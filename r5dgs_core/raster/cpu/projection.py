@@ -39,7 +39,7 @@ GEOMETRY = 8
 FX, SKEW, CX, FY, CY, U_LOW, U_HIGH, V_LOW, V_HIGH, WIDTH, HEIGHT, NEAR, DILATION, ALPHA_MIN = range(14)
 ROTATION, TRANSLATION = 14, 23
 
-# Tiles of the image: side in px, and most per side, so that four tile indices fit into one float64.
+# Tiles of the image: side in px, and maximum number per side, so that four tile indices fit into one float64.
 TILE = 32  # larger tiles make fewer pairs; smaller ones finish earlier in opaque scenes
 MOST_TILES = 8191
 BOX_DIGIT = MOST_TILES + 1

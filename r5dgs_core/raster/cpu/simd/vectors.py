@@ -1,6 +1,6 @@
 """SIMD vectors as values in numba kernels: types, operators and common operations.
 
-Numba's automatic vectorization depends on what it can prove about a loop. Here it is explicit: every operation is one
+Numba's automatic vectorization depends on its analysis of a loop. Here vectors are explicit: every operation is one
 vector instruction, or two or four on machines with shorter vectors. The two types are `float32x16` and `float64x8`,
 each with a mask of booleans. Products and sums are fused only by `fma`, so that kernels with the same arithmetic make
 bit-identical decisions.
