@@ -36,7 +36,7 @@ def parse(
         place: Start of error messages: the file, or the member of a file.
         kind: Class of the error.
         remedy: End of error messages about damage.
-        finite: Refuse NaN, infinity and floats out of range; otherwise the caller checks its numbers.
+        finite: Reject NaN, infinity and floats out of range; otherwise the caller checks its numbers.
         memory: Memory limit of the result, without its text, bytes.
         size: Size limit of ``data``, bytes.
 
@@ -45,7 +45,7 @@ def parse(
 
     Raises:
         R5dgsError: Of class ``kind``: invalid JSON, too large, nested deeper than `MOST_DEPTH`, a repeated key in an
-            object, an unpaired surrogate, an integer of more than 64 bits, or a float that ``finite`` refuses.
+            object, an unpaired surrogate, an integer of more than 64 bits, or a float that ``finite`` rejects.
     """
     needed = memory_of(data)
     if len(data) > size or needed > memory:

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 SETTLED = 0.05  # share of the work before which the estimate may change without limit
-CHANGE = 0.2  # largest change between two reports, as a share of the estimate, in addition to SLACK_S
-SLACK_S = 2.0  # largest change between two reports, seconds, in addition to CHANGE
+CHANGE = 0.2  # maximum change between two reports, as a share of the estimate, in addition to SLACK_S
+SLACK_S = 2.0  # maximum change between two reports, seconds, in addition to CHANGE
 MEMORY = 0.03  # share of the work over which seconds per cost are averaged
 OUTLIER = 4.0  # limit of the seconds per cost of one report, as a multiple of the average
 

@@ -12,7 +12,7 @@ import numpy as np
 CLOCKS = ("wall", "cpu")
 SAMPLE_MS = 4.0  # minimum duration of a turn, milliseconds; shorter calls are repeated
 MOST_CALLS = 1000  # maximum calls per turn
-PATIENCE_MS = 30_000.0  # time of a contender's turns after which it takes no more than `ENOUGH`
+PATIENCE_MS = 30_000.0  # time of a contender's turns after which it takes at most `ENOUGH`
 ENOUGH = 3
 BUSY = 1.25  # ratio of wall to single-thread processor time above which the machine counts as busy
 Key = TypeVar("Key", bound=Hashable)
@@ -84,7 +84,7 @@ def take(calls: Mapping[Key, Callable[[], object] | Contender], rounds: int) -> 
     """Time callables in interleaved rounds.
 
     Args:
-        calls: The callables, or contenders that take their turns in a way of their own.
+        calls: The callables, or contenders with their own way to take turns.
         rounds: Turns of each, >= 1; slow ones take fewer (`PATIENCE_MS`). Every other round is reversed, so that no
             call always follows the same one.
 

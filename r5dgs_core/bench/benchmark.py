@@ -50,7 +50,7 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
     records: list[dict[str, Any]] = []
     failures: list[dict[str, Any]] = []
     result: dict[str, Any] = {}
-    with make_progress(progress_kind) as progress, interrupt.at_once("stopped; give the same command to go on"):
+    with make_progress(progress_kind) as progress, interrupt.at_once("stopped; repeat the same command to continue"):
         progress({"event": "prepare", "text": "kernels"})
         warm_up.warm_up()
         for index, case in enumerate(planned):
@@ -72,7 +72,7 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
         raise TrainingError(
             f"{len(failures)} of {len(planned)} runs failed, the first one {failures[0]['scene']}, "
             f"{failures[0]['variant']}, seed {failures[0]['seed']}: {failures[0]['error']}; "
-            f"see {plan.out / TABLES_FILE}, and give the same command to try them again"
+            f"see {plan.out / TABLES_FILE}, and repeat the same command to try them again"
         )
     return result
 

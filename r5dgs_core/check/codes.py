@@ -58,11 +58,11 @@ CODES: dict[str, Code] = {
     "S16": Code(WARNING, "nearly all Gaussians transparent", "train longer"),
     "R01": Code(ERROR, "run.json damaged", "train again, or restore the file from a backup"),
     "R02": Code(ERROR, "no checkpoint", "train with --resume, or again"),
-    "R03": Code(ERROR, "checkpoint damaged", "go on from the previous one with --resume, or train again"),
+    "R03": Code(ERROR, "checkpoint damaged", "continue from the previous one with --resume, or train again"),
     "R04": Code(ERROR, "evaluation.json damaged", "run 'r5dgs evaluate' again"),
     "R10": Code(WARNING, "data set of the run missing or faulty", "give its new place with --data"),
     "R11": Code(WARNING, "data set changed since the training", "train again, or evaluate with the old data"),
-    "R12": Code(WARNING, "training not finished", "go on with --resume"),
+    "R12": Code(WARNING, "training not finished", "continue with --resume"),
     "P01": Code(ERROR, "PLY file damaged or of another kind", "export it again"),
     "C01": Code(ERROR, "configuration refused", "correct the key; 'r5dgs config' lists all of them"),
 }  # fmt: skip

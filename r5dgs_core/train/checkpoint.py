@@ -148,7 +148,7 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
             (run.folder / name).unlink(missing_ok=True)
         atomic_files.write(run.folder / RUN_FILE, json.dumps(text, indent=2).encode())
     except OSError as error:
-        raise CheckpointError(f"{run.folder}: cannot be made or written: {error}; choose another --out") from error
+        raise CheckpointError(f"{run.folder}: cannot be created or written: {error}; choose another --out") from error
     return run
 
 
@@ -172,10 +172,10 @@ def refuse_to_lose(folder: Path) -> None:
     if not (folder / RUN_FILE).exists() or newest_file(folder) is None:
         return
     try:
-        found = f"a run at step {load(folder).iteration}; add --resume to go on, or"
+        found = f"a run at step {load(folder).iteration}; add --resume to continue, or"
     except CheckpointError:
         found = "a run whose checkpoint cannot be read; add"
-    raise CheckpointError(f"{folder}: holds {found} --overwrite to begin again")
+    raise CheckpointError(f"{folder}: holds {found} --overwrite to start again")
 
 
 def open_run(folder: Path) -> Run:
@@ -229,7 +229,8 @@ def save(folder: Path, state: Checkpoint) -> None:
         checkpoint_file.write(path, {"format_version": FORMAT_VERSION, **content}, previous)
     except OSError as error:
         raise CheckpointError(
-            f"{path}: cannot be written: {error}; the checkpoint before it is kept. Make room and go on with --resume"
+            f"{path}: cannot be written: {error}; the previous checkpoint is kept. "
+            "Free disk space and continue with --resume"
         ) from error
 
 
@@ -246,7 +247,7 @@ def load(folder: Path, *, mend: bool = False) -> Checkpoint:
     """
     path, previous = (Path(folder) / name for name in GENERATIONS)
     if newest_file(folder) is None:
-        raise CheckpointError(f"{path}: no checkpoint yet; go on with 'r5dgs train ... --resume'")
+        raise CheckpointError(f"{path}: no checkpoint yet; continue with 'r5dgs train ... --resume'")
     try:
         return read(path)
     except CheckpointError as error:
@@ -257,7 +258,7 @@ def load(folder: Path, *, mend: bool = False) -> Checkpoint:
         except CheckpointError as other:
             also = f"; {other}" if previous.exists() else ""
             raise CheckpointError(f"{error}{also}; train again with --overwrite") from error
-        log.warning("%s; taking the checkpoint before it, %s of step %d", error, previous.name, state.iteration)
+        log.warning("%s; using the previous checkpoint, %s of step %d", error, previous.name, state.iteration)
     if mend:
         try:
             os.replace(previous, path)

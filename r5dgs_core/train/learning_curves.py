@@ -15,8 +15,8 @@ from .checkpoint import CURVES_FILE, LOG_FILE
 
 log = logging.getLogger(__name__)
 
-EVERY_S = 30.0  # shortest interval between two plots during a run, s
-SHARE = 0.02  # largest share of the run's time that plots may take
+EVERY_S = 30.0  # minimum interval between two plots during a run, s
+SHARE = 0.02  # maximum share of the run's time for plots
 PANELS = (("loss", "loss", "log"), ("val_psnr", "held-out views, dB", "linear"), ("gaussians", "Gaussians", "linear"))
 
 

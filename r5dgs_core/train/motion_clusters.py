@@ -24,12 +24,12 @@ SHARE = 0.12  # allowed residual / travel of a point; fields bend rigid motions 
 PROPOSALS = 48  # per part
 NEIGHBOURHOOD = 24  # points per proposal
 LINKS = 8  # nearest neighbours that a point may be connected with
-REACH = 4.0  # longest connection / median distance of nearest neighbours
+REACH = 4.0  # maximum connection / median distance of nearest neighbours
 REFITS = 4
-JOINT = 0.7  # smallest share of inliers in both parts for a merge
+JOINT = 0.7  # minimum share of inliers in both parts for a merge
 LOOSE = 1.5  # factor on the allowed residual for a merge
 LATE = 1.5  # factor on the allowed residual for points that are added at the end
-MOST = 4000  # largest number of sampled points
+MOST = 4000  # maximum number of sampled points
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def find(paths: np.ndarray, weights: np.ndarray, tolerance: float, fewest: int, 
         paths: Positions of the points over time. [R, S, 3]
         weights: Weights of the points. [R]
         tolerance: Residual allowed for points that hardly move, units of the paths.
-        fewest: Smallest number of points of a part; smaller parts are dropped.
+        fewest: Minimum number of points of a part; smaller parts are dropped.
         rng: Random generator.
 
     Returns:

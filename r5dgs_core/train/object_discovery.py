@@ -30,13 +30,13 @@ from .trainer import Trainer
 
 log = logging.getLogger(__name__)
 
-JUDGES = 20  # views that decide if a part must move
-GAIN = 2.0  # smallest gain in PSNR by the motion of a part, dB
+JUDGES = 20  # number of views that decide if a part is needed
+GAIN = 2.0  # minimum gain in PSNR by the motion of a part, dB
 OPAQUE = 0.3  # opacity below which Gaussians do not define parts
 TOLERANCE = 0.02  # residual allowed for points that hardly move, normalised units
-SPECK = 0.1  # smallest piece of a mask / its largest piece
+SPECK = 0.1  # minimum size of a piece of a mask / size of its largest piece
 NAME = "discovery"  # name of the progress events
-CAP = 12000  # largest number of Gaussians in the short run
+CAP = 12000  # maximum number of Gaussians in the short run
 
 
 def find(

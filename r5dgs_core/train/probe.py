@@ -18,7 +18,7 @@ from .train_views import spread
 if TYPE_CHECKING:
     from .trainer import Trainer
 
-TRAINING_VIEWS = 150  # largest number of compared training views
+TRAINING_VIEWS = 150  # maximum number of compared training views
 
 
 class Probe:
@@ -26,7 +26,7 @@ class Probe:
 
     Args:
         trainer: The run; its ``dataset`` provides the views.
-        count: Largest number of views.
+        count: Maximum number of views.
 
     Raises:
         DatasetError: An image cannot be read.

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 Progress = Callable[[dict[str, Any]], None]
 
 MARGIN = 2  # dilation of masks in the comparison, px; non-rigid parts cross the edge
-HELD_SHARE, MAX_HELD = 0.2, 20  # share and largest number of views held out for the comparison
+HELD_SHARE, MAX_HELD = 0.2, 20  # share and maximum number of views held out for the comparison
 MIN_PIXELS = 50  # pixels of a body in the held-out views below which its gain is unknown
 TRIAL = "trial"  # name of the progress events
 SEED_STEP = 2  # added to the run's seed for the trial's generator

@@ -113,7 +113,7 @@ def _train(
         count = len(state.tensors["gaussians.means"])
         progress({"event": "trained", "gaussians": count, "text": "already finished"})
         return run
-    kept = f"{folder} is as it was; give the same command to begin again" if replaces else f"go on with: {go_on}"
+    kept = f"{folder} is unchanged; repeat the same command to start again" if replaces else f"continue with: {go_on}"
     with interrupt.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
         progress({"event": "prepare", "text": "kernels"})
         warm_up.warm_up()
@@ -131,7 +131,7 @@ def _train(
     pictures = learning_curves.Curves(run.folder)
     _plan(trainer, progress)
     _optimise(trainer, run, began, began_cpu, go_on, progress, probe, pictures)
-    with interrupt.at_once(f"stopped after the last step, before the labels; go on with: {go_on}"):
+    with interrupt.at_once(f"stopped after the last step, before the labels; continue with: {go_on}"):
         _save(trainer, run, began, finished=True, extra=finish.outcome(trainer, progress))
         pictures.update(finished=True)
     progress({"event": "trained", "gaussians": len(trainer.gaussians)})
@@ -255,7 +255,7 @@ def _optimise(
                 _save(trainer, run, began, finished=False)
                 pictures.update()
             if stop:
-                raise Interrupted(f"stopped at step {trainer.iteration}; go on with: {go_on}")
+                raise Interrupted(f"stopped at step {trainer.iteration}; continue with: {go_on}")
 
 
 def _save(

@@ -40,7 +40,7 @@ class StepLog:
             self._stream.flush()
         except OSError as error:
             place = f"{self._path}: cannot be written: {error}"
-            raise CheckpointError(f"{place}; make room and go on with --resume") from error
+            raise CheckpointError(f"{place}; free disk space and continue with --resume") from error
 
 
 def clean_up(path: Path, iteration: int) -> None:

@@ -1,8 +1,8 @@
 """Trainer of canonical Gaussians and their motion, from posed images with masks.
 
-Each step poses the Gaussians at the time of one view, rasterizes and compares. Training starts at one well-seen time
-and adds the others outwards; densification adds Gaussians. `Trainer.state` contains everything that a step depends on,
-so a resumed run gives the same numbers as an uninterrupted one.
+Each step poses the Gaussians at the time of one view, rasterizes and compares. Training starts at one time with good
+visibility and adds the others outwards; densification adds Gaussians. `Trainer.state` contains everything that a step
+depends on, so a resumed run gives the same numbers as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from .representations.representation import Representation
 
 log = logging.getLogger(__name__)
 
-TARGET_BYTES = 1 << 30  # largest cache of training images as floats
-EYES = 256  # largest number of cameras in tests of visibility
+TARGET_BYTES = 1 << 30  # maximum size of the cache of training images as floats
+EYES = 256  # maximum number of cameras in tests of visibility
 HOLD_EVERY = 100  # steps between updates of the held Gaussians
 HELD = "held"  # name of a tensor of the state: mask of the Gaussians whose centres are frozen
 

@@ -43,7 +43,7 @@ class EditedPoints:
         decoded = {key: _edit_of(value) for key, value in new.items()}
         missing = [key for key in keys if not isinstance(key, str) or key not in decoded and key not in self._edits]
         if missing:
-            raise errors.ConfigError(f"worker: 'points' needs the edits {missing!r}, which it does not hold")
+            raise errors.ConfigError(f"worker: 'points' refers to unknown edits {missing!r}")
         self._edits = {key: decoded[key] if key in decoded else self._edits[key] for key in keys}
 
     def extend(self, scenes: list[Scene], wanted: list[tuple[int, str]]) -> tuple[list[Scene], Places]:
@@ -61,7 +61,7 @@ class EditedPoints:
         """
         lost = [key for _, key in wanted if key not in self._edits]
         if lost:
-            raise errors.ConfigError(f"worker: the edits {lost!r} of points are not held; send 'points' first")
+            raise errors.ConfigError(f"worker: unknown point edits {lost!r}; send 'points' first")
         before, edits = self._shown
         if edits == wanted and len(before) == len(scenes) and all(map(operator.is_, before, scenes)):
             return self._extended

@@ -101,12 +101,12 @@ def run_demo(
             go_on=go_on,
             progress=progress,
         )
-        with interrupt.at_once(f"stopped after training; go on with: {go_on}"), folder_lock.hold(out):
+        with interrupt.at_once(f"stopped after training; continue with: {go_on}"), folder_lock.hold(out):
             scene_path = out / "demo.r5dgs"
             scene, dataset, result = _bake_and_evaluate(trained, data, scene_path, progress)
     if progress_kind != "json":
         terminal.console().print(evaluation_table.make(result))
-    stopped = f"stopped before the contact sheet; go on with: {go_on}"
+    stopped = f"stopped before the contact sheet; continue with: {go_on}"
     with make(progress_kind) as progress, interrupt.at_once(stopped), folder_lock.hold(out):
         json_path = evaluate.write(result, out / checkpoint.EVALUATION_FILE)
         progress({"event": "sheet", "text": "contact sheet"})

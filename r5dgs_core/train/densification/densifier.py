@@ -28,7 +28,7 @@ class Conditions:
     """Properties of the run that a strategy depends on.
 
     Attributes:
-        cap: Largest number of Gaussians, from the start and after each step.
+        cap: Maximum number of Gaussians, from the start and after each step.
         iterations: Steps of the whole run.
         pixel_size: Typical size of a pixel at the objects, normalised units.
         image_width: Typical width of an image, px.
@@ -194,7 +194,7 @@ def floaters(gaussians: Gaussians, eyes: Sequence[Camera], distance: float) -> T
     Args:
         gaussians: The Gaussians.
         eyes: The distinct training cameras.
-        distance: Largest distance that counts as close, normalised units; nothing is masked if it is 0.
+        distance: Maximum distance that counts as close, normalised units; nothing is masked if it is 0.
 
     Returns:
         Mask. [N] bool

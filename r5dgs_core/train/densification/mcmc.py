@@ -18,7 +18,7 @@ from ...scene.cameras import Camera
 from . import densifier
 from .densifier import Conditions
 
-MOST = 51  # largest number of Gaussians that replace one
+MOST = 51  # maximum number of Gaussians that replace one
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005  # sigmoid gate of the noise over opacity
 
 

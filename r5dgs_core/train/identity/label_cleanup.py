@@ -35,10 +35,10 @@ MOTION = 0.5  # weight of the group that it moves with relative to its neighbour
 DOUBT = 1.0  # votes with a trust of one half, pixels
 UNDECIDED = 0.55  # share of own label in the votes for it and the new one, above which an object's Gaussian keeps it
 UNDECIDED_BACKGROUND = 0.45  # the same for Gaussians of the background
-APART = 5.0  # longest link between members of an object / their typical spacing
+APART = 5.0  # maximum link between members of an object / their typical spacing
 SMALL = 0.05  # share of an object's total opacity above which a part is never an outlier
 SUPPORTED = 0.65  # trusted share of a part's votes above which it is no outlier
-FEWEST = 9  # smallest number of members for statistics of an object
+FEWEST = 9  # minimum number of members for statistics of an object
 MOVES = 0.1  # displacement in radii above which an object counts as moving
 AGREED = 0.5  # median certainty of the objects below which the masks contradict each other
 AT_ONCE = 1 << 16  # Gaussians per block; bounds memory
@@ -80,7 +80,7 @@ def clean(
         points: Centres in the bind state. [N, 3]
         opacities: [N]
         going: Class of the body that a Gaussian moves with, 0 for none; None if unknown. [N]
-        moving: Classes that can be told from the background by their motion. [C] bool
+        moving: Classes that differ from the background by their motion. [C] bool
 
     Returns:
         Classes [N] int64, and the counts of changes.

@@ -22,7 +22,7 @@ from .triangulation import Places
 
 TEXTURE = 0.1  # change of colour per radian (root mean square) that makes rotation observable
 STIFFEST = 100.0  # factor on the smoothness of a track if nothing is visible
-CLEARER = 0.03  # mean colour difference that noise may cause
+CLEARER = 0.03  # maximum mean colour difference due to noise
 DISC = 0.6  # radius of the compared disc / radius of the body
 HIDDEN = 0.1  # share of the disc covered by other objects above which a view is ignored
 FEWEST_FRAMES, MOST_FRAMES = 2, 15  # frames of a camera for the colours without the object
@@ -127,7 +127,7 @@ def absent(views: Sequence[TrainView], places: Places, times: np.ndarray) -> np.
 
     Args:
         views: Training views.
-        places: Positions of the objects, interpolated where they are not visible.
+        places: Positions of the objects, interpolated at times at which they are not visible.
         times: The observed times. [S]
 
     Returns:

@@ -17,7 +17,7 @@ from ...scene import sh_color
 from . import shadows
 
 SHADOW_OPACITY = 0.03
-SHADOW_LIFT = (0.02, 0.01)  # smallest height above the plane, and range above it
+SHADOW_LIFT = (0.02, 0.01)  # minimum height above the plane, and range above it
 SHADOW_THICKNESS = 0.01
 SCALES = (0.005, 0.2)  # limits of the initial standard deviations
 

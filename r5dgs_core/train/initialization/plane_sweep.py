@@ -1,8 +1,8 @@
 """Plane sweep that places the initial static background.
 
-Each camera has one image without objects (`background_images`). For a grid
-of its rays, a range of depths is compared; at a good depth the other cameras see the same colour. Rays on which
-infinity is as good as any depth show sky and place no points; the learned background represents them.
+Each camera has one image without objects (`background_images`). For a grid of its rays, a range of depths is compared;
+at a good depth the other cameras show the same colour. Rays on which infinity is as good as any depth show sky and
+place no points; the learned background represents them.
 
 Notation: B background images, [h, w] a grid of rays, D depths.
 """
@@ -27,9 +27,9 @@ MAX_NEIGHBOURS = 8
 COST_VALUES = 1 << 22  # colour differences per compared band
 NEAREST, FARTHEST = 0.4, 60.0  # normalised units; the cameras' focus is at about 4
 INFINITE = 1e5
-PLANE_REACH = 12.0  # largest depth of rays that extend the plane beyond its region, normalised units
-SAME = 0.012  # insignificant colour difference
-GOOD = 0.12  # larger colour differences are no match
+PLANE_REACH = 12.0  # maximum depth of rays that extend the plane beyond its region, normalised units
+SAME = 0.012  # maximum insignificant colour difference
+GOOD = 0.12  # maximum colour difference of a match
 CONFIRMATIONS = 2  # other cameras that must agree on a depth
 
 
@@ -146,8 +146,8 @@ class Sweep:
         """Draw background points and fit the sky.
 
         Rays on which the supporting plane is as good as the best depth are placed on the plane: within the region in
-        which it was found and, if the sky is known, everywhere near that is not sky. Rays of the sky and rays without a
-        distinct depth place no points. The others are placed at their best depth if other cameras confirm it.
+        which it was found and, if the sky is known, on all near rays that do not show sky. Rays of the sky and rays
+        without a distinct depth place no points. The others are placed at their best depth if other cameras confirm it.
 
         Args:
             count: Number of points.

@@ -57,7 +57,7 @@ def behind_objects(
         points: Points, normalised coordinates. [P, 3]
         colors: Their colours. [P, 3]
         views: Training views.
-        count: Largest number of points.
+        count: Maximum number of points.
         rng: Random generator.
 
     Returns:

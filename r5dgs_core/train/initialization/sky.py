@@ -13,7 +13,7 @@ import numpy as np
 from ...scene import sh_color
 
 DEGREE = 2
-AGREES = 0.025  # largest colour difference at which a ray is sky
+AGREES = 0.025  # maximum colour difference at which a ray is sky
 MIN_SHARE = 0.25  # share of the candidate rays that must agree
 ROUNDS = 6
 

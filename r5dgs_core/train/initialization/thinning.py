@@ -19,7 +19,7 @@ def thin(gaussians: Gaussians, cap: int, rng: np.random.Generator) -> Gaussians:
 
     Args:
         gaussians: The Gaussians before training.
-        cap: Largest number of them, at least 1.
+        cap: Maximum number of them, at least 1.
         rng: Random generator; not used if no thinning is necessary.
 
     Returns:

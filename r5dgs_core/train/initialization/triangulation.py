@@ -26,7 +26,7 @@ ACCELERATION = 10.0  # standard deviation of the path's acceleration, units per 
 VELOCITY = 30.0  # standard deviation of its velocity, units per span; long gaps slowly bring the path to rest
 DEPTH_NOISE = 3.0  # standard deviation of the prior depth, that of the cameras' focus, normalised units
 CUT_OFF = 0.003  # weight of masks that the image border cuts
-PLACED = 0.05  # largest standard deviation of a measured position, normalised units
+PLACED = 0.05  # maximum standard deviation of a measured position, normalised units
 ROUNDS = 5
 
 
@@ -36,7 +36,7 @@ class Places:
 
     Attributes:
         object_ids: Ids that occur in the masks. [M]
-        centers: Centres, on a smooth path where they could not be measured. [M, S, 3]
+        centers: Centres; unmeasured ones are on a smooth path through the others. [M, S, 3]
         measured: Times at which the masks determine the centre. [M, S] bool
         visibility: Share of the views at that time that show the whole object, weighted by its area. [M, S]
         radii: Radius of a ball that contains the object. [M]
@@ -68,7 +68,7 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> P
     Args:
         views: Training views; those without a mask are ignored.
         times: Observed times, increasing. [S]
-        min_share: Size of the smallest mask to use, as a share of the image.
+        min_share: Minimum size of a mask to use, as a share of the image.
 
     Returns:
         The positions. An object that is never visible from two sides gets the depth of the cameras' focus. An object in

@@ -7,8 +7,8 @@ Within the horizon, a training step draws a start t' = t -+ h; the field moves t
 there to t in one step. Past the horizon, the TRD moves them from T to t. The TRD starts at positions without gradient:
 its displacement trains the TRD, the position itself trains the field.
 
-Source: TRACE's training scheme. Ours are the restriction to movers, the fits to positions and to motion without images,
-    and the cross-Gaussian twist loss.
+Source: TRACE's training scheme, with these additions: the restriction to movers, the fits to positions and to motion
+    without images, and the cross-Gaussian twist loss.
 """
 
 from __future__ import annotations

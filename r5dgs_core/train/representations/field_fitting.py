@@ -1,7 +1,7 @@
 """Fits of the deformation field and the TRD to motion alone, without images.
 
-They are fast and determine what images leave open. Images only show a Gaussian's velocity v + w x p at its own
-position: its spin w is free, and a field puts rotation into velocities that depend on position. The cross-Gaussian
+They are fast and determine motion that images leave open. Images only show a Gaussian's velocity v + w x p at its own
+position: its spin w is free, and a field represents rotation by velocities that depend on position. The cross-Gaussian
 twist loss removes this ambiguity: the twist of one Gaussian must also move another Gaussian of the same group.
 """
 

@@ -43,7 +43,7 @@ class Motion:
         clock: Conversion of scene time to network time.
         start: First observed scene time.
         horizon: Scene time T.
-        step: Scene time h that the TRD bridges in training.
+        step: Time step h of the TRD in training, scene time.
         chunk: Gaussians per forward pass.
     """
 

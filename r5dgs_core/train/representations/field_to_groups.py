@@ -147,8 +147,8 @@ def _motion_ids(trained: np.ndarray, labels: np.ndarray, rows: np.ndarray, alone
         own = labels[rows].astype(np.int64)
     result = np.zeros(len(labels), np.int64)
     result[rows] = own
-    resting = ~np.isin(labels, own)  # objects without movers are groups, too,
-    resting[rows] = False  # but movers stay in their groups even if the masks label them as background
+    resting = ~np.isin(labels, own)  # objects without movers are groups, too
+    resting[rows] = False  # movers stay in their groups even if the masks label them as background
     result[resting] = labels[resting]
     return result
 

@@ -25,11 +25,11 @@ def by_name(name: str) -> type[Representation]:
 
         return FieldRepresentation
     known = ", ".join((TRACKS, FIELD, STILL))
-    raise CheckpointError(f"the checkpoint was trained with representation '{name}'; this version knows {known}")
+    raise CheckpointError(f"the checkpoint was trained with representation '{name}'; this version supports {known}")
 
 
 def configured(config: Config, still: bool = False) -> type[Representation]:
-    """Return the representation that a run trains, at last; ``still`` if nothing moves."""
+    """Return the final representation of a run: the configured one, or that of a static scene if ``still``."""
     return by_name(STILL if still else config.train.representation)
 
 

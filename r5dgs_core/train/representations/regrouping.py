@@ -24,15 +24,15 @@ from ..observed_motion import GroupTrack, Moves
 
 log = logging.getLogger(__name__)
 
-BETTER = 0.5  # largest error in the new group / error in the current group
-NOTICED = 0.08  # smallest error in the current group, radii
-EXPLAINED = 0.3  # largest error in the new group, radii
-NEAR = 1.5  # largest distance from the members of the new group, radii
+BETTER = 0.5  # maximum error in the new group / error in the current group
+NOTICED = 0.08  # minimum error in the current group, radii
+EXPLAINED = 0.3  # maximum error in the new group, radii
+NEAR = 1.5  # maximum distance from the members of the new group, radii
 FLOATING = 2.0  # distance above which a member is a floater / 90 % quantile of the distances
-ROUNDS = 8  # largest number of rounds of regrouping and refitting
-REACH = 4.0  # largest distance of a shadow from its caster along the plane, radii
-STEEPEST = 4.0  # largest shift of a shadow / rise of its caster: light from 14 degrees above the plane
-FEWEST = 5  # smallest number of Gaussians in a shadow
+ROUNDS = 8  # maximum number of rounds of regrouping and refitting
+REACH = 4.0  # maximum distance of a shadow from its caster along the plane, radii
+STEEPEST = 4.0  # maximum shift of a shadow / rise of its caster: light from 14 degrees above the plane
+FEWEST = 5  # minimum number of Gaussians in a shadow
 AT_ONCE = 8192  # Gaussians per block; bounds memory
 
 

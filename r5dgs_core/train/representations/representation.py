@@ -92,14 +92,14 @@ class Representation:
         raise NotImplementedError
 
     def restored(self, name: str, tensors: dict[str, Tensor]) -> Representation:
-        """Return the representation ``name`` with a checkpoint's state: this one, or one that `before_step` gives.
+        """Return the representation ``name`` with a checkpoint's state: this one, or one that `before_step` returns.
 
         Raises:
             CheckpointError: The checkpoint has another representation than the configuration.
         """
         if name != self.name:
             raise CheckpointError(
-                f"the checkpoint was trained with representation '{name}', the configuration asks for '{self.name}'"
+                f"the checkpoint was trained with representation '{name}', the configuration has '{self.name}'"
             )
         self.restore(tensors)
         return self

@@ -1,5 +1,4 @@
-"""Rigidity of objects under a deformation: L_rigid of the paper and its absolute form, and the distance from a group's
-best rigid motion.
+"""Rigidity losses: L_rigid of the paper, its absolute form, and the deviation from a group's best rigid motion.
 
 Notation: N Gaussians, C classes, class 0 the background; -1 for none.
 """

@@ -25,7 +25,7 @@ from . import fused_posing
 from .representation import STILL, Representation
 
 BLOCK = 4  # side of the averaged blocks, px
-CHANGE = 3.0  # smallest significant change of a block, levels of 255
+CHANGE = 3.0  # minimum significant change of a block, levels of 255
 NOISE = 8.0  # the same in standard deviations of the change over all blocks
 NOTHING = 0.3  # lower limit of the noise of 8-bit images, levels of 255
 

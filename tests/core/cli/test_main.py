@@ -240,7 +240,7 @@ def test_missing_bundled_data_raises(monkeypatch, capsys, tmp_path):
 def test_a_second_run_does_not_replace_the_first(made, tiny, capsys):
     before = (made[0] / "checkpoint.pt").read_bytes()
     line = complaint(capsys, "train", tiny.root, "--out", made[0], *OPTIONS)
-    assert f"{made[0]}: holds a run at step 20; add --resume to go on, or --overwrite to begin again" in line
+    assert f"{made[0]}: holds a run at step 20; add --resume to continue, or --overwrite to start again" in line
     assert (made[0] / "checkpoint.pt").read_bytes() == before
 
 
@@ -254,7 +254,9 @@ def test_paths_of_the_wrong_kind_are_errors_of_one_line(made, tiny, tmp_path, ca
     file = tmp_path / "letter.txt"
     file.write_text("mine")
     assert f"{file}: not a run folder" in complaint(capsys, "bake", file, "--out", tmp_path / "x.r5dgs")
-    assert f"{file / 'run'}: cannot be made" in complaint(capsys, "train", tiny.root, "--out", file / "run", *OPTIONS)
+    assert f"{file / 'run'}: cannot be created" in complaint(
+        capsys, "train", tiny.root, "--out", file / "run", *OPTIONS
+    )
     assert f"{file}: exists and is not a run" in complaint(capsys, "train", tiny.root, "--out", file, *OPTIONS)
     assert f"{tmp_path}: cannot be read" in complaint(
         capsys, "train", tiny.root, "--out", tmp_path / "r", "--config", tmp_path
@@ -326,7 +328,7 @@ def test_the_demo_may_be_run_twice_and_does_not_replace_other_runs(small_demo, m
     assert "leave out --preset, --config, --set, --iterations" in line
     monkeypatch.setattr(demo, "DATASET", "another data set")
     line = complaint(capsys, *small_demo, "--out", made[0])
-    assert "add --resume to go on, or --overwrite" in line
+    assert "add --resume to continue, or --overwrite" in line
 
 
 @pytest.mark.parametrize("moment", [{"event": "step", "iteration": 10}, {"event": "evaluate", "done": 1}])
@@ -340,7 +342,7 @@ def test_a_stopped_demo_prints_the_command_that_continues_it(small_demo, tmp_pat
     with monkeypatch.context() as patch:
         patch.setattr(progress, "make", stopping)
         assert main.main([*small_demo, "--out", str(out)]) == 130
-    command = shlex.split(capsys.readouterr().err.split("go on with: ")[1])
+    command = shlex.split(capsys.readouterr().err.split("continue with: ")[1])
     assert command == ["r5dgs", "demo", "--out", str(out), "--resume"]
     assert main.main([*command[1:], "--progress", "none"]) == 0
     assert (out / "contact_sheet.png").exists()

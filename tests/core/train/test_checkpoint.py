@@ -200,5 +200,5 @@ def test_a_configuration_of_another_version_is_named_with_the_remedy(tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(CheckpointError, match="file/run: cannot be made or written: .*choose another --out"):
+    with pytest.raises(CheckpointError, match="file/run: cannot be created or written: .*choose another --out"):
         checkpoint.create_run(tmp_path / "file" / "run", dataset(), config.Config())

@@ -157,7 +157,7 @@ def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
     assert len(bake.bake(tiny_datasets.as_trained(checkpoint.open_run(newest.parent))).gaussians.means) > 0
     caplog.clear()
     assert main.main(["train", str(tiny.root), "--out", str(newest.parent), "--resume", "--progress", "none"]) == 0
-    told = [record.getMessage() for record in caplog.records if "checkpoint before it" in record.getMessage()]
+    told = [record.getMessage() for record in caplog.records if "previous checkpoint" in record.getMessage()]
     assert len(told) == 1 and str(newest) in told[0] and previous.name in told[0] and "\n" not in told[0]
     assert_same(checkpoint.load(newest.parent), checkpoint.load(reference))
     assert steps(newest.parent) == steps(reference)

@@ -98,7 +98,7 @@ def stop_at(step, number, options, folder):
     else:
         assert process.returncode == 130
         assert complaint == (
-            f"r5dgs: stopped at step {stopped.iteration}; go on with: "
+            f"r5dgs: stopped at step {stopped.iteration}; continue with: "
             f"r5dgs train {options[1]} --out {folder} --resume\n"
         )
 
@@ -131,7 +131,7 @@ def test_a_run_stopped_beside_its_steps_names_the_way_to_go_on(tiny, unbroken, t
 
     with pytest.raises(Interrupted) as stopped:
         run.train(tiny.root, folder, settings, progress=stop)
-    command = shlex.split(str(stopped.value).split("go on with: ")[1])
+    command = shlex.split(str(stopped.value).split("continue with: ")[1])
     assert command == ["r5dgs", "train", str(tiny.root.resolve()), "--out", str(folder), "--resume"]
     assert main.main([*command[1:], "--progress", "none"]) == 0
     assert_equal_runs(folder, unbroken[0])
@@ -204,12 +204,12 @@ def copied(unbroken, tmp_path):
 
 def test_a_run_is_replaced_only_on_request(tiny, copied):
     before = contents(copied)
-    with pytest.raises(CheckpointError, match="holds a run at step 150; add --resume to go on, or --overwrite"):
+    with pytest.raises(CheckpointError, match="holds a run at step 150; add --resume to continue, or --overwrite"):
         run.train(tiny.root, copied, tiny_datasets.settings())
     torn = dict.fromkeys(checkpoint.GENERATIONS, b"torn")
     for file, content in torn.items():
         (copied / file).write_bytes(content)
-    with pytest.raises(CheckpointError, match="cannot be read; add --overwrite to begin again"):
+    with pytest.raises(CheckpointError, match="cannot be read; add --overwrite to start again"):
         run.train(tiny.root, copied, tiny_datasets.settings())
     assert contents(copied) == {**before, **torn}
 
@@ -229,7 +229,7 @@ def test_a_run_stays_where_the_one_that_replaces_it_cannot_begin(tiny, copied, m
 
     monkeypatch.setattr(run, "Trainer", fail)
     before = contents(copied)
-    with pytest.raises((TrainingError, Interrupted), match=r"no start|is as it was; give the same command"):
+    with pytest.raises((TrainingError, Interrupted), match=r"no start|is unchanged; repeat the same command"):
         run.train(tiny.root, copied, tiny_datasets.settings(), overwrite=True)
     assert contents(copied) == before
 

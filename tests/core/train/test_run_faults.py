@@ -124,7 +124,7 @@ def test_a_full_disk_stops_a_run_that_goes_on_when_there_is_room(tiny, reference
     options = ["train", tiny.root, "--out", folder, "--resume", "--progress", "none"]
     full = processes.run(FULL_DISK, len(before) // 2, *options)
     assert full.returncode == 3
-    assert "checkpoint.pt: cannot be written" in full.stderr and "the checkpoint before it is kept" in full.stderr
+    assert "checkpoint.pt: cannot be written" in full.stderr and "the previous checkpoint is kept" in full.stderr
     assert "Traceback" not in full.stderr
     assert path.read_bytes() == before and not list(folder.glob(".*.part"))
     assert_equal(resumed(tiny.root, folder), reference)
@@ -134,7 +134,7 @@ def test_a_full_disk_stops_a_run_that_goes_on_when_there_is_room(tiny, reference
 def test_a_full_disk_at_the_very_start_is_one_line(tiny, tmp_path):
     full = processes.run(FULL_DISK, 1000, *arguments(tiny.root, tmp_path / "run"))
     assert full.returncode == 3 and "Traceback" not in full.stderr
-    assert f"{tmp_path / 'run'}: cannot be made or written" in full.stderr
+    assert f"{tmp_path / 'run'}: cannot be created or written" in full.stderr
 
 
 @pytest.fixture
