@@ -79,10 +79,10 @@ def reduce(
         radius: Largest distance of a point from the pivot, world units.
         kinks: Increasing times at which slopes jump. Those inside (t0, t1) get a key with the slopes of both sides, but
             not those within ``nearest`` of the previous one, and no more than one per `FEWEST_INTERVALS` of ``most``.
-        nearest: Least time between candidate keys, for editors that merge closer keys.
-        frames: Frames of the editor. A curve that four keys per frame do not reproduce gets one key per frame; so does
-            a rotation of more than `MAX_FRAME_TURN_RAD` per frame.
-        most: Largest number of intervals between keys, >= `FEWEST_INTERVALS`. If there are more frames, a curve with
+        nearest: Minimum time between candidate keys, for editors that merge closer keys.
+        frames: Frames of the editor. A curve that four keys per frame do not reproduce, or a rotation of more than
+            `MAX_FRAME_TURN_RAD` per frame, gets one key per frame.
+        most: Maximum number of intervals between keys, >= `FEWEST_INTERVALS`. If there are more frames, a curve with
             one key per frame gets a key at every n-th frame.
 
     Returns:
@@ -144,7 +144,7 @@ def _smooth(sample: Sampler, t0: float, t1: float, limits: _Limits) -> cubic_cur
 
 
 def _sampled(sample: Sampler, t0: float, t1: float, limits: _Limits) -> tuple[tuple[_Curve, _Curve], tuple[bool, bool]]:
-    """Sample on ever finer grids until single intervals are within the tolerance, or the limits of `reduce` are met.
+    """Sample on finer grids until single intervals are within the tolerance, or the limits of `reduce` are met.
 
     Returns:
         Location and rotation; for each, True if single intervals follow it.
