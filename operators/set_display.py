@@ -7,7 +7,7 @@ from ..r5dgs_addon.scene import loaded_scenes, polls, viewport_display
 
 
 class R5DGS_OT_set_display(polls.NeedsScene, bpy.types.Operator):
-    """Choose how viewports represent the Gaussians of this scene"""
+    """Choose the representation of this scene's Gaussians in viewports"""
 
     bl_idname = "r5dgs.set_display"
     bl_label = "Set Display"

@@ -1,4 +1,4 @@
-"""Errors that a user can resolve; messages name the place, what was expected, what was found and the remedy."""
+"""Errors that a user can resolve; messages name the place, the expected and the found content, and the remedy."""
 
 
 class R5dgsError(Exception):

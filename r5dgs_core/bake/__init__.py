@@ -1,1 +1,1 @@
-"""Bake a checkpoint into a `Scene`, with the table of what the scene needs."""
+"""Bake a checkpoint into a `Scene`, with the table of its needs."""

@@ -1,4 +1,4 @@
-"""Last stage of baking: the record of how a scene was made, and its PSNR on the training views."""
+"""Last stage of baking: the provenance record of the scene, with its PSNR on the training views."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
 
 
 def run_case(plan: Plan, case: Case, remeasure: bool, progress: Progress) -> list[dict[str, Any]]:
-    """Train and measure what is missing of a case; returns its records, one per mode."""
+    """Finish the training and the measurements of a case; returns its records, one per mode."""
     if not cases.is_finished(case):
         _train(plan, case, progress)
     record = cases.read_record(case)

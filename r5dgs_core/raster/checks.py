@@ -1,4 +1,4 @@
-"""Checks of the rasterizer's inputs; every message names the input, what was expected and what was found."""
+"""Checks of the rasterizer's inputs; every message names the input, the expected and the found content."""
 
 from __future__ import annotations
 

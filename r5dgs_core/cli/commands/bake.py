@@ -45,7 +45,7 @@ def run_bake(
     threads: int | None = None,
     progress_kind: str = "none",
 ) -> None:
-    """Convert a run to a scene file (see `bake.bake.run_bake`) and print a summary, with the needs table if asked."""
+    """Convert a run to a scene file (see `bake.bake.run_bake`) and print a summary, optionally with the needs table."""
     input_paths.check_scene_output(out)
     config.require_needs(overrides)
     input_paths.check_run(run_folder)

@@ -76,7 +76,7 @@ def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
     """Return the knots of the tracks: the distinct observed times.
 
     Times of slightly unsynchronised cameras, within a tenth of each camera's time step, share one knot. If more than
-    ``limit`` knots remain, they are sampled evenly by index, so that knots are dense where images are. The first and
+    ``limit`` knots remain, they are sampled evenly by index, so that knots are as dense as the images. The first and
     the last observed time are always knots.
     """
     of_camera: dict[bytes, set[float]] = {}

@@ -70,7 +70,7 @@ def shadow(
     count: int,
     rng: np.random.Generator,
 ) -> Points:
-    """Return faint, flat, dark Gaussians where the shadow of a body falls on the plane.
+    """Return faint, flat, dark Gaussians in the shadow of a body on the plane.
 
     Args:
         center: Centre of the body. [3]
