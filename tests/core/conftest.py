@@ -76,5 +76,5 @@ def scene():
 
 @pytest.fixture(scope="session")
 def data(scene, tmp_path_factory):
-    """A data set of its own pictures."""
+    """Data set of the pictures of `scene`."""
     return pictures.write_dataset(tmp_path_factory.mktemp("own pictures"), scene)

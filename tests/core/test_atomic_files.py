@@ -7,7 +7,7 @@ import pytest
 from r5dgs_core import atomic_files
 
 
-def test_the_new_content_takes_the_place_of_the_old(tmp_path):
+def test_the_new_content_replaces_the_old(tmp_path):
     path = tmp_path / "a.bin"
     for content in (b"first", b"", b"a longer second"):
         atomic_files.write(path, content)
@@ -15,7 +15,7 @@ def test_the_new_content_takes_the_place_of_the_old(tmp_path):
 
 
 @pytest.mark.parametrize("moment", ["block", "fsync", "replace"])
-def test_after_an_error_the_old_content_is_there_and_nothing_else(tmp_path, monkeypatch, moment):
+def test_after_an_error_only_the_old_content_remains(tmp_path, monkeypatch, moment):
     path = tmp_path / "a.bin"
     atomic_files.write(path, b"old")
 
@@ -32,7 +32,7 @@ def test_after_an_error_the_old_content_is_there_and_nothing_else(tmp_path, monk
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.bin"]
 
 
-def test_until_the_block_ends_the_old_content_is_there(tmp_path):
+def test_the_old_content_is_kept_until_the_block_ends(tmp_path):
     path = tmp_path / "a.bin"
     atomic_files.write(path, b"old")
     with atomic_files.replacing(path) as stream:
@@ -84,12 +84,12 @@ def test_new_files_have_the_permissions_that_the_user_chose(tmp_path):
     assert modes == {0o640} or os.name != "posix"
 
 
-def test_only_a_files_own_leftovers_are_found(tmp_path):
+def test_only_leftovers_of_the_same_file_are_found(tmp_path):
     for name in (".a.bin.12ab.part", ".b.bin.12ab.part", "a.bin.part", ".a.bin.part"):
         (tmp_path / name).touch()
     assert [p.name for p in atomic_files.leftovers(tmp_path / "a.bin")] == [".a.bin.12ab.part"]
 
 
-def test_a_missing_folder_is_the_callers_error(tmp_path):
+def test_a_missing_folder_raises_in_the_caller(tmp_path):
     with pytest.raises(FileNotFoundError):
         atomic_files.write(tmp_path / "deep" / "a.bin", b"")

@@ -25,7 +25,7 @@ def test_other_errors_are_reported_only_on_demand():
         raise RuntimeError("built for another torch")
 
 
-def test_a_package_that_is_there_is_imported():
+def test_an_installed_package_is_imported():
     with extras.required("models", "encoders"):
         import json
     assert json.loads("1") == 1

@@ -59,7 +59,7 @@ def test_a_killed_process_leaves_no_lock(tmp_path, other):
     assert os.listdir(tmp_path) == []
 
 
-def test_a_folder_is_made_and_the_lock_goes_with_the_block(tmp_path):
+def test_a_folder_is_created_and_unlocked_at_the_end_of_the_block(tmp_path):
     folder = tmp_path / "deep" / "run"
     for _ in range(2):
         with folder_lock.hold(folder):
@@ -67,7 +67,7 @@ def test_a_folder_is_made_and_the_lock_goes_with_the_block(tmp_path):
         assert os.listdir(folder) == []
 
 
-def test_a_lock_that_its_holder_removes_in_between_is_taken_anew(tmp_path, monkeypatch):
+def test_a_lock_that_its_holder_removes_meanwhile_is_acquired_again(tmp_path, monkeypatch):
     real, opened = folder_lock._lock, []
 
     def lock(descriptor, path):
@@ -111,7 +111,7 @@ def test_a_file_system_without_locks_is_named_and_keeps_half_written_files(tiny,
 
 
 @pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOSPC])
-def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, monkeypatch, number):
+def test_a_folder_that_cannot_be_written_is_an_error_of_one_line(tmp_path, monkeypatch, number):
     def fail(*_):
         raise OSError(number, os.strerror(number))
 
@@ -121,7 +121,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, monkeypatch, numb
     assert str(tmp_path) in message and os.strerror(number) in message and "\n" not in message
 
 
-def test_a_second_training_of_a_folder_is_refused_and_harms_nothing(tiny, tmp_path):
+def test_a_second_training_of_a_folder_is_refused_and_changes_nothing(tiny, tmp_path):
     folder, messages = tmp_path / "run", []
 
     def meanwhile(event):
@@ -140,7 +140,7 @@ def test_a_second_training_of_a_folder_is_refused_and_harms_nothing(tiny, tmp_pa
     assert checkpoint.load(folder).finished and not list(folder.glob(".*"))
 
 
-def test_a_folder_that_another_training_made_in_the_meantime_is_not_trained_over(tiny, tmp_path, monkeypatch):
+def test_a_folder_that_another_training_created_meanwhile_is_not_overwritten(tiny, tmp_path, monkeypatch):
     folder = tmp_path / "run"
     real = run.datasets.read
 
@@ -167,7 +167,7 @@ WRITERS = {
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_every_command_that_writes_into_a_run_folder_waits_for_no_one(tmp_path, name):
+def test_no_command_that_writes_into_a_run_folder_waits_for_the_lock(tmp_path, name):
     (tmp_path / checkpoint.RUN_FILE).write_text('{"format_version": 1, "dataset": "data"}')
     with folder_lock.hold(tmp_path), pytest.raises(CheckpointError, match="in use by"):
         WRITERS[name](tmp_path)

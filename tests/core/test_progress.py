@@ -1,4 +1,4 @@
-"""Progress: one JSON object per line for programs, few lines for a log, silence where asked."""
+"""Progress: one JSON object per line for programs, few lines for a log, no output on request."""
 
 import json
 
@@ -88,7 +88,7 @@ def test_events_in_words(event, words):
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-def test_steps_keep_showing_what_the_last_look_at_held_out_views_found(capsys, monkeypatch, terminal):
+def test_steps_repeat_the_last_measurement_of_held_out_views(capsys, monkeypatch, terminal):
     monkeypatch.setattr(progress.sys.stdout, "isatty", lambda: terminal, raising=False)
     monkeypatch.setattr(progress, "PLAIN_EVERY_S", 0.0)
     with progress.make("auto") as report:
@@ -99,7 +99,7 @@ def test_steps_keep_showing_what_the_last_look_at_held_out_views_found(capsys, m
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-def test_a_run_that_starts_forgets_what_held_out_views_of_the_one_before_gave(capsys, monkeypatch, terminal):
+def test_a_new_run_resets_the_measurements_of_held_out_views(capsys, monkeypatch, terminal):
     monkeypatch.setattr(progress.sys.stdout, "isatty", lambda: terminal, raising=False)
     monkeypatch.setattr(progress, "PLAIN_EVERY_S", 0.0)
     with progress.make("auto") as report:

@@ -48,7 +48,7 @@ def test_each_fault_is_one_error_of_the_kind_asked_for(text, message):
     assert len(str(caught.value)) < 300
 
 
-def test_a_doubled_key_is_found_in_linear_time():
+def test_a_duplicate_key_is_found_in_linear_time():
     class Counted(str):
         compared = 0
 
@@ -69,7 +69,7 @@ def test_nesting_up_to_the_limit_is_accepted():
 
 
 @pytest.mark.parametrize("unit", [b"[],", b"{},", b'{"a":0},', b"0,", b"[[]],", b'"ab",'])
-def test_memory_of_what_is_refused_stays_below_the_limit(unit):
+def test_refused_input_takes_less_memory_than_the_limit(unit):
     limit, text = 1 << 20, b"[" + unit * 200_000 + b"0]"
     tracemalloc.start()
     try:

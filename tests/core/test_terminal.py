@@ -45,7 +45,7 @@ def assert_harmless(captured):
 
 
 @pytest.mark.parametrize("command", [["info"], ["check"], ["objects"], ["query", "mug"]])
-def test_no_command_prints_what_moves_the_cursor(path, capsys, command):
+def test_no_command_prints_control_sequences(path, capsys, command):
     main.main([command[0], str(path), *command[1:]])
     captured = capsys.readouterr()
     assert "mug" in captured.out + captured.err
@@ -59,7 +59,7 @@ def test_json_keeps_the_name_exactly(path, capsys):
     assert_harmless(captured)
 
 
-def test_an_error_is_one_line_whatever_the_path_holds(tmp_path, capsys):
+def test_an_error_is_one_line_for_any_path(tmp_path, capsys):
     assert main.main(["info", str(tmp_path / EVIL)]) != 0
     captured = capsys.readouterr()
     assert_harmless(captured)

@@ -84,7 +84,7 @@ def test_a_machine_that_becomes_three_times_slower_is_followed():
     st.lists(st.tuples(st.integers(1, 400), st.floats(0.1, 10), st.floats(1e-3, 30)), min_size=1, max_size=6),
     st.integers(1, 60),
 )
-def test_whatever_the_phases_take_the_estimate_never_jumps(phases, every):
+def test_the_estimate_never_jumps_for_any_duration_of_the_phases(phases, every):
     now = [0.0]
     estimate = TimeLeft(
         *(Phase(str(k), units, cost) for k, (units, cost, _) in enumerate(phases)), clock=lambda: now[0]
@@ -103,7 +103,7 @@ def test_whatever_the_phases_take_the_estimate_never_jumps(phases, every):
     assert shown in (0, None)
 
 
-def test_a_phase_that_is_left_out_is_no_longer_waited_for():
+def test_a_skipped_phase_does_not_count():
     now = [0.0]
     estimate = TimeLeft(Phase("step", 100), Phase("trial", 900), clock=lambda: now[0])
     for k in (0, 2, 4):
@@ -115,7 +115,7 @@ def test_a_phase_that_is_left_out_is_no_longer_waited_for():
     assert estimate.at("step", 50) == pytest.approx(50)
 
 
-def test_nothing_is_shown_before_anything_is_measured():
+def test_nothing_is_shown_before_the_first_measurement():
     assert TimeLeft(Phase("step", 100)).at("step", 0) is None
 
 

@@ -8,7 +8,7 @@ import pytest
 from r5dgs_core import timing
 
 
-def test_turns_go_forth_and_back_over_all_calls(monkeypatch):
+def test_rounds_alternate_in_direction_over_all_calls(monkeypatch):
     monkeypatch.setattr(timing, "SAMPLE_MS", 0.0)
     seen = []
     times = timing.take({name: lambda name=name: seen.append(name) for name in "abc"}, 3)
@@ -20,7 +20,7 @@ def test_turns_go_forth_and_back_over_all_calls(monkeypatch):
         timing.take({}, 0)
 
 
-def test_times_add_up_and_scale_and_one_clock_is_that_of_the_rows():
+def test_times_add_up_and_scale_and_rows_use_one_clock():
     one, two = (timing.Times(k * np.array([0.5, 1, 2, 3]), k * np.array([3.5, 4, 5, 6])) for k in (1, 2))
     columns = (one + two).scaled(0.5).columns("cpu")
     assert columns == {"clock": "cpu", "ms": 7.5, "ms_low": 6.0, "ms_high": 9.0, "ms_wall": 3.0, "ms_cpu": 7.5}
@@ -33,7 +33,7 @@ def test_a_coarse_processor_clock_gives_no_zero(monkeypatch):
     assert timing.take({"quick": lambda: None}, 1)["quick"].cpu[0] > 0
 
 
-def test_slow_contenders_leave_early(monkeypatch):
+def test_slow_contenders_leave_after_fewer_rounds(monkeypatch):
     monkeypatch.setattr(timing, "PATIENCE_MS", 0.0)
     turns = []
 

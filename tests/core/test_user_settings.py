@@ -23,7 +23,7 @@ def place():
     return found
 
 
-def test_without_a_file_nothing_is_set(place, capsys):
+def test_without_a_file_no_setting_has_a_value(place, capsys):
     assert user_settings.read() == {}
     assert main.main(["config", "--user"]) == 0
     shown = capsys.readouterr().out

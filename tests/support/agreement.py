@@ -1,4 +1,4 @@
-"""The bars that the `cpu` backend keeps to against the float64 `reference`, on whatever scene."""
+"""Error bounds of the `cpu` backend against the float64 `reference`, on any scene."""
 
 import numpy as np
 import torch

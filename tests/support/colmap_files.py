@@ -1,4 +1,4 @@
-"""Write COLMAP reconstructions as COLMAP does, binary and text."""
+"""Write COLMAP reconstructions in COLMAP's binary and text formats."""
 
 from __future__ import annotations
 

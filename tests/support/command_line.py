@@ -5,7 +5,7 @@ from r5dgs_core.cli.exit_status import ExitStatus
 
 
 def complaint(capsys, *arguments, status=ExitStatus.ERROR):
-    """Run a command that fails; returns the line that says why, after the usage if arguments are wrong."""
+    """Run a command that fails. Returns the error line, which follows the usage if arguments are wrong."""
     capsys.readouterr()
     try:
         found = main.main([str(argument) for argument in arguments])

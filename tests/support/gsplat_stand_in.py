@@ -1,7 +1,7 @@
 """A stand-in for gsplat in plain torch, for tests of the cuda backend on machines without a GPU.
 
 It has the signatures, the tile lists, the float32 arithmetic and the cut-offs of the kernels of gsplat 1.5 and 1.6,
-read from their sources. It shows that our side of the border is right, and nothing about gsplat.
+read from their sources. Tests with it check the backend's own code, not gsplat.
 """
 
 import dataclasses

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 
 class Layout:
-    """Keeps what is said, refuses what does not exist: icons, properties, operators and their arguments.
+    """Records texts, and refuses icons, properties, operators and arguments that do not exist.
 
     Args:
         bpy: Blender.

@@ -1,4 +1,4 @@
-"""Loaded scenes for tests of motion: where their points are, what their curves hold."""
+"""Loaded scenes for tests of motion: positions of their points and contents of their curves."""
 
 import importlib
 
@@ -74,7 +74,7 @@ def offsets(bpy, collection, scene, t):
 
 
 def assert_plays_like_the_core(bpy, collection, scene, times, gone=()):
-    """Every Gaussian of a loaded scene lies where playback has it; those of groups that are gone are nowhere."""
+    """Assert that every Gaussian of a loaded scene matches playback, and that deleted groups have no points."""
     missing = np.isin(scene.gaussians.motion_ids, gone)
     for t in times:
         found = offsets(bpy, collection, scene, t)
@@ -87,7 +87,7 @@ def curves(anchor):
 
 
 def keys(anchor, until=np.inf):
-    """All that is stored of an anchor's keys up to a frame, by path and component, and the left side of the last."""
+    """Stored data of an anchor's keys up to a frame, by path and component; of the last key only the left side."""
     found = {}
     for name, curve in curves(anchor).items():
         rows = [point for point in curve.keyframe_points if point.co[0] <= until + 1e-3]

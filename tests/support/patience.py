@@ -1,4 +1,4 @@
-"""Waiting for what another thread or process does, and not for ever."""
+"""Waiting for another thread or process, with a time limit."""
 
 import time
 
@@ -6,7 +6,7 @@ PATIENCE_S = 120.0  # the rasterizer may have to be compiled
 
 
 def wait_until(condition):
-    """Return when a condition holds; a test in which that never comes fails instead of hanging."""
+    """Return when a condition holds. If it never does, the test fails instead of hanging."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline, f"it did not come within {PATIENCE_S:g} s"

@@ -1,4 +1,4 @@
-"""A data set made of a synthetic scene's own pictures, id maps and poses: what is measured on it is known."""
+"""Data set of a synthetic scene's own pictures, id maps and poses, for which all measurements are known."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def write_dataset(root: Path, scene: Scene) -> dataset.Dataset:
     bodies = [group for group in scene.groups if group.role == "body"]
     rows = []
     for group in bodies:
-        offset = np.eye(4)  # the object's own frame is not the scene's
+        offset = np.eye(4)  # the frames of object and scene differ
         offset[:3, :3] = rotations.quats_to_rotmats(rotations.normalize(np.array([1.0, 0.3, -0.5, group.id])))
         offset[:3, 3] = [0.1 * group.id, -0.2, 5.0]
         matrices = []

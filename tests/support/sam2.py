@@ -1,4 +1,4 @@
-"""A tiny SAM2 with random weights in a folder, as real ones come: the code is the real one, the masks mean nothing."""
+"""Folder with a tiny SAM2 with random weights, in the format of real ones. The code is real, the masks are noise."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def write_model(folder: Path, seed: int = 0) -> Path:
 
     torch.manual_seed(seed)
     model = Sam2VideoModel(Sam2VideoConfig(**_sizes()))
-    with torch.no_grad():  # chance would have it that objects are gone from most images
+    with torch.no_grad():  # with these random weights, objects would be absent from most images
         model.mask_decoder.pred_obj_score_head.proj_out.bias.fill_(5.0)
     model.save_pretrained(folder)
     return folder
@@ -24,7 +24,7 @@ def _sizes() -> dict:
     wide = 128  # the memory's attention asks for a multiple of 64 larger than it, and for 64 channels of the memory
     return {
         "image_size": SIZE,
-        "initializer_range": 0.2,  # ten times the usual one, so that what is remembered makes a difference
+        "initializer_range": 0.2,  # ten times the usual value, so that the memory has an effect
         "vision_config": {
             "model_type": "sam2_vision_model",
             "backbone_config": {

@@ -1,4 +1,4 @@
-"""Small synthetic scenes that are valid in every field: for tests of playback, files, rendering and the add-on."""
+"""Small, completely valid synthetic scenes for tests of playback, files, rendering and the add-on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Random Gaussians before a camera, for the tests of the rasterizer."""
+"""Random Gaussians in front of a camera, for the tests of the rasterizer."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""A tiny multi-view data set whose truth is known: a textured floor and two textured objects, drawn by our rasterizer.
+"""Tiny multi-view data set with known truth: a textured floor and two textured objects, drawn by our rasterizer.
 
 The brick (id 1) slides and turns about the vertical; the ball (id 2) is thrown. Times up to `T_MAX` are observed.
 """
@@ -155,7 +155,7 @@ def settings(*overrides: str) -> config.Config:
 
 
 def as_trained(made: checkpoint.Run) -> checkpoint.Run:
-    """The run, to be baked with the motion that was trained, noise and all."""
+    """The run, to be baked with its trained motion including noise."""
     kept = made.config.override(("needs.tracks=on", "needs.rotation=on"))
     return dataclasses.replace(made, config=kept)
 

@@ -1,4 +1,4 @@
-"""Association of segments by the Gaussians they show: laws of the outcome, on small scenes of balls on a floor."""
+"""Association of segments by the Gaussians they show: properties of the result on small scenes of balls on a floor."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def look(bodies: int, views: int, times: int, seed: int = 0, wrong: float = 0.1)
 
 
 def partition(ids: list[np.ndarray]) -> list[int]:
-    """Ids renamed by first appearance: equal where they part the segments alike."""
+    """Ids renumbered by first appearance. Equal results mean the same partition of the segments."""
     names: dict[int, int] = {}
     return [names.setdefault(int(i), len(names)) for i in np.concatenate(ids)]
 

@@ -1,4 +1,4 @@
-"""Mending: objects without a segment of their own take pixels from the one they lie in, and outlines stay."""
+"""Mending: objects without a segment take pixels from the segment that contains them, and outlines do not change."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from r5dgs_core.association import associate, mending, segment_stack
 from r5dgs_core.data.masks import UNKNOWN
 
 SIZE, TIMES = 24, 6
-PIXELS = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)  # of a scene in which every pixel shows a Gaussian of its own
+PIXELS = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)  # of a scene in which every pixel shows a different Gaussian
 
 
 def truth() -> np.ndarray:
@@ -31,7 +31,7 @@ def associated(masks: list[np.ndarray]) -> tuple[list[segment_stack.ImageBags], 
 
 
 def mended(masks: list[np.ndarray], **changes: object) -> list[np.ndarray]:
-    """Associate and mend masks of one view over time, with changes of what the association says of itself."""
+    """Associate and mend masks of one view over time, with changed attributes of the association."""
     given, found = associated(masks)
     found = dataclasses.replace(found, **changes)
     out = []

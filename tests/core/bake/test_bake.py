@@ -1,4 +1,4 @@
-"""A baked scene shows and moves what was trained, in the world of the data set."""
+"""A baked scene has the trained appearance and motion, in the world of the data set."""
 
 import dataclasses
 
@@ -71,12 +71,12 @@ def test_unfinished_runs_with_other_options_bake_to_their_current_state(tiny, tm
     with pytest.raises(Interrupted):
         train_briefly(tiny, tmp_path / "run", *overrides)
     made = checkpoint.open_run(tmp_path / "run")
-    if overrides[0] == "train.sh_degree=2":  # strong harmonics, so that a wrong frame would be seen
+    if overrides[0] == "train.sh_degree=2":  # strong harmonics, so that a wrong frame is visible
         state = checkpoint.load(made.folder)
         draws = torch.Generator().manual_seed(1)
         rest = state.tensors["gaussians.sh_rest"]
         rest += 0.2 * torch.randn(rest.shape, generator=draws)
-        base = state.tensors["tracks.base_quats"]  # and bodies that have turned far at t_max
+        base = state.tensors["tracks.base_quats"]  # and bodies with large rotations at t_max
         angles = torch.linspace(0.4, 1.9, base.shape[1])[:, None] * torch.tensor([0.3, 0.5, 0.8])
         base[1:] = rotations.multiply(rotations.rotvecs_to_quats(angles), base[1:])
         checkpoint.save(made.folder, state)

@@ -185,7 +185,7 @@ def test_training_omits_parts_that_the_user_disables(tiny, tmp_path):
     assert not tensors["gaussians.shading"].any()
     assert not [name for name in tensors if name.startswith("tracks.")]
     assert "identities" not in tensors and len(tensors["background"]) == 1
-    assert done.config == settings  # the folder says what was asked for
+    assert done.config == settings  # the run folder stores the request
     scene = bake.bake(done, datasets.read(tiny.root))
     assert {row["decision"] for row in scene.needs} == {"off"}
     assert all(row["reason"].startswith("set off by the user") for row in scene.needs)

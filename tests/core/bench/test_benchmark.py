@@ -1,4 +1,4 @@
-"""A benchmark trains what is not trained, measures what is not measured, and goes on over what fails."""
+"""A benchmark trains and measures only missing runs, and continues after failures."""
 
 import contextlib
 import json
@@ -39,7 +39,7 @@ def contents(folder):
 
 @pytest.fixture(scope="module")
 def made(tiny, tmp_path_factory):
-    """A benchmark that was stopped at its first step and gone on with: its plan, the records in between, the result."""
+    """A benchmark that was stopped at its first step and resumed: its plan, the records in between, the result."""
     plan = plan_for(tiny, tmp_path_factory.mktemp("bench"))
     (case,) = cases.make(plan)
 
@@ -280,7 +280,7 @@ def test_the_user_can_benchmark_the_absolute_form_of_the_rigidity_loss(tiny, tmp
 def test_the_method_does_not_depend_on_the_users_settings(name):
     given = variants.settings(name, None)
     assert {"train.representation", "field.variant", "identity.training", "identity.weight"} <= set(given)
-    weights = {"identity.weight", "identity.spatial", "identity.majority"}  # which the paper's preset has, too
+    weights = {"identity.weight", "identity.spatial", "identity.majority"}  # the preset `paper` has these sections, too
     assert set(given) - set(variants.settings(name, "paper")) == weights & set(given)
 
 
@@ -307,7 +307,7 @@ def test_a_damaged_record_raises_with_the_file_to_remove(tiny, tmp_path):
 
 
 def test_a_process_reports_its_own_memory_and_error(tmp_path):
-    ballast = np.ones(2**26)  # half a GiB here, which must not be counted there
+    ballast = np.ones(2**26)  # half a GiB in this process, which must not count in the other
     log_path, ended = tmp_path / "log", []
     log_path.write_text("an earlier complaint\n")
     sitting = process.train(["evaluate", str(tmp_path / "gone.r5dgs")], log_path, lambda event: None, ended.append)

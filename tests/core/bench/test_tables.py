@@ -1,4 +1,4 @@
-"""The tables of a benchmark say what its records hold."""
+"""The tables of a benchmark show the values of its records."""
 
 import io
 

@@ -45,7 +45,7 @@ DAMAGES = {
     "truncated": lambda array: npy(array)[:-3],
     "not an array": lambda array: b"PK",
 }
-# One row less in these changes what other arrays have to fit, so that all of those are at fault.
+# One row less in these changes the expected shape of other arrays, so all of those are faulty.
 SHARED_ROWS = ("track_times", "residual_rows")
 
 

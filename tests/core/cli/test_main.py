@@ -48,7 +48,7 @@ def sub_parsers():
 
 @pytest.fixture(scope="module")
 def made(tiny, tmp_path_factory):
-    """A folder with a run and a scene, made by the commands, and what they printed."""
+    """A folder with a run and a scene, made by the commands, and their output."""
     folder = tmp_path_factory.mktemp("made")
     run, scene = folder / "run", folder / "tiny.r5dgs"
     assert main.main(["train", str(tiny.root), "--out", str(run), "--progress", "none", *OPTIONS]) == 0
@@ -266,7 +266,7 @@ def test_paths_of_the_wrong_kind_are_errors_of_one_line(made, tiny, tmp_path, ca
 
 @pytest.mark.parametrize("place", ["missing/deep/x.json", "."])
 def test_an_evaluation_that_could_not_be_written_is_refused_before_the_work(made, tmp_path, capsys, monkeypatch, place):
-    monkeypatch.setattr(evaluate, "evaluate", None)  # calling it would be a TypeError
+    monkeypatch.setattr(evaluate, "evaluate", None)  # a call would raise TypeError
     assert "--json" in complaint(capsys, "evaluate", made[0], "--json", tmp_path / place)
 
 
@@ -304,7 +304,7 @@ def test_evaluate_counts_its_images(made, tmp_path, capsys):
 
 @pytest.fixture
 def small_demo(tiny, monkeypatch):
-    """Makes the demo run on the tiny data set; returns its arguments without --out."""
+    """Make the demo run on the tiny data set. Returns its arguments without --out."""
     monkeypatch.setattr(demo, "DATASET", tiny.root.name)
     monkeypatch.setattr(demo, "bundled_data", lambda: tiny.root)
     return ["demo", *OPTIONS, "--progress", "json"]

@@ -1,4 +1,4 @@
-"""``r5dgs objects`` and ``r5dgs query --render``: what they print and write, and what they refuse before any work."""
+"""``r5dgs objects`` and ``r5dgs query --render``: output, files, and arguments that are refused before any work."""
 
 import dataclasses
 import json

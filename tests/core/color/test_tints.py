@@ -1,4 +1,4 @@
-"""A tint multiplies the colour of a Gaussian, whatever it is seen from."""
+"""A tint multiplies the colour of a Gaussian in every viewing direction."""
 
 import numpy as np
 import pytest

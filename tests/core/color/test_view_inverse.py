@@ -1,4 +1,4 @@
-"""Inverses of view transforms give back the colours that a view displays, and come near to those that it cannot."""
+"""Inverses of view transforms restore displayable colours and approximate the others."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def film(colors):
 
 
 def soft(colors):
-    """Displays as white what is eight times brighter than others do."""
+    """View transform whose white is eight times brighter than that of the others."""
     return film(colors / 8)
 
 
@@ -21,7 +21,7 @@ MIX = np.array([[0.86, 0.09, 0.05], [0.06, 0.88, 0.06], [0.04, 0.12, 0.84]])
 
 
 def mixed(colors):
-    """Channels that bleed into each other before the curve, so that saturated colours need light below nothing."""
+    """Channels that are mixed before the curve, so that saturated colours need negative light."""
     return film(np.maximum(colors @ MIX.T, 0))
 
 
@@ -30,7 +30,7 @@ def gamma(colors):
 
 
 def seen(n=3000, spread=0.7, seed=1):
-    """Scene-linear colours as scenes have them. [N, 3]"""
+    """Typical scene-linear colours. [N, 3]"""
     random = np.random.default_rng(seed)
     return 2.0 ** random.uniform(-5, 2, (n, 1)) * 2.0 ** random.uniform(-spread, spread, (n, 3))
 
@@ -78,7 +78,7 @@ def test_inverting_restores_scene_linear_colours_of_an_invertible_view(of):
 
 
 def test_negative_light_reaches_more_colours(of):
-    """Colours that are more saturated than the view shows of any scene without negative light."""
+    """Colours that are more saturated than any displayed colour without negative light."""
     light = seen(500)
     light[:, 2] = -0.04 * light[:, 0]
     wanted = mixed(light)
@@ -89,7 +89,7 @@ def test_negative_light_reaches_more_colours(of):
 
 
 def test_unreachable_colours_are_approximated_as_closely_as_possible(of):
-    """Nearer than clamping light at nothing, which is what the start of the search does."""
+    """They are nearer than with light clamped at zero, the start of the search."""
     wanted = np.array([[0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.1, 0.1, 0.9]])
     greys = 2.0 ** np.linspace(-10, 4, 500)
     curve = mixed(np.repeat(greys[:, None], 3, axis=1))[:, 0]
@@ -107,7 +107,7 @@ def test_an_exposure_is_a_scale(of):
 
 def test_the_inverse_reports_its_error(of):
     assert of(film).error < 0.5 and of(mixed).error < 1
-    folded = view_inverse.invert(lambda colors: np.abs(2 * gamma(colors) - 1))  # what is dark is displayed bright
+    folded = view_inverse.invert(lambda colors: np.abs(2 * gamma(colors) - 1))  # dark colours are displayed bright
     assert folded.error > 50
 
 

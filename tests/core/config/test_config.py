@@ -1,4 +1,4 @@
-"""Configurations: files and overrides arrive as typed values, and what cannot be used is named."""
+"""Configurations: files and overrides become typed values, and unusable values are named."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Reading data sets: both layouts, every hint that files give, and one clear error for each fault."""
+"""Reading data sets: both layouts, every optional entry of the files, and one clear error for each fault."""
 
 import dataclasses
 import json
@@ -439,7 +439,7 @@ def test_training_masks_may_come_from_another_folder(flat, tmp_path_factory):
     assert (dataset.load_mask(other.train[0]) == 7).all()
     assert [view.mask_path for view in other.train[1:]] == [None] * (len(own.train) - 1)
     assert all(view.mask_path is None for view in without.train)
-    for some in (other, without):  # what a run is measured by stays
+    for some in (other, without):  # held-out masks do not change
         assert [view.mask_path for view in some.test] == [view.mask_path for view in own.test] != [None, None]
     assert other.object_names == own.object_names
     assert len({own.digest, other.digest, without.digest}) == 3

@@ -1,4 +1,4 @@
-"""Image files: what is written is read, and what cannot be read says so."""
+"""Image files: written files can be read, and unreadable files are named."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Object id images in the forms that tools write them."""
+"""Object id images in the formats of common tools."""
 
 import struct
 import zlib
@@ -112,7 +112,7 @@ def test_colours_get_the_same_ids_in_all_masks(tmp_path):
 
 
 def test_the_kind_of_masks_is_decided_for_all_of_them_at_once(tmp_path):
-    """A colour-coded mask that happens to show white and gray objects alone is one of colours all the same."""
+    """A colour-coded mask that shows only white and gray objects is still read as colours."""
     gray, red, white = (90, 90, 90), (200, 0, 0), (255, 255, 255)
     pictures = {
         "all.png": np.array([[(0, 0, 0), gray], [red, white]], np.uint8),
@@ -216,7 +216,7 @@ def test_ids_among_colour_masks_are_refused_as_ambiguous(tmp_path):
 
 
 def test_soft_edges_of_coloured_masks_are_refused(tmp_path):
-    """Two discs drawn with anti-aliasing: few colours in all, but most of them fill no area."""
+    """Two discs drawn with anti-aliasing: they have few colours, but most of these fill no area."""
 
     def discs(softness):
         y, x = np.mgrid[:64, :64]

@@ -1,4 +1,4 @@
-"""Neither the place nor the unit of a data set's world changes what is trained, baked, played and measured."""
+"""Neither the origin nor the unit of a data set's world changes training, baking, playback and evaluation."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Pixels that a mask does not know teach nothing, and so cost nothing that the other masks tell."""
+"""Unknown pixels of masks have no effect on training, so the information of other masks is kept."""
 
 import dataclasses
 
@@ -82,7 +82,7 @@ def test_unknown_pixels_do_not_vote(seen, pose):
 
 
 def test_masks_marked_unknown_do_not_change_the_labels(tiny, seen, pose):
-    """Two of three masks of the ball are missed: as background they outvote the rest, as unknown they do nothing."""
+    """Two of three masks of the ball are missing: as background they outvote the rest, as unknown they do not."""
     truth = torch.from_numpy(np.array([CLASSES[int(i)] for i in tiny.truth.gaussians.object_ids]))
     fallback = torch.zeros(len(truth), dtype=torch.int64)
 
@@ -150,7 +150,7 @@ def test_pixels_known_in_some_masks_use_only_those_masks(seen):
     dirty = dataclasses.replace(unknown(same[1]), image=np.full_like(same[1].image, 255))
     hidden = marked(clean, cover, 1)
     (background,) = background_images.compute([hidden, dirty, dirty])
-    assert not background.known[6:14, 6:14].any()  # an object there; what the others show is perhaps the same one
+    assert not background.known[6:14, 6:14].any()  # an object there; the others may show the same one
     np.testing.assert_allclose(background.image[20:], clean.image[20:] / 255, atol=1e-6)
 
 
@@ -169,7 +169,7 @@ def test_points_of_a_reconstruction_are_not_judged_by_unknown_pixels(tiny, seen)
 
 @pytest.mark.slow
 def test_a_run_with_unknown_masks_learns_nearly_the_same_as_with_all_masks(tiny, tmp_path):
-    """The ball is missed in two of three masks: named unknown that costs little, named background most of its mIoU."""
+    """The ball is missing in two of three masks, which costs little if marked unknown, else most of its mIoU."""
     found = {}
     for name, missed in (("whole", None), ("unknown", masks.UNKNOWN), ("background", 0)):
         folder = tmp_path / name

@@ -1,4 +1,4 @@
-"""Edits that are written into a scene: untouched it is the same to the bit, and what was moved is where it was put."""
+"""Edits written into a scene: unedited scenes keep every bit, and moved objects are at their new place."""
 
 import dataclasses
 
@@ -39,7 +39,7 @@ def played(scene, motion_id, times):
 
 
 def pieces_of(scene, noise=0.0, before=None, after=None):
-    """The clouds of a loaded scene: their maps are those of playback between ``after`` and ``before``, by object id."""
+    """Clouds of a loaded scene. Their maps are those of playback, between ``after`` and ``before`` by object id."""
     random, pieces = np.random.default_rng(0), []
     pairs = scene.gaussians.object_ids.astype(np.int64) * 1000 + scene.gaussians.motion_ids
     for start, stop, pair in row_runs.runs(pairs):

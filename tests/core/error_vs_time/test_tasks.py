@@ -40,7 +40,7 @@ FAMILY = ("static", "translation, quadratic", "constant twist", "hinge", "ballis
 
 
 def hurry(patch):
-    """One call a turn, few frames, and few motions to choose from: what is fitted how well is for the tests of it."""
+    """Use one call per turn, few frames and few candidate motions; other tests check the quality of the fit."""
     patch.setattr(timing, "SAMPLE_MS", 0.0)
     patch.setattr(image_task, "FRAMES", 1)
     patch.setattr(rasterizer_task, "VIEWS", 1)

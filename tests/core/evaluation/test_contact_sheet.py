@@ -1,4 +1,4 @@
-"""The contact sheet: which views it takes, and that each row shows what it says."""
+"""The contact sheet: choice of its views and content of each row."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Evaluation of scenes against data sets made of their own pictures, where every number is known."""
+"""Evaluation of scenes against data sets of their own pictures, for which every number is known."""
 
 import dataclasses
 import io

@@ -1,4 +1,4 @@
-"""Each number against its formula, written again in the plainest way."""
+"""Each metric against a second, direct implementation of its formula."""
 
 import importlib.util
 import math

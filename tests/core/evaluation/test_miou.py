@@ -1,4 +1,4 @@
-"""Overlap of id maps with true masks: what counts, what does not, and one map of ids for a whole split."""
+"""Overlap of id maps with true masks: counted pixels, ignored pixels, and one map of ids for a whole split."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The table of objects: each number is that of its definition, and names are shown as they are."""
+"""The table of objects: each number follows its definition, and names are shown unchanged."""
 
 import dataclasses
 import io

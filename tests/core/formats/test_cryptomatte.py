@@ -1,4 +1,4 @@
-"""Names in Cryptomatte are what other programs make of them."""
+"""Cryptomatte names have the same hashes as in other programs."""
 
 import json
 

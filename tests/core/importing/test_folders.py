@@ -1,4 +1,4 @@
-"""Run folders of others that cannot be read, the settings beside them, and the command `r5dgs import`."""
+"""Unreadable run folders of other projects, their settings, and the command `r5dgs import`."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_the_last_complete_iteration_is_read_unless_another_is_named(deformed):
         run_folder.open_run(deformed, 30000)
 
 
-def test_other_folders_are_distinguished(tmp_path, deformed):
+def test_each_unusable_run_folder_is_refused_with_its_reason(tmp_path, deformed):
     with pytest.raises(CheckpointError, match="expected a run folder, found nothing"):
         run_folder.open_run(tmp_path / "nowhere")
     with pytest.raises(CheckpointError, match="expected a run folder, found a file"):
@@ -178,7 +178,7 @@ def test_other_folders_are_distinguished(tmp_path, deformed):
         run_folder.open_run(deformed)
 
 
-def test_settings_are_read_and_never_run(tmp_path):
+def test_settings_are_parsed_and_never_executed(tmp_path):
     path, sprung = tmp_path / "cfg_args", tmp_path / "sprung"
     path.write_text(
         f"Namespace(max_time=0.65, light=True, n=-3, names=['a', 'b'], device=open({str(sprung)!r}, 'w'), none=None, "
@@ -228,7 +228,7 @@ def test_principal_axes_keep_the_given_ones_of_unit_quaternions():
     np.testing.assert_allclose(np.exp(log_scales), scales, rtol=1e-6)
 
 
-def test_principal_axes_draw_what_any_quaternion_draws():
+def test_principal_axes_give_the_picture_of_any_quaternion():
     random = np.random.default_rng(1)
     quats = random.normal(size=(300, 4)) * random.uniform(0.3, 1.8, (300, 1))
     scales = random.normal(size=(300, 3))  # of any sign

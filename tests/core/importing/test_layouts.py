@@ -1,4 +1,4 @@
-"""A folder in each foreign layout becomes a scene that is drawn as that layout's own rule says."""
+"""A folder in each foreign layout becomes a scene with the picture that the layout's own rule gives."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def imported(folder, tmp_path, **options):
     return scene_file.read(scene_file.write(scene, tmp_path / "scene.r5dgs", exact=True))
 
 
-def test_gaussian_splatting_stands_still(tmp_path):
+def test_a_run_of_gaussian_splatting_is_static(tmp_path):
     cloud = foreign.cloud()
     foreign.write_common(tmp_path / "run", cloud, 7000, "white_background=True, source_path='nowhere'")
     scene = imported(tmp_path / "run", tmp_path)
@@ -129,7 +129,7 @@ def test_deformable_does_not_normalise_its_rotations(tmp_path):
 
 
 @pytest.mark.parametrize("light", [True, False], ids=["light", "complex"])
-def test_trace_turns_before_the_canonical_rotation_and_flies_on(tmp_path, light):
+def test_trace_rotates_before_the_canonical_rotation_and_extrapolates(tmp_path, light):
     cloud = foreign.cloud(2)
     deform = foreign.deform_weights(2, 256, 8, 81)
     width, hidden, bands = (128, 6, 3) if light else (256, 8, 6)
@@ -204,7 +204,7 @@ def silu_row(weights, x, hidden):
 
 
 @pytest.mark.parametrize(("width", "depth"), [(256, 8), (128, 6)], ids=["full", "light"])
-def test_freegave_turns_against_the_sign_of_its_weights(tmp_path, width, depth):
+def test_freegave_rotates_against_the_sign_of_its_weights(tmp_path, width, depth):
     cloud, size = foreign.cloud(8), 16
     codes = foreign.code_weights(9, size)
     deform = foreign.deform_weights(10, width, depth, 81 + size)
@@ -221,7 +221,7 @@ def test_freegave_turns_against_the_sign_of_its_weights(tmp_path, width, depth):
         code, shares = code_and_shares(codes, cloud)
         moved, turn, growth = foreign.deform(deform, depth, 8, cloud.means, min(t, T_MAX), code)
 
-        def rates(tau: float):  # asked for anew at every time
+        def rates(tau: float):  # evaluated again at every time
             patterns = silu_row(velocity, foreign.encoded(torch.tensor([[T_MAX + tau]]).double(), 3), 4)
             v, minus_w = (shares @ patterns.reshape(size, 6)).split(3, dim=1)
             return v, -minus_w
@@ -239,7 +239,7 @@ def test_freegave_turns_against_the_sign_of_its_weights(tmp_path, width, depth):
     assert_pictured(scene, far, cloud, rule(far), 1.0, "standard")
 
 
-def test_freegave_keeps_what_hardly_moves_as_at_time_zero(tmp_path):
+def test_freegave_freezes_nearly_static_gaussians_at_time_zero(tmp_path):
     cloud, size = foreign.cloud(8), 16
     codes = foreign.code_weights(9, size)
     deform = foreign.deform_weights(10, 128, 6, 81 + size)
@@ -259,7 +259,7 @@ def test_freegave_keeps_what_hardly_moves_as_at_time_zero(tmp_path):
     assert_drawn(scene, 0.4, foreign.twisted(cloud, moved, turn, growth, None, 0.0))
 
 
-def test_a_run_far_from_the_origin_keeps_what_its_files_hold_and_gets_an_origin(tmp_path, caplog):
+def test_a_run_far_from_the_origin_keeps_its_stored_precision_and_gets_an_origin(tmp_path, caplog):
     shift = np.array([2.0**21, -(2.0**20), 0.0])
     cloud = foreign.cloud()
     far = dataclasses.replace(cloud, means=cloud.means + torch.from_numpy(shift))

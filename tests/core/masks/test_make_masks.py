@@ -1,4 +1,4 @@
-"""Masks are made video by video, and what is made is neither made again nor lost."""
+"""Masks are made video by video, and finished videos are neither made again nor lost."""
 
 import dataclasses
 import json
@@ -15,7 +15,7 @@ from r5dgs_core.masks import make_masks, mask_folders, videos
 
 
 class Numbered:
-    """A backend that gives every video ids of its own; breaks off where it is told to."""
+    """Backend that numbers every video separately and raises at a given video."""
 
     name, numbering, own_names = "numbered", mask_notes.VIDEO, None
 
@@ -61,7 +61,7 @@ def moving(views, names, turn):
     return made
 
 
-def test_a_camera_in_motion_is_one_video_as_long_as_it_does_not_leap(views):
+def test_a_moving_camera_is_one_video_until_it_jumps(views):
     hand_held = moving(views, [f"cam{k}" for k in range(8)], np.radians(5))
     assert [len(video.views) for video in videos.of(hand_held)] == [8]
     leaping = moving(views, [f"cam{k}" for k in range(8)], np.radians(40))
@@ -83,7 +83,7 @@ def test_made_masks_can_be_read_back_and_are_reported(views, tmp_path):
     assert events[-1]["done"] == events[-1]["total"] == 36 and events[-1]["seconds_left"] == 0
 
 
-def test_a_stop_loses_the_video_that_was_being_made_and_no_other(views, tmp_path):
+def test_a_stop_loses_only_the_current_video(views, tmp_path):
     names = [video.name for video in videos.of(views)]
     with pytest.raises(KeyboardInterrupt):
         make_masks.make(views, Numbered(stop_at=(names[2], 3)), tmp_path)
@@ -105,7 +105,7 @@ def test_a_mask_that_was_deleted_is_made_again(views, tmp_path):
     assert again.asked == [views[4].camera.name] and (tmp_path / f"{views[4].name}.png").exists()
 
 
-def test_masks_of_others_and_of_other_settings_are_not_overwritten_unasked(views, tmp_path, tiny):
+def test_other_masks_are_overwritten_only_on_request(views, tmp_path, tiny):
     with pytest.raises(errors.DatasetError, match="holds 36 masks of unknown origin.*--overwrite"):
         make_masks.make(views, Numbered(), tiny.root / "object_mask")
     make_masks.make(views, Numbered(), tmp_path)
@@ -122,14 +122,14 @@ def test_masks_of_others_and_of_other_settings_are_not_overwritten_unasked(views
         make_masks.make(views, Numbered(), tmp_path)
 
 
-def test_ids_of_one_video_are_the_folders_own(views, tmp_path):
+def test_ids_of_a_single_video_belong_to_the_folder(views, tmp_path):
     alone = [view for view in views if view.camera.name == views[0].camera.name]
     make_masks.make(alone, Numbered(), tmp_path)
     assert json.loads((tmp_path / "objects.json").read_text())["3"] == "object 3"
 
 
-def test_masks_of_a_folder_are_taken_over_as_ids(copied, tmp_path, capsys):
-    """Colours become ids, other sizes the images' own, 255 unknown; names by path or by the file alone."""
+def test_masks_of_a_folder_are_converted_to_ids(copied, tmp_path, capsys):
+    """Colours become ids, sizes those of the images, 255 unknown; files are found by path or by file name."""
     source = tmp_path / "theirs"
     truth = {}
     for view in datasets.read(copied).train:
@@ -162,7 +162,7 @@ def test_coloured_masks_of_a_folder_become_ids(copied, tmp_path):
         cli_masks.run_masks(copied, source=tmp_path / "rgb", out=tmp_path / "other", unknown=255)
 
 
-def test_masks_in_their_place_are_checked_and_left_alone(copied, capsys):
+def test_masks_in_the_data_set_are_checked_and_not_changed(copied, capsys):
     before = {path: path.read_bytes() for path in copied.rglob("*") if path.is_file()}
     for backend in ("precomputed", "blender"):
         made = cli_masks.run_masks(copied, backend=backend)
@@ -183,7 +183,7 @@ def test_a_capture_names_every_id_and_has_every_mask(copied):
     assert cli_masks.run_masks(copied).images == 35
 
 
-def test_masks_of_another_shape_are_named_before_anything_is_half_done(copied, tmp_path):
+def test_masks_of_another_shape_are_named_before_anything_is_written(copied, tmp_path):
     view = datasets.read(copied).train[3]
     shutil.copytree(copied / "object_mask", tmp_path / "theirs")
     masks.write(tmp_path / "theirs" / f"{view.name}.png", np.ones((36, 36), np.int32))
@@ -205,7 +205,7 @@ def test_masks_of_another_shape_are_named_before_anything_is_half_done(copied, t
         ({"unknown": 254}, "--unknown 254: expected 255 or 65535"),
     ],
 )
-def test_options_that_do_not_belong_together_are_refused(tiny, options, message):
+def test_contradictory_options_are_refused(tiny, options, message):
     with pytest.raises(errors.ConfigError, match=message):
         cli_masks.run_masks(tiny.root, **options)
 
@@ -218,7 +218,7 @@ def test_a_folder_without_masks_is_named(tiny, tmp_path):
         mask_folders.Precomputed(tmp_path / "gone", views)
 
 
-def test_masks_that_a_backend_does_not_make_leave_nothing_of_others_behind(copied, tmp_path):
+def test_old_masks_are_removed_if_the_backend_does_not_make_them(copied, tmp_path):
     """A mask of another numbering that stays among new ones would be read with them, and so would names of its ids."""
     views = datasets.read(copied).train
     source, out = tmp_path / "theirs", tmp_path / "out"
@@ -234,7 +234,7 @@ def test_masks_that_a_backend_does_not_make_leave_nothing_of_others_behind(copie
 
 
 def test_255_is_not_called_unknown_where_nothing_is_written(copied):
-    """Training would read it as an object all the same."""
+    """Training would still read it as an object."""
     with pytest.raises(
         errors.ConfigError, match=r"--unknown 255: nothing would be written.*--out, or record it in .*masks"
     ):
@@ -243,7 +243,7 @@ def test_255_is_not_called_unknown_where_nothing_is_written(copied):
     assert cli_masks.run_masks(copied, unknown=255).images == 36
 
 
-def test_names_of_the_ids_of_one_video_hold_in_the_data_sets_own_folder_too(copied):
+def test_names_of_the_ids_of_one_video_are_kept_in_the_data_sets_own_folder(copied):
     shutil.rmtree(copied / "object_mask")
     views = datasets.read(copied).train
     alone = [view for view in views if view.camera.name == views[0].camera.name]
@@ -252,7 +252,7 @@ def test_names_of_the_ids_of_one_video_hold_in_the_data_sets_own_folder_too(copi
     assert data.object_names == {k: f"object {k}" for k in range(1, 7)} and data.ground_truth is None
 
 
-def test_a_video_that_got_more_images_is_made_again(views, tmp_path):
+def test_a_video_with_new_images_is_made_again(views, tmp_path):
     some = [view for view in views if view.name != views[4].name]
     make_masks.make(some, Numbered(), tmp_path)
     again = Numbered()
@@ -260,7 +260,7 @@ def test_a_video_that_got_more_images_is_made_again(views, tmp_path):
     assert again.asked == [views[4].camera.name]
 
 
-def test_names_of_a_folders_own_ids_are_taken_over_with_its_masks(copied, tmp_path):
+def test_names_of_a_folders_own_ids_are_copied_with_its_masks(copied, tmp_path):
     """Else those of the data set's ids, and its true poses, would be put on them."""
     source, out = tmp_path / "theirs", tmp_path / "out"
     shutil.copytree(copied / "object_mask", source)

@@ -1,4 +1,4 @@
-"""SAM2's real code on a tiny random model: what is marked is followed both ways, and what is new is added."""
+"""SAM2's real code on a tiny random model: prompted objects are tracked both ways, and new ones are added."""
 
 import json
 import sys
@@ -17,7 +17,7 @@ from tests.support import tiny_datasets
 
 pytestmark = pytest.mark.heavy
 
-# The network is random: it foretells a quality of about a half, and its masks are noise.
+# The network is random: it predicts a quality of about a half, and its masks are noise.
 EVERYTHING = sam2_segments.SegmentSettings(points=3, score=0.0, stability=0.0, max_area=1.0)
 FEW = sam2_masks.TrackSettings(objects=5, together=2)
 
@@ -37,7 +37,7 @@ def video(tiny):
     return videos.of(datasets.read(tiny.root).train)[0]
 
 
-def test_a_folder_serves_both_networks_with_its_own_weights(model, folder):
+def test_both_networks_load_the_weights_of_a_folder(model, folder):
     from safetensors.torch import load_file
 
     stored = load_file(folder / "model.safetensors")
@@ -49,7 +49,7 @@ def test_a_folder_serves_both_networks_with_its_own_weights(model, folder):
     assert model.name == "tiny_sam2" and model.size == tiny_sam2.SIZE and len(model.digest) == 64
 
 
-def test_images_enter_as_sam2_was_trained(model):
+def test_images_are_preprocessed_as_in_the_training_of_sam2(model):
     image = np.zeros((36, 48, 3), np.uint8)
     image[..., 0] = 255
     pixels = model.pixels(image)
@@ -93,7 +93,7 @@ def marked_in(model, video, key, count=2):
     return torch.stack([s.logits for s in sam2_segments.find(model, video.image(key), EVERYTHING)[:count]])
 
 
-def test_objects_are_followed_to_both_ends_each_image_once(model, video):
+def test_objects_are_tracked_to_both_ends_and_each_image_is_processed_once(model, video):
     frames = sam2_tracking.Frames(model, video)
     marked = marked_in(model, video, 2)
     found = dict(sam2_tracking.follow(model, frames, 2, marked))
@@ -106,8 +106,8 @@ def test_objects_are_followed_to_both_ends_each_image_once(model, video):
     assert sam2_segments.iou(kept.numpy(), given.numpy()) > 0.75
 
 
-def test_following_agrees_with_the_librarys_own_loop(model, video):
-    """The same video held in memory whole, forwards from its first image, and nothing forgotten."""
+def test_tracking_agrees_with_the_librarys_own_loop(model, video):
+    """The reference keeps the whole video in memory and tracks forwards from the first image."""
     from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
 
     frames = sam2_tracking.Frames(model, video)
@@ -140,7 +140,7 @@ def test_memory_does_not_grow_with_the_video(model, video, monkeypatch):
     assert sizes[20] == sizes[40] > 0
 
 
-def test_a_pixel_goes_to_the_object_that_is_surest_of_it(tmp_path):
+def test_a_pixel_belongs_to_the_object_with_the_highest_logit(tmp_path):
     canvas = sam2_tracking.Canvas(2, 1, 4, tmp_path)
     canvas.paint(1, [7, 300], np.array([[[1.0, 2, -1, -1]], [[1.0, 3, 5, -2]]]))
     assert canvas.ids[1].tolist() == [[7, 300, 300, 0]]  # the first of equals; nobody below 0
@@ -176,7 +176,7 @@ def test_key_frames_are_spread_over_a_video():
     assert sam2_masks.key_frames(1, 3) == [0]
 
 
-def test_a_video_gets_masks_that_follow_what_was_marked(model, video, tmp_path):
+def test_the_masks_of_a_video_follow_the_prompted_objects(model, video, tmp_path):
     """Each image holds what the objects' own tracks hold there, and key frames later on add objects."""
     backend = sam2_masks.Sam2Masks(model, EVERYTHING, sam2_masks.TrackSettings(key_frames=2, objects=40, together=3))
     shares = []
@@ -201,7 +201,7 @@ def test_a_video_gets_masks_that_follow_what_was_marked(model, video, tmp_path):
     assert (images[5] == expected)[old & (images[5] > 0)].mean() > 0.99  # half floats make ties of near equals
 
 
-def test_networks_that_see_the_truth_give_the_truth_and_late_objects_too(model, tmp_path, monkeypatch):
+def test_perfect_networks_give_the_true_masks_of_all_objects(model, tmp_path, monkeypatch):
     """With the answers of the networks replaced by true masks, every image gets these, under numbers of its video."""
     late = tiny_datasets.make_dataset(tmp_path / "late", ball_from=0.4)
     views = datasets.read(late.root).train
@@ -334,12 +334,12 @@ def widen(folder):
         (lambda folder: (folder / "model.safetensors").unlink(), r"model\.safetensors: expected the weights, found"),
     ],
 )
-def test_folders_that_hold_no_whole_sam2_are_one_clear_error(folder, tmp_path, change, message):
+def test_folders_without_a_complete_sam2_are_one_clear_error(folder, tmp_path, change, message):
     with pytest.raises(errors.BackendError, match=message):
         sam2_model.Sam2(broken(folder, tmp_path, change))
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path):
+def test_a_missing_folder_is_named(tmp_path):
     with pytest.raises(errors.BackendError, match="expected a folder of SAM2.*found nothing"):
         sam2_model.Sam2(tmp_path / "gone")
 
@@ -352,6 +352,6 @@ def test_without_transformers_the_error_names_the_package_to_install(folder, pac
 
 
 @pytest.mark.parametrize("device", ["tpu", "meta", "cuda:99" if not torch.cuda.is_available() else "mps"])
-def test_devices_that_are_not_there_are_named(folder, device):
+def test_missing_devices_are_named(folder, device):
     with pytest.raises(errors.BackendError, match=f"--device {device}: "):
         sam2_model.Sam2(folder, device)

@@ -40,7 +40,7 @@ def test_the_untrained_field_is_the_identity(size):
 
 
 @pytest.mark.parametrize("size", trd.SHAPES)
-def test_under_the_untrained_trd_everything_rests_but_can_learn_to_accelerate(size):
+def test_the_untrained_trd_keeps_gaussians_at_rest_and_can_learn_accelerations(size):
     network = trd.TRD(trd.SHAPES[size], generator())
     state = network(torch.randn(7, 3, generator=generator(2)), 0.4)
     assert (state.equiv_velocity == 0).all() and (state.angular_velocity == 0).all()
@@ -85,7 +85,7 @@ def test_a_time_as_a_bias_is_a_time_beside_every_position(size):
     torch.testing.assert_close(found.quats.norm(dim=1), torch.ones(5, dtype=torch.float64))
 
 
-def test_chunks_change_nothing_but_memory():
+def test_chunks_change_only_the_memory():
     field = deformation.DeformationField(deformation.SHAPES["small"], generator()).double()
     network = trd.TRD(trd.SHAPES["small"], generator()).double()
     disturb(field)

@@ -1,4 +1,4 @@
-"""Gaussians that grow and shrink take the optimizer's memory of each row along."""
+"""The optimizer's state of each row follows Gaussians that are added and removed."""
 
 import pytest
 import torch
@@ -66,7 +66,7 @@ def test_new_rows_start_without_moments_and_old_ones_keep_theirs():
             assert (now[4:] == 0).all()
 
 
-def test_the_optimizer_moves_what_the_gaussians_hold_after_every_change():
+def test_the_optimizer_updates_the_current_tensors_after_every_change():
     gaussians = make(5)
     optimizer = adam(gaussians)
     gaussians.extend(optimizer, make(3, seed=2).params, torch.tensor([1, 1, 2]))
@@ -78,7 +78,7 @@ def test_the_optimizer_moves_what_the_gaussians_hold_after_every_change():
     assert (gaussians.means != before).all()
 
 
-def test_all_rows_may_go_and_others_come():
+def test_all_rows_may_be_replaced():
     gaussians = make(3)
     optimizer = adam(gaussians)
     gaussians.keep(optimizer, torch.zeros(3, dtype=torch.bool))

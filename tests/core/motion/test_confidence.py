@@ -1,4 +1,4 @@
-"""The spread of a motion is what random rates of its covariance give."""
+"""The spread of a motion equals that of motions with random rates from its covariance."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def test_a_certain_velocity_grows_the_spread_with_the_square_of_time():
     np.testing.assert_allclose(sigma / sigma[0], [1, 4, 16], rtol=1e-5)
 
 
-def test_certain_and_unknown_rates_have_no_spread():
+def test_exact_and_unknown_rates_have_no_spread():
     tau = np.linspace(0, 1, 5)
     assert not confidence.position_sigma(models.MotionModel("translation", velocity=[1, 0, 0]), tau).any()
     model = with_covariance(models.MotionModel("ballistic_spin", angular_velocity=[1, 0, 0]))

@@ -1,4 +1,4 @@
-"""Curves that are a motion model are recognised; others are met as well as may be, and the error is the true one."""
+"""Curves of a motion model are recognised; others are approximated, and the returned error is the true one."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ CASES = (
 
 @pytest.mark.parametrize(("kind", "names"), CASES)
 @pytest.mark.parametrize("sign", [1, -1])
-def test_models_are_found_again_and_go_on_alike(kind, names, sign):
+def test_models_are_recovered_and_extrapolate_alike(kind, names, sign):
     truth = MotionModel(kind, radius=0.3, **{name: RATES[name] for name in names})
     quats, moves = models.evaluate(truth, TAUS)
     found, error = fit_drawn_curve.fit(TAUS, sign * quats, moves, 0.3, 1e-6)
@@ -35,7 +35,7 @@ def test_models_are_found_again_and_go_on_alike(kind, names, sign):
     assert fit_drawn_curve.pose_errors(*models.evaluate(found, later), *models.evaluate(truth, later), 0.3).max() < 1e-4
 
 
-def test_the_plainest_kind_that_holds_the_tolerance_is_taken():
+def test_the_simplest_kind_within_the_tolerance_is_chosen():
     moves = np.outer(TAUS, (1.0, 0, 0)) + 1e-5 * np.sin(40 * TAUS)[:, None]
     quats = rotations.identity(len(TAUS))
     assert fit_drawn_curve.fit(TAUS, quats, moves, 0.3, 1e-4)[0].kind == "translation"

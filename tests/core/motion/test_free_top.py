@@ -90,14 +90,14 @@ def test_spins_are_the_derivative_of_the_turns():
             np.testing.assert_allclose(measured, spins, atol=3e-8 + 1e-7 * np.linalg.norm(w))
 
 
-def test_no_time_and_no_spin_are_the_identity_to_the_bit():
+def test_zero_time_and_zero_spin_are_the_identity_to_the_bit():
     quats, spins = free_top.turns(BOX, np.array([[1.0, 2, 3], [0, 0, 0]]), np.array([0.0, 1.0]))
     assert quats[0, 0].tolist() == quats[1, 0].tolist() == quats[1, 1].tolist() == [1, 0, 0, 0]
     assert not spins[1].any()
     assert (quats[0, 1] != quats[0, 0]).any()
 
 
-def test_many_spins_and_times_at_once_are_each_by_itself():
+def test_batches_of_spins_and_times_equal_single_evaluations():
     spins, tau = np.array(list(SPINS.values())), np.linspace(-2, 2, 5)
     together = free_top.turns(BODIES["tilted box"], spins, tau)
     for i, w in enumerate(spins):
@@ -107,7 +107,7 @@ def test_many_spins_and_times_at_once_are_each_by_itself():
             np.testing.assert_allclose(together[1][i, j], alone[1][0], atol=1e-12)
 
 
-def test_times_far_away_cost_no_digits_but_those_of_the_angle():
+def test_far_times_lose_only_the_digits_of_the_angle():
     w = np.array([3.0, 0.5, -1.2])
     there, spins = free_top.turns(BOX, w, np.array([1e4]))
     matrix = rotations.quats_to_rotmats(there[0])
@@ -140,6 +140,6 @@ def test_inertia_is_that_of_the_cloud():
     assert not free_top.tumbles(free_top.inertia(np.outer(np.arange(5.0), [1, 2, 3])))
 
 
-def test_a_body_without_extent_across_is_refused():
+def test_a_body_without_extent_in_two_directions_is_refused():
     with pytest.raises(ValueError, match="moments"):
         free_top.turns(np.diag([0.0, 1.0, 1.0]), np.ones(3), np.zeros(1))

@@ -108,7 +108,7 @@ def test_an_observation_is_an_outlier_as_a_whole():
     np.testing.assert_allclose(found.x, [1, 3, 2, -1], atol=0.02)
 
 
-def test_many_starts_are_each_solved_as_if_alone():
+def test_many_starts_are_solved_independently():
     """Each start has values of its own, and they need different numbers of steps."""
     values = 1 + np.arange(5)[:, None] * TIMES + 0.01 * RNG.normal(size=(5, len(TIMES)))
     values[3, 7] += 2.0

@@ -55,7 +55,7 @@ def test_the_motion_converges_to_the_fitted_curve(name):
 
 
 @pytest.mark.parametrize("tau", [0.0, 0.013, 1.7])
-def test_many_models_at_once_are_each_by_itself(tau):
+def test_batches_of_models_equal_single_models(tau):
     group = [m for case in CASES.values() for m in (case, with_offsets(case), with_offsets(models.STATIC))]
     # A kind ignores the rates that are not its own.
     group.append(MotionModel("translation", velocity=[1, 2, 3], angular_velocity=[3, 2, 1], center_offset=[1, 1, 1]))
@@ -73,7 +73,7 @@ def test_many_models_at_once_are_each_by_itself(tau):
 
 
 @pytest.mark.parametrize("tau", [1.0, 10.0, 30.0])
-def test_far_in_the_future_twists_are_where_keys_put_them(tau):
+def test_far_in_the_future_twists_agree_with_keys(tau):
     rates = {"velocity": [1, 0, 0], "acceleration": [0, 1, 0]}
     twist = MotionModel("world_twist", **rates, angular_velocity=[5, 0, 0], angular_acceleration=[0, 5, 0])
     stack = models.Stack([twist])
@@ -104,7 +104,7 @@ def test_distances_are_kept(name):
 
 @pytest.mark.parametrize("scale", [0.5, -2.0])
 @pytest.mark.parametrize("name", CASES)
-def test_a_model_moves_with_its_world(name, scale):
+def test_a_model_transforms_with_its_world(name, scale):
     turn = rotations.rotvecs_to_quats(np.array([0.4, -0.9, 0.7]))
     model = with_offsets(CASES[name])
     rates = {f"{name}.{axis}": rate for name in RATES for axis, rate in zip("xyz", getattr(model, name), strict=True)}
@@ -191,7 +191,7 @@ def test_a_hinge_keeps_its_axis_in_place():
 
 
 @pytest.mark.parametrize("name", ["pendulum", "spring"])
-def test_a_swing_comes_back_after_each_period(name):
+def test_a_swing_returns_after_each_period(name):
     model = CASES[name]
     period = 2 * np.pi / model.frequency
     tau = np.linspace(0, period, 9)
@@ -207,7 +207,7 @@ def test_a_pendulum_keeps_its_axis_in_place():
     np.testing.assert_allclose(hook, np.broadcast_to(model.center_offset, displacements.shape), atol=1e-12)
 
 
-def test_a_spring_is_pulled_back_in_proportion_to_its_way():
+def test_the_force_of_a_spring_is_proportional_to_its_displacement():
     model, tau, h = CASES["spring"], np.linspace(0, 2, 11), 1e-4
     rest = model.acceleration / model.frequency**2  # of d, where nothing pulls
     before, here, after = (models.curve(model, tau + shift)[1] for shift in (-h, 0, h))
@@ -341,7 +341,7 @@ def test_world_twist_equals_many_magnus_steps():
         np.testing.assert_allclose(displacements, fine, atol=1e-8)
 
 
-def test_world_twist_does_not_depend_on_the_other_times_asked_for():
+def test_world_twist_does_not_depend_on_the_other_requested_times():
     together = models.evaluate(WORLD_TWIST, np.array([0.2, 9.0]))
     alone = models.evaluate(WORLD_TWIST, 0.2)
     for x, y in zip(together, alone, strict=True):

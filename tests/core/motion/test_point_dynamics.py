@@ -1,4 +1,4 @@
-"""Points that move by twists of their own."""
+"""Points that each move by their own twist."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_rk2_converges_with_order_two():
 
 
 @pytest.mark.parametrize("angle", [0.05, 0.1, 0.5, 1.0, math.pi])
-def test_midpoint_steps_let_a_spinning_body_grow_as_they_must(angle):
+def test_midpoint_steps_enlarge_a_spinning_body_as_theory_predicts(angle):
     still, spin = np.zeros(3), np.array([0.0, 0.0, angle])
     points, _ = point_dynamics.rk2(np.array([1.0, 0.0, 0.0]), still, spin, still, still, 3.0, 1.0)
     assert np.linalg.norm(points) == pytest.approx((1 + angle**4 / 4) ** 1.5, rel=1e-9)
@@ -135,14 +135,14 @@ def test_rk2_serves_numpy_and_torch_alike():
             np.testing.assert_allclose(tensor.numpy(), array, atol=1e-14)
 
 
-def test_the_last_step_is_shorter_so_that_the_time_is_met():
+def test_the_last_step_is_shortened_to_reach_the_time():
     # Constant velocity is exact at any step.
     state = np.zeros((1, 3)), np.ones((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3))
     points, _ = point_dynamics.rk2(*state, 1.0, 0.3)
     np.testing.assert_allclose(points, 1.0, atol=1e-15)
 
 
-def test_a_path_that_explodes_stays_where_it_last_was_however_far_ahead(monkeypatch):
+def test_a_diverging_path_keeps_its_last_finite_position(monkeypatch):
     monkeypatch.setattr(rk2_cache, "MOST_STEPS", 2000)
     start = np.zeros((2, 3))
     v, w = np.array([[0.1, 0, 0], [0.1, 0, 0]]), np.array([[0, 0, 400.0], [0, 0, 0.5]])

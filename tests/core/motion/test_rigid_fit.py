@@ -77,7 +77,7 @@ def test_a_thin_rod_in_noise_counts_as_a_line():
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 60])
 @pytest.mark.parametrize("flatten", [(1, 1, 1), (1, 1, 0), (1, 0.1, 0.1), (1, 0.01, 0.01), (1, 0, 0), (0, 0, 0)])
-def test_no_cloud_is_mirrored_or_gives_nonsense(count, flatten):
+def test_no_fit_mirrors_a_cloud_or_is_meaningless(count, flatten):
     rng = np.random.default_rng(count)
     for _ in range(10):
         source = cloud(count, int(rng.integers(1 << 30)), flatten)
@@ -90,7 +90,7 @@ def test_no_cloud_is_mirrored_or_gives_nonsense(count, flatten):
             assert rotations.angle_between(fit.quat, QUAT) < 1e-12
 
 
-def test_two_points_leave_the_turn_about_their_line_open():
+def test_two_points_do_not_determine_the_rotation_about_their_line():
     source = np.array([[0.0, 0, 0], [1.0, 0, 0]])
     fit = rigid_fit.fit_rigid(source, moved(source))
     assert len(fit.undetermined_axes) == 1
@@ -133,12 +133,12 @@ def test_ambiguous_rotation_steps_are_reported(degrees, told):
     assert rigid_fit.aliased_step(times[:1], quats[:1]) is None
 
 
-def test_opposite_points_turn_half_about_a_normal():
+def test_opposite_points_give_a_half_turn_about_a_normal():
     quat = rigid_fit.shortest_turn(np.array([0, 0, 1.0]), np.array([0, 0, -1.0]))
     np.testing.assert_allclose(rotations.rotate(quat, np.array([0, 0, 1.0])), [0, 0, -1], atol=1e-12)
 
 
-def test_a_third_of_strangers_does_not_move_the_fit():
+def test_a_third_of_outliers_does_not_move_the_fit():
     rng = np.random.default_rng(3)
     source = cloud(90)
     target = moved(source) + 0.002 * rng.normal(size=source.shape)
@@ -150,7 +150,7 @@ def test_a_third_of_strangers_does_not_move_the_fit():
     assert np.linalg.norm(robust.displacement_at(robust.center) - robust.displacement) < 1e-12
 
 
-def test_weight_zero_leaves_a_point_out():
+def test_points_with_zero_weight_are_ignored():
     source = cloud(10)
     target = moved(source)
     target[0] += 100

@@ -1,4 +1,4 @@
-"""A motion about a point leaves that point where it is, wherever it is moved to."""
+"""The centre of a motion stays in place, also after it was moved."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ def places(model, points, taus=TAU):
 
 
 def spins(**more):
-    """Motions that turn and do nothing else, about a place off the pivot."""
+    """Pure rotations about a point beside the pivot."""
     rates = {"angular_velocity": W, "angular_acceleration": EPS}
     arms = {"velocity": -np.cross(W, POINT), "acceleration": -np.cross(EPS, POINT)}
     return {
@@ -101,7 +101,7 @@ def test_the_center_is_on_the_axis_and_of_a_twist_the_nearest_to_the_pivot(name)
 
 
 @pytest.mark.parametrize("name", spins())
-def test_moving_and_turning_to_where_it_is_changes_nothing(name):
+def test_moving_to_the_current_place_changes_nothing(name):
     model = spins()[name]
     for same in (
         rotation_centers.with_center(model, rotation_centers.center(model)),
@@ -111,7 +111,7 @@ def test_moving_and_turning_to_where_it_is_changes_nothing(name):
             np.testing.assert_allclose(getattr(same, field), getattr(model, field), atol=1e-12)
 
 
-def test_the_opposite_axis_is_reached_too():
+def test_an_axis_can_be_reversed():
     for along in (*np.eye(3), W):
         model = MotionModel("constant_twist", angular_velocity=along)
         np.testing.assert_allclose(rotation_centers.with_axis(model, -along).angular_velocity, -along, atol=1e-12)

@@ -31,7 +31,7 @@ def test_multiply_composes_rotations(p, q, v):
 
 
 @given(hnp.arrays(np.float64, (2, 3, 3), elements=st.floats(-10, 10)), quats())
-def test_no_rotation_is_nearer_than_the_nearest(matrices, other):
+def test_the_nearest_rotation_is_optimal(matrices, other):
     nearest = rot.nearest_rotmats(matrices)
     np.testing.assert_allclose(
         nearest @ np.swapaxes(nearest, -1, -2), np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-12
@@ -60,7 +60,7 @@ def test_rotate_equals_the_matrix_and_keeps_lengths(q, v):
 
 
 @given(quats(), vectors())
-def test_conjugate_undoes(q, v):
+def test_the_conjugate_is_the_inverse(q, v):
     np.testing.assert_allclose(rot.rotate(rot.conjugate(q), rot.rotate(q, v)), v, atol=1e-13)
 
 
@@ -185,7 +185,7 @@ def test_signs_are_continuous_over_ten_turns():
 
 
 @given(quats(), quats())
-def test_slerp_reaches_its_ends_the_short_way(p, q):
+def test_slerp_takes_the_short_way_between_its_ends(p, q):
     assert rot.angle_between(rot.slerp(p, q, 0.0), p) < 1e-7
     assert rot.angle_between(rot.slerp(p, q, 1.0), q) < 1e-7
     half = rot.slerp(p, q, 0.5)

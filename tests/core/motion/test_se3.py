@@ -84,7 +84,7 @@ def test_products_by_halving_and_doubling_equal_the_loop(count):
     np.testing.assert_allclose(quats, np.stack([p[0] for p in prefixes]), atol=1e-12)
 
 
-def test_step_rule_holds_its_tolerance():
+def test_the_step_rule_keeps_its_tolerance():
     rng = np.random.default_rng(0)
     ratios = []
     for _ in range(200):
@@ -106,7 +106,7 @@ def test_one_step_is_exact_where_twist_and_rate_commute():
     assert distance(se3.integrate(W, V, 0.5 * W, 0.5 * V, 3.0, 1), se3.exp(whole * W, whole * V)) < 1e-12
 
 
-def test_an_axis_that_stays_turns_by_the_integral_of_its_spin():
+def test_a_fixed_axis_rotates_by_the_integral_of_its_spin():
     w, eps = np.array([1.2, -0.4, 2.0]), -1.3 * np.array([1.2, -0.4, 2.0])
     for duration in (0.5, 1.0, 2.0, 30.0):
         q, _ = se3.integrate(w, V, eps, ACC, duration, 4)
@@ -143,7 +143,7 @@ def test_origin_shift_changes_nothing_but_rounding():
     np.testing.assert_allclose(rotations.rotate(q, c) + d, c + d2, atol=1e-12)
 
 
-def test_a_body_far_away_keeps_its_shape_and_its_place():
+def test_a_body_far_from_the_origin_keeps_its_shape_and_position():
     center, rng = np.array([1e4, -1e4, 5e3]), np.random.default_rng(1)
     offsets = rng.normal(size=(20, 3))
     v, a = V - np.cross(W, center), ACC - np.cross(EPS, center)  # about the world's origin; about the centre V and ACC
@@ -172,7 +172,7 @@ def test_recentred_rates_are_those_of_the_centre():
 
 @pytest.mark.parametrize("steps", [1, 3, 64])
 @pytest.mark.parametrize("order", [2, 4])
-def test_no_time_gives_the_identity_to_the_bit(steps, order):
+def test_zero_time_gives_the_identity_to_the_bit(steps, order):
     q, d = se3.integrate(W, V, EPS, ACC, np.zeros(2), steps, order)
     assert q.tolist() == [[1, 0, 0, 0]] * 2
     assert d.tolist() == [[0, 0, 0]] * 2
@@ -194,7 +194,7 @@ def test_parts_of_a_time_one_after_another_are_the_whole_within_the_tolerance():
     assert distance(pose, reach(0.0, 2.0)) < 2 * tolerance
 
 
-def test_backward_undoes_forward():
+def test_integrating_backward_inverts_integrating_forward():
     q, d = se3.integrate(W, V, EPS, ACC, 1.5, 5)
     back = se3.integrate(W + 1.5 * EPS, V + 1.5 * ACC, EPS, ACC, -1.5, 5)
     assert distance(se3.compose(back, (q, d)), (rotations.identity(), np.zeros(3))) < 1e-13
@@ -206,7 +206,7 @@ def test_motion_composes_over_time():
     assert distance(se3.compose(second, first), fine(W, V, EPS, ACC, 1.1)) < 1e-10
 
 
-def test_invert_undoes():
+def test_invert_gives_the_inverse():
     pose = se3.exp(W, V)
     assert distance(se3.compose(se3.invert(pose), pose), (rotations.identity(), np.zeros(3))) < 1e-14
 

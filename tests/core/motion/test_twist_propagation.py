@@ -45,7 +45,7 @@ def test_closed_forms_need_no_tolerance():
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-300, 1e-12, 1e-8, 1e-4, 0.5, np.pi, 2 * np.pi, 30.0])
-def test_nothing_is_lost_near_no_rotation(turn):
+def test_precision_is_kept_near_zero_rotation(turn):
     w, v = np.array([[turn], [0.0], [0.0]]), np.array([[0.3], [-1.0], [2.0]])
     quats, moves = twist_propagation._exp(np.concatenate([w, v]))
     expected, exact = se3.exp(w[:, 0], v[:, 0])
@@ -53,7 +53,7 @@ def test_nothing_is_lost_near_no_rotation(turn):
     np.testing.assert_allclose(quats[:, 0], expected, atol=1e-15)
 
 
-def test_times_may_come_in_any_order_and_points_in_any_number():
+def test_times_may_have_any_order_and_points_any_number():
     state, times = points(50), [0.5, 0.1, 0.9, 0.5]
     kept = twist_propagation.Propagator(state, 1e-6)
     for t in times:
@@ -63,7 +63,7 @@ def test_times_may_come_in_any_order_and_points_in_any_number():
     assert quats.shape == (0, 4) and moves.shape == (0, 3)
 
 
-def test_points_beyond_one_chunk_are_all_there(monkeypatch):
+def test_points_beyond_one_chunk_are_all_computed(monkeypatch):
     state = points(40)
     whole = twist_propagation.Propagator(state, 1e-8).rows_of(0.6)
     monkeypatch.setattr(twist_propagation, "CHUNK", 7)

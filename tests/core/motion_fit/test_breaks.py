@@ -113,7 +113,7 @@ def test_two_impacts_are_both_found():
     assert error < 8
 
 
-def test_the_last_part_may_have_a_law_that_no_break_has():
+def test_the_last_part_may_have_a_law_of_its_own():
     def path(t):
         since = np.maximum(t - 0.21, 0)[:, None]
         way = -np.expm1(-5 * since) / 5
@@ -201,7 +201,7 @@ def test_bounces_that_no_pose_separates_are_one_event():
     assert min(np.diff([event.time for event in found])) > T_MAX / 15
 
 
-def test_motion_that_no_law_describes_is_not_taken_for_rest():
+def test_motion_without_a_fitting_law_is_not_taken_for_rest():
     truth = problems.MOTIONS["free axis"][0]
     quats, d, *_ = problems.observe(truth, TIMES, np.random.default_rng(0), 1e-7 * SIZE, 1e-7)
     names = ["static", "ballistic + spin, accelerating"]
@@ -210,7 +210,7 @@ def test_motion_that_no_law_describes_is_not_taken_for_rest():
 
 
 @pytest.mark.parametrize(("acceleration", "much"), [(1.0, False), (200.0, True)])
-def test_a_law_by_which_a_body_goes_further_than_ever_is_implausible(acceleration, much):
+def test_a_law_that_moves_a_body_further_than_ever_is_implausible(acceleration, much):
     tau = np.linspace(-1, 0, 15)
     track = pose_track.PoseTrack(tau, rotations.identity(15), 3.0 * tau[:, None] * [1, 0, 0], np.ones(15))
     law = candidates.BY_NAME["translation, quadratic"]

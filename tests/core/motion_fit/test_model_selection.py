@@ -30,7 +30,7 @@ def test_each_motion_is_recovered_without_noise(name):
 
 
 @pytest.mark.parametrize("name", ["uniform", "hinge", "ballistic, spinning"])
-def test_uneven_times_and_a_gap_are_no_obstacle(name):
+def test_uneven_times_and_gaps_are_supported(name):
     times = np.concatenate([UNEVEN[UNEVEN < 0.3], UNEVEN[UNEVEN > 0.45]])
     fit, error = fitted(name, np.random.default_rng(1), 1e-6 * SIZE, 1e-6, times)
     assert fit.chosen in MOTIONS[name][1]
@@ -78,7 +78,7 @@ def test_at_low_noise_the_choice_is_never_clearly_worse_than_the_largest():
 
 
 def observe_tumbling(rng, sigma_t, sigma_r):
-    """Poses of a tumbling box, its last true pose, and its inertia in the bind state as its surface would give it."""
+    """Poses of a tumbling box, its last true pose, and its inertia in the bind state, computed from its surface."""
     truth = problems.TUMBLING
     quats, d, last_quat, last = problems.observe(truth, TIMES, rng, sigma_t, sigma_r)
     back = rotations.quats_to_rotmats(rotations.conjugate(last_quat))
@@ -116,7 +116,7 @@ def test_the_inertia_changes_nothing_for_bodies_that_do_not_tumble():
     assert cube.chosen != "free top"
 
 
-def test_one_gross_outlier_is_shrugged_off():
+def test_one_gross_outlier_has_little_effect():
     rng = np.random.default_rng(4)
     truth = MOTIONS["ballistic, spinning"][0]
     clean, dirty = [], []
@@ -245,8 +245,8 @@ def test_the_band_holds_the_true_error():
     assert fit.history.band.half_width[-1] > fit.history.band.half_width[4] > 0
 
 
-def test_a_law_that_earlier_poses_contradict_is_not_trusted():
-    """A path of five random waves, of which three are too fast to be seen as such."""
+def test_a_law_that_contradicts_earlier_poses_is_rejected():
+    """A path of five random waves, three of them too fast to be resolved."""
     rng, trusted = np.random.default_rng(0), []
     for _ in range(4):
         frequencies, ways = rng.uniform(5, 40, 5), 0.4 * rng.normal(size=(5, 3))
@@ -271,7 +271,7 @@ def test_the_future_starts_at_the_bind_state_however_noisy():
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6, 7])
-def test_few_poses_give_a_plain_model_that_runs_through_them(count):
+def test_few_poses_give_a_simple_model_through_them(count):
     truth = MOTIONS["rolling"][0]
     times = np.linspace(0, T_MAX, count) if count > 1 else np.array([T_MAX])
     quats, d, last_quat, last = problems.observe(truth, times, np.random.default_rng(0), 1e-6, 1e-6)
@@ -302,7 +302,7 @@ def test_scale_and_units_of_time_do_not_change_the_choice():
     )
 
 
-def test_the_world_twist_can_be_asked_for():
+def test_the_world_twist_can_be_requested():
     truth = models.MotionModel(
         "world_twist",
         velocity=[0.5, 0, 0.1],
@@ -333,7 +333,7 @@ def test_equal_input_gives_equal_models():
 
 
 @pytest.mark.parametrize("count", [2, 3, 5, 9, 15])
-def test_poses_without_sense_give_finite_motions(count):
+def test_meaningless_poses_give_finite_motions(count):
     rng = np.random.default_rng(count)
     times = np.sort(rng.uniform(size=count))
     quats = rotations.normalize(rng.normal(size=(count, 4)))

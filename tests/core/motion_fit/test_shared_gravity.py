@@ -78,7 +78,7 @@ def test_gravity_needs_at_least_two_agreeing_bodies():
         assert all(x is y for x, y in zip(shared, fits, strict=False))
 
 
-def test_bodies_that_speed_up_alike_do_not_share_where_only_falling_counts():
+def test_bodies_with_equal_acceleration_share_it_only_if_they_fall():
     tracks, fits, _ = observed([SPEEDING, SPEEDING], np.random.default_rng(3), 0.002 * SIZE)
     assert shared_gravity.share(tracks, fits)[1] == (0, 1)
     assert shared_gravity.share(tracks, fits, np.array([0, 0, 1.0]))[1] == ()

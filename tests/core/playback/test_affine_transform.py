@@ -1,4 +1,4 @@
-"""Gaussians carried by a map look as the renderer draws them under that map."""
+"""Transformed Gaussians match the renderer's picture of Gaussians under the same map."""
 
 import dataclasses
 
@@ -77,7 +77,7 @@ def test_covariances_are_mapped_exactly(linear):
     np.testing.assert_allclose(moved.means, splats.means @ linear.T + [0.3, -2.0, 1.0], atol=1e-5)
 
 
-def test_carrying_there_and_back_changes_nothing():
+def test_a_transform_and_its_inverse_change_nothing():
     splats = affine_transform.bind_state(make_scene(n=60, sh_degree=3), slice(None))
     matrix = matrix_of(1.7 * TURN)
     back = affine_transform.carry(affine_transform.carry(splats, matrix), np.linalg.inv(matrix))
@@ -114,7 +114,7 @@ def test_a_placed_range_is_lit_as_playback_lights_it():
     np.testing.assert_allclose(np.maximum(0.5 + spherical_harmonics.C0 * placed.sh[:, 0], 0), colour, atol=1e-6)
 
 
-def test_the_light_turns_with_the_world():
+def test_the_light_rotates_with_the_world():
     scene = make_scene(n=200, shading=True)
     world, matrix = matrix_of(0.5 * TURN), matrix_of(TURN @ TURN)
     placed = affine_transform.place(scene, 60, 120, world @ matrix, world=world)

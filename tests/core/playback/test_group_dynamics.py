@@ -1,4 +1,4 @@
-"""Motion of groups out of the dynamics of their members."""
+"""Motion of groups from the dynamics of their members."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_members_of_one_twist_give_that_twist(scene, source):
             assert model.is_static
 
 
-def test_the_fitted_source_is_what_the_scene_holds(scene):
+def test_the_fitted_source_is_the_model_of_the_scene(scene):
     assert group_dynamics.models_of(scene, "fitted") == tuple(group.model for group in scene.groups)
 
 
@@ -80,7 +80,7 @@ def test_the_representative_defines_the_motion_of_its_group(scene):
 
 
 @pytest.mark.parametrize("source", VOTES)
-def test_faint_members_do_not_vote_and_a_few_bad_ones_do_not_matter(scene, source):
+def test_faint_members_and_a_few_outliers_have_no_effect(scene, source):
     members, rng = np.flatnonzero(scene.gaussians.motion_ids == 1), np.random.default_rng(3)
     faint, bad = members[: len(members) // 2], members[-len(members) // 10 :]
     dynamics, logits = scene.dynamics.rates.copy(), np.full(len(scene.gaussians.means), 3.0, np.float32)
@@ -99,8 +99,8 @@ def test_all_members_vote_if_all_are_faint(scene):
 
 
 @pytest.mark.parametrize(("source", "right"), [("median", False), ("least_squares", True), ("kabsch", True)])
-def test_spins_that_training_cannot_see_do_not_mislead_fits_to_what_it_sees(scene, source, right):
-    """Members that move like the body but do not spin themselves: only v + w x r is seen in training."""
+def test_unobservable_spins_do_not_mislead_the_fits(scene, source, right):
+    """Members that move like the body but do not spin themselves: training observes only v + w x r."""
     dynamics = np.asarray(scene.dynamics.rates, np.float64).copy()
     for group in scene.groups:
         rows = np.flatnonzero(scene.gaussians.motion_ids == group.id)

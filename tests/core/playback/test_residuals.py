@@ -118,7 +118,7 @@ def test_equal_twists_move_a_body_rigidly_in_mode_standard():
         assert scene.groups[g].role == "body" or (before == after).all()
 
 
-def test_the_literal_form_is_rigid_only_where_offsets_are_those_at_t_max():
+def test_the_literal_form_is_rigid_only_if_offsets_are_those_at_t_max():
     scene = twisting(make_scene())
     standard, literal = (scene_player.frame(scene, 1.0, mode) for mode in ("standard", "rigid_paper"))
     np.testing.assert_allclose(literal.means, standard.means, atol=2e-3)
@@ -184,7 +184,7 @@ def loose(scene: Scene, rows: np.ndarray, size: float) -> Scene:
 
 
 @pytest.mark.parametrize("variant", ["", "/least_squares"])
-def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, variant):
+def test_hybrid_is_rigid_except_for_gaussians_that_no_group_explains(twisted, variant):
     dynamics = twisted.dynamics.rates + (twisted.dynamics.rates != 0) * np.float32(0.2)
     dynamics[np.flatnonzero(twisted.gaussians.motion_ids == 1)[::6]] = 0.0  # a stray that rests while its group moves
     scene = twisted.with_arrays(dynamics=dynamics)
@@ -204,7 +204,7 @@ def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, v
             np.testing.assert_array_equal(getattr(frame, name)[~free], getattr(rigid, name)[~free])
 
 
-def test_the_literal_form_is_rigid_where_the_object_only_moved_along(twisted):
+def test_the_literal_form_is_rigid_if_the_object_only_translated(twisted):
     """If f_def is a translation, offsets in the canonical state are those at t_max."""
     dynamics = twisted.dynamics.rates.copy()
     dynamics[:, 3:6] *= 0.1  # TRACE's midpoint steps are exact enough for slow spins
@@ -239,7 +239,7 @@ def test_the_first_gaussian_of_a_scene_can_represent_a_body_in_the_literal_form(
     np.testing.assert_allclose(moved, np.broadcast_to([0.15, 0.0, -0.05], moved.shape), atol=1e-6)
 
 
-def test_modes_without_canonical_places_lack_the_literal_form():
+def test_scenes_without_canonical_centres_lack_the_literal_form():
     scene = twisting(make_scene(60)).with_arrays(canonical_means=None)
     assert {scene_player.split(mode)[0] for mode in scene_player.modes(scene)} == {"rigid", "hybrid", "standard"}
 

@@ -81,7 +81,7 @@ def test_slopes_are_exact_for_parabolas_on_uneven_times():
     assert (cubic_curves.slopes(times[:1], values[:1]) == 0).all()
 
 
-def test_signs_in_the_file_do_not_matter(scene):
+def test_signs_of_quaternions_in_the_file_do_not_matter(scene):
     flipped = scene.tracks.poses.copy()
     flipped[:, ::2, :4] *= -1
     other = scene.with_arrays(track_poses=flipped)
@@ -111,7 +111,7 @@ def test_pinned_gaussians_never_change(scene):
         assert (frame.shading_factor[still] == 1).all()
 
 
-def test_a_follower_takes_its_leaders_displacement_without_turning(scene):
+def test_a_follower_takes_its_leaders_displacement_without_rotating(scene):
     shadow = next(g for g in scene.groups if g.follows is not None)
     quats, displacements = scene_player.group_poses(scene, 1.4)
     np.testing.assert_allclose(displacements[shadow.id], shadow.follow_matrix @ displacements[shadow.follows])
@@ -142,7 +142,7 @@ def test_one_turn_lights_gaussians_as_the_same_turn_for_each(scene):
 
 
 @pytest.mark.parametrize("t", [0.2, T_MAX, 1.1])
-def test_posing_groups_as_playback_does_gives_its_frame(scene, t):
+def test_posing_groups_like_playback_gives_its_frame(scene, t):
     played = scene_player.frame(scene, t)
     posed = scene_player.pose(scene, played.group_quats, played.group_displacements, t)
     for one, other in zip(dataclasses.astuple(posed), dataclasses.astuple(played), strict=True):
@@ -178,7 +178,7 @@ def test_the_largest_acceleration_that_a_file_may_hold_plays_to_finite_centres(s
 
 @pytest.mark.parametrize("shift", [0.0, 1e4])
 @pytest.mark.parametrize("t", [T_MAX / 2, 2.0, 100 * T_MAX])
-def test_bodies_keep_their_shape_near_and_far_and_for_long(scene, shift, t):
+def test_bodies_keep_their_shape_at_any_distance_and_for_long_times(scene, shift, t):
     """Distances from the body's own place are kept, to single precision of the body's size."""
     away = np.array([1.0, -1.0, 0.5]) * shift
     groups = tuple(dataclasses.replace(group, pivot=group.pivot + away) for group in scene.groups)
@@ -208,7 +208,7 @@ def test_an_origin_only_shifts_the_centres(scene, t):
     np.testing.assert_array_equal(again.means, plain.means)
 
 
-def test_frames_are_their_own_whatever_a_player_showed_before(scene):
+def test_frames_do_not_depend_on_earlier_frames_of_the_player(scene):
     player = scene_player.Player(scene)
     first = player.frame(1.1)
     kept = first.means.copy()

@@ -1,6 +1,6 @@
-"""The `cpu` backend draws random scenes as the float64 reference does, whatever they hold.
+"""The `cpu` backend agrees with the float64 reference on random scenes of all kinds.
 
-Hypothesis chooses what kind of scene it is; its numbers come from a seed, rounded to float32 so that both precisions
+Hypothesis chooses the kind of scene. Its numbers come from a seed, rounded to float32 so that both precisions
 see the same scene.
 """
 
@@ -44,7 +44,7 @@ def scenes(draw, place):
     n = draw(st.sampled_from([1, 2, 7, 30, 100, 200]))
     n_channels = draw(st.sampled_from([1, 2, 3, 4, 5, 8, 19]))
     width, height = draw(st.integers(1, 50)), draw(st.integers(1, 50))
-    # The seed holds what was chosen: Hypothesis likes to change one choice only, and numbers should change with it.
+    # The seed contains the choices: Hypothesis often changes a single choice, and the numbers should change with it.
     random = np.random.default_rng([draw(st.integers(0, 2**32 - 1)), n, n_channels, width, height])
     focal = draw(st.sampled_from([0.3, 1.0, 20.0])) * max(width, height)
     view = _camera(random, width, height, focal, draw(st.booleans()))

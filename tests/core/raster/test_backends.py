@@ -25,7 +25,7 @@ def single(*args, **kwargs):
     return [tensor.float() for tensor in splats(*args, **kwargs)]
 
 
-def test_a_backend_draws_by_its_name_and_auto_stays_as_it_was():
+def test_a_backend_draws_by_its_name_and_auto_does_not_change():
     scene = single(40, 3)
     drawn = rasterize_splats(*scene, camera(), torch.full((3,), 0.5), backend="points")
     covered = drawn.alpha > 0
@@ -58,7 +58,7 @@ def test_weights_of_segments_follow_from_its_gradients():
     assert weights.sum() == (drawn.alpha > 0).sum() and set(weights.data) == {1.0}
 
 
-def test_a_backend_that_cannot_draw_is_passed_over_with_its_reason(monkeypatch, caplog):
+def test_a_backend_that_cannot_draw_is_skipped_with_its_reason(monkeypatch, caplog):
     class Broken(Backend):
         name = "broken"
 

@@ -38,7 +38,7 @@ def forget():
 
 
 def blocked(tmp_path: Path) -> Path:
-    """A place in which nobody, root included, can make a folder."""
+    """Path in which nobody, not even root, can create a folder."""
     path = tmp_path / "a file"
     path.write_text("")
     return path
@@ -76,7 +76,7 @@ def test_the_users_choice_and_the_users_cache_come_first(tmp_path, monkeypatch):
     assert Path(compilation._cache_folder(str(blocked(tmp_path) / "deeper"))).parent == tmp_path / "user"
 
 
-def test_the_first_compilation_is_announced_once_and_loading_never(tmp_path):
+def test_the_first_compilation_is_announced_once_and_loading_is_never_announced(tmp_path):
     first, second = (run_toy(tmp_path, NUMBA_CACHE_DIR=tmp_path / "cache") for _ in range(2))
     assert first.stderr.splitlines() == [compilation.NOTICE] and second.stderr == ""
 
@@ -170,7 +170,7 @@ def imported_from_the_core(path, tree):
                 yield inside if inside.exists() else folder.with_suffix(".py")
 
 
-def test_kernels_are_made_of_their_own_file_and_the_shared_sources_alone():
+def test_kernels_depend_only_on_their_own_file_and_the_shared_sources():
     shared = set(compilation.shared_sources())
     found = dict(modules_with_kernels())
     assert len(found) > 8 and CORE / "train" / "losses.py" in found
@@ -181,15 +181,15 @@ def test_kernels_are_made_of_their_own_file_and_the_shared_sources_alone():
     assert CORE / "scene" / "spherical_harmonics.py" in shared
 
 
-def test_a_kernel_is_compiled_again_for_another_state_of_its_own_file(tmp_path):
-    """Also if time and size of the file, at which numba looks, are the same."""
+def test_a_kernel_is_compiled_again_after_a_change_of_its_file(tmp_path):
+    """Also if time and size of the file, which numba compares, are the same."""
     printed = []
     for script in (TOY, TOY.replace("return 2 * x", "return 5 * x"), TOY):
         printed.append(run_toy(tmp_path, script, NUMBA_CACHE_DIR=tmp_path / "cache").stdout.split())
     assert printed == [["42", "0", "1"], ["105", "0", "1"], ["42", "1", "0"]]
 
 
-def test_another_state_of_a_source_has_another_folder(tmp_path, monkeypatch):
+def test_a_changed_source_has_another_cache_folder(tmp_path, monkeypatch):
     source = tmp_path / "constants.py"
     monkeypatch.setattr(compilation, "shared_sources", lambda: [source])
     folders = []
@@ -220,7 +220,7 @@ def test_a_new_cache_folder_replaces_old_unused_ones(tmp_path):
     assert left == {*ages, folder.name} - {"r5dgs-0123456789ab"}
 
 
-def test_a_folder_that_is_used_stays_young_and_removes_nothing(tmp_path):
+def test_using_a_cache_folder_renews_it_and_removes_nothing(tmp_path):
     folder = Path(compilation._cache_folder(str(tmp_path)))
     old = tmp_path / "r5dgs-0123456789ab"
     old.mkdir()
@@ -273,7 +273,7 @@ def test_compiled_code_that_others_can_replace_is_not_used(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("value", ["0", "100000", "2.5", "٣", "9" * 5000, " 2"])
-def test_a_number_of_threads_that_is_none_is_one_line(tmp_path, value):
+def test_an_invalid_number_of_threads_is_an_error_of_one_line(tmp_path, value):
     code = "import sys; from r5dgs_core.cli import main as cli; sys.exit(cli.main(['warm-up']))"
     environment = {**os.environ, "NUMBA_NUM_THREADS": value, "PYTHONPATH": str(CORE.parent)}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=tmp_path)
@@ -291,7 +291,7 @@ def test_without_a_cache_folder_nothing_is_cached_and_one_warning_is_logged(tmp_
     assert "a file" in record.getMessage()
 
 
-def test_no_home_is_no_error(tmp_path, monkeypatch):
+def test_a_missing_home_folder_is_no_error(tmp_path, monkeypatch):
     def unknown():
         raise RuntimeError("Could not determine home directory.")
 

@@ -1,4 +1,4 @@
-"""The cuda backend means what the reference means; without a GPU a stand-in plays gsplat.
+"""The cuda backend agrees with the reference; without a GPU, a stand-in replaces gsplat.
 
 The stand-in (`tests/support/gsplat_stand_in.py`) shows that our side of the border is right: projection, order,
 culling, padding, chunks, ids, gradients. That gsplat does what the stand-in does is shown by the same tests with the
@@ -189,7 +189,7 @@ def test_frames_without_gradients_are_the_same(rasterize_cuda):
     assert torch.equal(with_graph.image, without.image)
 
 
-def test_numbers_far_out_of_the_image_do_not_reach_gsplat(monkeypatch):
+def test_coordinates_far_outside_the_image_do_not_reach_gsplat(monkeypatch):
     """Its tile boxes are integers, so a Gaussian of a million pixels must be cut to the image before."""
     seen = {}
 
@@ -209,7 +209,7 @@ def test_numbers_far_out_of_the_image_do_not_reach_gsplat(monkeypatch):
 
 
 class Recorder:
-    """Kernels of the stand-in that remember how they were called."""
+    """Kernels of the stand-in that record their calls."""
 
     def __init__(self):
         self.calls = []
@@ -258,7 +258,7 @@ def test_settings_that_gsplat_cannot_meet_are_named(monkeypatch, change):
         rasterize_splats(*scene, camera(), settings=RasterSettings(**change), backend="cuda")
 
 
-def test_a_cap_that_nothing_reaches_is_met_exactly(monkeypatch):
+def test_a_cap_above_all_opacities_is_exact(monkeypatch):
     use(OLD_STAND_IN, monkeypatch)
     scene = splats.splats(100, 3)
     scene[3] = scene[3].clamp_max(0.9)
@@ -284,7 +284,7 @@ def test_an_old_gsplat_uses_another_alpha_cap_and_warns_once(monkeypatch, caplog
 
 @pytest.fixture
 def cuda_machine(monkeypatch):
-    """As if torch had CUDA and found a device, so that what is missing beside them can be told."""
+    """Pretend that torch has CUDA and a device, so that only other missing parts are reported."""
     monkeypatch.setattr(torch.version, "cuda", "12.8")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     saved = {name: module for name, module in sys.modules.items() if name.split(".")[0] == "gsplat"}
@@ -301,7 +301,7 @@ def forget_gsplat():
 
 
 def install(folder, monkeypatch, version="1.5.3", init="", backend="_C = object()", constants=None):
-    """A package called gsplat that has nothing but what is looked for when it is loaded."""
+    """Package named gsplat with only the names that the backend looks up when it loads it."""
     package = folder / "gsplat"
     (package / "cuda").mkdir(parents=True)
     functions = "isect_tiles = isect_offset_encode = rasterize_to_pixels = print"
@@ -372,7 +372,7 @@ def test_gsplat_is_loaded_once_and_leaves_stdout_alone(cuda_machine, monkeypatch
     ("constants", "alpha_max"),
     [(None, 0.999), ("ALPHA_THRESHOLD = 1 / 255\nMAX_ALPHA = 0.99\nTRANSMITTANCE_THRESHOLD = 1e-4", 0.99)],
 )
-def test_thresholds_are_those_of_the_gsplat_that_is_there(cuda_machine, monkeypatch, tmp_path, constants, alpha_max):
+def test_thresholds_are_those_of_the_installed_gsplat(cuda_machine, monkeypatch, tmp_path, constants, alpha_max):
     install(tmp_path, monkeypatch, constants=constants)
     kernels = cuda.find_kernels()
     assert (kernels.alpha_min, kernels.alpha_max, kernels.transmittance_min) == (1 / 255, alpha_max, 1e-4)
@@ -387,7 +387,7 @@ def test_auto_uses_the_reference_on_a_gpu_without_gsplat_and_warns_once(cuda_mac
 
 
 def test_the_cpu_draws_without_looking_for_a_gpu(tmp_path):
-    """gsplat is there, and would complain on being imported."""
+    """gsplat is installed, and its import would raise an error."""
     (tmp_path / "gsplat.py").write_text("raise AssertionError('gsplat was imported')")
     script = (
         "import sys, torch, r5dgs_core.raster as raster\n"

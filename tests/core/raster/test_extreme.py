@@ -1,4 +1,4 @@
-"""Stiff and extreme scenes give what 3D Gaussian splatting means by them, and what cannot be drawn is named."""
+"""Stiff and extreme scenes give the picture that 3D Gaussian splatting defines, and invalid input is named."""
 
 import dataclasses
 import math
@@ -39,7 +39,7 @@ def test_one_gaussian_covers_the_middle_strips_of_a_4k_image(side):
     assert_within_bars(case.inputs, view, case.background, settings=case.settings)
 
 
-# What each gives
+# Expected pictures
 
 
 def render(name, backend):
@@ -66,7 +66,7 @@ def test_gaussians_around_the_camera_are_not_drawn_unless_their_centre_lies_befo
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_opacities_are_seen_from_alpha_min_on_and_capped_at_alpha_max(backend):
+def test_opacities_are_visible_from_alpha_min_on_and_capped_at_alpha_max(backend):
     case, result, gradients, stats = render("opacities at their limits", backend)
     for i, opacity in enumerate(case.inputs[3].tolist()):
         alone = [values[i : i + 1] for values in case.inputs]
@@ -98,7 +98,7 @@ def test_ten_thousand_opaque_layers_show_only_the_nearest(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_layer_that_would_bring_transmittance_to_the_minimum_exactly_is_not_seen(backend):
+def test_a_layer_that_would_bring_transmittance_to_the_minimum_exactly_is_invisible(backend):
     case, result, gradients, _ = render("half transparent layers", backend)
     passed = torch.cumprod(1 - case.inputs[3].double(), 0)
     assert case.settings.transmittance_min in passed.tolist()
@@ -108,7 +108,7 @@ def test_a_layer_that_would_bring_transmittance_to_the_minimum_exactly_is_not_se
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_thin_layers_are_seen_until_transmittance_would_fall_below_its_minimum(backend):
+def test_thin_layers_are_visible_until_transmittance_would_fall_below_its_minimum(backend):
     case = extreme_scenes.CASES["ten thousand thin layers"]()
     case.inputs[0][:, 0] = 0  # the very middle of the pixel, where alpha is the opacity
     result, gradients, _ = draw(case.inputs, case.camera, backend)
@@ -131,7 +131,7 @@ def test_the_lower_row_of_coincident_gaussians_is_in_front(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_depths_are_sorted_as_float64_has_them(backend):
+def test_depths_are_sorted_in_float64(backend):
     """Two planes a micrometre apart at a distance of a hundred: float32 cannot tell them apart, their order can."""
     T_cam_world = np.eye(4)
     T_cam_world[2, 3] = 100.0
@@ -144,7 +144,7 @@ def test_depths_are_sorted_as_float64_has_them(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_far_from_the_origin_a_scene_looks_as_it_does_there(backend):
+def test_a_scene_looks_the_same_far_from_the_origin(backend):
     inputs, view = extreme_scenes.cloud(200, seed=2, sigma=1.0), extreme_scenes.view()
     inputs[0] = (inputs[0] * 20 * 16).round() / 16
     shift = torch.tensor([1e6, -1e6, 1e6])
@@ -158,7 +158,7 @@ def test_far_from_the_origin_a_scene_looks_as_it_does_there(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_wide_image_shows_in_the_middle_what_a_small_one_does(backend):
+def test_the_middle_of_a_wide_image_equals_a_small_image(backend):
     inputs = extreme_scenes.cloud(100, seed=3)
     inputs[0][:, :2] *= 0.002
     wide, small = (
@@ -183,7 +183,7 @@ def test_the_falloff_of_a_gaussian_is_correct_in_all_corners_of_a_4k_image(backe
     torch.testing.assert_close(alpha[y.long(), x.long()], expected, atol=FORWARD, rtol=0)
 
 
-# What cannot be drawn
+# Invalid input
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -237,7 +237,7 @@ def test_a_camera_without_an_image_is_refused(change):
     (3, (8,), 1.5, r"opacities: expected values from 0 to 1, found 1.5 at index \(8,\); remedy: pass sigmoid"),
 ])  # fmt: skip
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_values_out_of_their_range_are_named_with_the_first_index(position, index, value, message, dtype):
+def test_values_outside_their_range_are_named_with_the_first_index(position, index, value, message, dtype):
     inputs = [t.to(dtype) for t in splats(10, 2)]
     inputs[position][index] = inputs[position][(9, *index[1:])] = value
     with pytest.raises(ValueError, match=message):

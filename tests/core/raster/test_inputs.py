@@ -1,4 +1,4 @@
-"""Inputs that cannot be drawn are named as the caller knows them; all others are drawn."""
+"""Invalid inputs are named by the caller's argument; all others are drawn."""
 
 import dataclasses
 import math
@@ -141,7 +141,7 @@ def test_a_raw_parameter_of_another_shape_is_named(changes):
         rasterize(gaussians(**changes), camera())
 
 
-def test_raw_infinities_that_mean_something_are_drawn():
+def test_meaningful_infinities_of_raw_parameters_are_drawn():
     dots = gaussians()
     dots.log_scales[:], dots.opacity_logits[:5], dots.opacity_logits[5:] = -math.inf, math.inf, -math.inf
     alpha = rasterize(dots, camera()).alpha
@@ -186,7 +186,7 @@ def test_features_and_colours_of_another_dtype_are_converted():
     ("T_cam_world", (3, 3), r"T_cam_world: expected \[0.0, 0.0, 0.0, 1.0\] as the last row"),
     ("T_cam_world", (3, 1), "T_cam_world: expected .* as the last row"),
 ])  # fmt: skip
-def test_entries_of_a_camera_that_are_not_read_must_be_what_they_are_taken_for(name, index, message):
+def test_unused_entries_of_a_camera_must_have_their_assumed_values(name, index, message):
     def changed(value):
         matrix = getattr(camera(), name).copy()
         matrix[index] = value
@@ -202,7 +202,7 @@ def test_entries_of_a_camera_that_are_not_read_must_be_what_they_are_taken_for(n
 @pytest.mark.parametrize(
     "rotation", [np.zeros((3, 3)), 2 * np.eye(3), np.diag([-1.0, 1.0, 1.0]), np.eye(3) + 0.01 * np.eye(3)[::-1]]
 )
-def test_a_pose_that_is_no_rotation_is_refused(rotation):
+def test_a_pose_that_is_not_a_rotation_is_refused(rotation):
     pose = np.eye(4)
     pose[:3, :3] = rotation
     view = dataclasses.replace(camera(), T_cam_world=pose)

@@ -1,4 +1,4 @@
-"""The rasterizer means what 3D Gaussian splatting means, and the fast backend agrees with the reference."""
+"""The reference implements 3D Gaussian splatting, and the fast backend agrees with it."""
 
 import importlib.util
 import math
@@ -52,7 +52,7 @@ def stack(*scenes):
     return [torch.cat(parts) for parts in zip(*scenes, strict=True)]
 
 
-# What a splat is
+# A single Gaussian
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
@@ -95,7 +95,7 @@ def test_centres_are_projected_as_by_the_camera(backend):
 
 
 def test_reference_is_the_loop_of_3dgs():
-    """Pixel by pixel, Gaussian by Gaussian, as the method is written down: the oracle's oracle."""
+    """Pixel by pixel and Gaussian by Gaussian, as in the definition: an oracle of the oracle."""
     view, settings = camera(8, 6), RasterSettings()
     means, quats, scales, opacities, channels = scene = splats(60, 2, seed=3, radius_px=60.0)
     opacities[::3] = 0.999
@@ -158,7 +158,7 @@ def test_cpu_agrees_with_the_reference_at_any_size(size):
     assert_backends_agree(splats(300, 3, seed=5), camera(*size, skew=2.0, offset=(1.5, -2.0)), torch.rand(3).double())
 
 
-def test_cpu_agrees_with_the_reference_where_pixels_finish_early():
+def test_cpu_agrees_with_the_reference_if_pixels_finish_early():
     scene = splats(800, 3, seed=6, radius_px=25.0)
     scene[3] = (0.9 + 0.1 * scene[3]).float().double()
     assert assert_backends_agree(scene, camera()).alpha.min() > 0.99
@@ -225,7 +225,7 @@ def test_rows_are_sorted_by_depth_and_then_by_row_on_any_number_of_threads(seed)
         compilation.set_threads(before)
 
 
-def test_two_python_threads_may_draw_at_once():
+def test_two_python_threads_can_draw_at_once():
     scene, view = splats(5000, 3, seed=11, radius_px=4.0), camera(150, 130, 160.0)
     expected = draw(scene, view, "cpu")[1]
     found = []
@@ -296,7 +296,7 @@ def test_gradients_do_not_depend_on_the_other_requested_gradients(backend, posit
 
 
 @pytest.mark.parametrize("name", ["means", "opacities", "background", "alpha"])
-def test_changing_in_place_what_gradients_need_is_refused(name):
+def test_in_place_changes_of_tensors_needed_for_gradients_are_refused(name):
     leaves = [t.float().requires_grad_() for t in splats(50, 3)]
     background = torch.rand(40, 48, 3)
     result = rasterize_splats(*leaves, camera(), background)
@@ -383,7 +383,7 @@ def test_degenerate_gaussians_draw_finite_images_with_finite_gradients(backend):
         assert (gradients[name][[0, 1, 13, 14, 16]] == 0).all()
 
 
-# Nothing to see
+# Empty pictures
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
@@ -430,7 +430,7 @@ def test_ids_agree_between_backends():
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_ids_are_the_labels_however_large_and_sparse_they_are(backend):
+def test_ids_are_the_labels_even_if_large_and_sparse(backend):
     scene, view = splats(200, 1, seed=15), camera()
     few = torch.randint(-1, 6, (200,), generator=torch.Generator().manual_seed(3))
     names = torch.tensor([0, 7, 300, 301, 70_000, 2**20, -1])  # the last is reached as -1
@@ -495,7 +495,7 @@ def test_features_in_the_same_pass_equal_those_of_their_own():
     assert rasterize(scene, view, ids=False).ids is None
 
 
-def test_final_colours_take_the_place_of_the_harmonics():
+def test_final_colours_replace_the_harmonics():
     scene, view = gaussians(k=4), camera()
     colors = torch.rand(300, 3, requires_grad=True)
     shown = rasterize(scene, view, colors=colors).color
@@ -530,7 +530,7 @@ def test_the_first_value_that_is_not_finite_is_named(position, name, index, valu
     assert str(index) in str(caught.value)
 
 
-def test_infinities_that_cancel_are_found():
+def test_infinities_that_cancel_are_detected():
     scene = [t.float() for t in splats(10, 3)]
     scene[0][3, 0], scene[0][4, 0] = math.inf, -math.inf
     with pytest.raises(ValueError, match=r"means.*\(3, 0\)"):

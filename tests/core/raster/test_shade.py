@@ -1,4 +1,4 @@
-"""Colours out of spherical harmonics: the kernels against plain torch in float64, with every gradient."""
+"""Colours from spherical harmonics: the kernels against plain torch in float64, with every gradient."""
 
 from types import SimpleNamespace
 
@@ -76,7 +76,7 @@ def test_the_gradient_along_the_line_of_sight_is_zero_and_across_it_a_difference
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_coefficients_may_come_in_two_parts(count):
+def test_coefficients_may_be_given_in_two_parts(count):
     tensors, where = draw(300, count)
     means, factor = tensors["means"], tensors["factor"]
     parts = {"sh": tensors["sh"][:, :1], "rest": tensors["sh"][:, 1:]}

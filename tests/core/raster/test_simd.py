@@ -1,4 +1,4 @@
-"""Vector operations inside numba kernels do what their scalar namesakes do."""
+"""Vector operations inside numba kernels agree with the scalar functions of the same name."""
 
 import numba
 import numpy as np
@@ -75,7 +75,7 @@ def test_exp2_is_good_to_float32_rounding():
     np.testing.assert_array_equal(result, 2.0**whole)
 
 
-def test_lanes_choose_like_numpy():
+def test_lanes_select_like_numpy():
     random = np.random.default_rng(0)
     seen = set()
     for shift in (-30.0, 0.0):

@@ -1,4 +1,4 @@
-"""Drawing what moves into what stands still gives the picture of both together, to the bit."""
+"""Drawing moving Gaussians into a static layer gives the picture of all Gaussians, to the bit."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -27,7 +27,7 @@ def assert_equal(found, expected):
 
 @pytest.mark.parametrize("n_channels", [3, 5])
 @pytest.mark.parametrize("background", ["none", "one", "each"])
-def test_a_body_that_flies_through_is_drawn_as_if_all_were_drawn_together(n_channels, background):
+def test_a_body_that_moves_through_the_static_layer_is_drawn_exactly(n_channels, background):
     view = camera(150, 130, 160.0)
     behind = {"none": None, "one": torch.rand(n_channels), "each": torch.rand(130, 150, n_channels)}[background]
     still = single(splats(3000, n_channels, seed=1, radius_px=5.0))
@@ -52,7 +52,7 @@ def test_equal_depths_keep_still_gaussians_in_front():
     assert_equal(StaticLayer(*still, view).draw(*moving), rasterize_splats(*joined(still, moving), view))
 
 
-def test_any_number_may_move_from_frame_to_frame():
+def test_the_number_of_moving_gaussians_may_vary_between_frames():
     view, still = camera(), single(splats(100, 3, seed=5))
     backdrop = StaticLayer(*still, view)
     for count in (5, 0, 700, 1, 64):
@@ -118,7 +118,7 @@ def test_settings_hold_for_both_parts():
     assert_equal(found, rasterize_splats(*joined(still, moving), view, settings=settings))
 
 
-def test_parts_that_do_not_fit_together_are_refused():
+def test_incompatible_parts_are_refused():
     view, still = camera(), single(splats(30, 3))
     with pytest.raises(ValueError, match="channels: expected 3"):
         StaticLayer(*still, view).draw(*single(splats(5, 4)))

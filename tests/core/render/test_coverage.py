@@ -1,4 +1,4 @@
-"""Shares of a pixel are what its groups cover before the eye."""
+"""Coverage of pixels by groups."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Pictures of some objects: alone they are what the rest does not touch, among the others they alone have colour."""
+"""Pictures of some objects: alone, without the rest of the scene; in place, with the rest in gray."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ def drawn(scene, t, background):
 
 
 def rows_of(scene, object_id):
-    """The scene with nothing but one object's Gaussians."""
+    """The scene with only one object's Gaussians."""
     kept = scene.gaussians.object_ids == object_id
     arrays = ("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids", "shading")
     cut = {name: scene.arrays()[name][kept] for name in arrays}
@@ -30,7 +30,7 @@ def rows_of(scene, object_id):
 
 
 @pytest.mark.parametrize("t", [0.2, LATER])
-def test_an_object_alone_is_a_scene_of_its_own_gaussians(scene, t):
+def test_an_object_alone_looks_like_a_scene_of_its_own_gaussians(scene, t):
     found = highlight.isolate(scene, [2], CAMERA, t, backend=BACKEND)
     alone = drawn(rows_of(scene, 2), t, None)
     np.testing.assert_allclose(found[..., 3], alone.alpha, atol=1e-6)
@@ -61,7 +61,7 @@ def test_objects_without_highlight_are_gray_and_dim(scene):
     assert np.abs(some - nothing).max() > 0.1
 
 
-def test_an_object_is_alone_even_where_others_hide_it(scene):
+def test_an_object_is_drawn_alone_even_if_others_hide_it(scene):
     toward = scene.gaussians.means[scene.gaussians.object_ids == 1].mean(0) - CAMERA.center
     behind = [item for item in scene.objects if item.id == 1]
     wall = scene.with_arrays(
@@ -89,7 +89,7 @@ def test_cameras_are_found_by_name_and_by_number(scene):
         viewpoints.named(dataclasses.replace(scene, cameras=()), "0")
 
 
-def test_the_best_standpoint_sees_the_most_objects(scene):
+def test_the_best_viewpoint_shows_the_most_objects(scene):
     away = scenes.looking_camera([9.0, 0, 1], [1.0, 0, 0], 0.9, 48, 36, "away")
     near = scenes.looking_camera(
         scene.gaussians.means[scene.gaussians.object_ids == 2].mean(0) + [0.4, 0, 0], [-1.0, 0, 0], 0.5, 48, 36
@@ -114,7 +114,7 @@ def test_candidates_are_cameras_at_times(scene):
 
 
 @pytest.mark.parametrize("convention", sorted(cameras.WORLD_TO_BLENDER))
-def test_a_scene_without_cameras_is_seen_from_above_its_side(convention):
+def test_a_scene_without_cameras_is_viewed_obliquely_from_above(convention):
     scene = scenes.make_scene(n=400, objects=3, seed=2, world_convention=convention)
     turn = cameras.WORLD_TO_BLENDER[convention].T
     turned = dataclasses.replace(
@@ -133,7 +133,7 @@ def test_a_scene_without_cameras_is_seen_from_above_its_side(convention):
     assert only == "overview"
 
 
-def test_a_resized_camera_keeps_its_picture():
+def test_a_resized_camera_keeps_its_field_of_view():
     camera = viewpoints.sized(CAMERA, 96)
     assert (camera.width, camera.height) == (96, 72)
     points = np.array([[0.1, 0.2, 0.3], [-0.5, 0.1, 0.0]])

@@ -1,4 +1,4 @@
-"""A stage shows what rendering every frame from the start would show."""
+"""A stage gives the same pictures as rendering every frame from scratch."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ def scene(request):
 
 @pytest.fixture
 def made(monkeypatch):
-    """Counts the backdrops that are made."""
+    """Count the static layers that are built."""
     count = []
     original = static_layer.StaticLayer.__init__
 
@@ -46,14 +46,14 @@ def assert_shows(theatre, scene, instances, camera, sky=True):
         assert np.array_equal(getattr(found, name), getattr(expected, name)), name
 
 
-def test_playing_shows_every_frame_and_draws_static_objects_once(scene, made):
+def test_playback_shows_every_frame_and_draws_static_objects_once(scene, made):
     theatre = incremental_renderer.Stage(scene)
     for t in (0.0, 0.1, 0.2, 0.9, 1.4):
         assert_shows(theatre, scene, group_instances(scene, t), CAMERA)
     assert len(made) == 1
 
 
-def test_another_camera_sky_or_selection_starts_again(scene, made):
+def test_another_camera_sky_or_selection_redraws_everything(scene, made):
     theatre = incremental_renderer.Stage(scene)
     for t in (0.0, 0.3, 0.5):
         assert_shows(theatre, scene, group_instances(scene, t), CAMERA)
@@ -86,7 +86,7 @@ def test_without_static_instances_no_layer_is_cached(scene, made):
     assert not made
 
 
-def test_bodies_at_equal_depths_keep_their_order_whoever_moves():
+def test_bodies_at_equal_depths_keep_their_order_whichever_moves():
     scene = scenes.make_scene(n=900, seed=3)
     flat = scene.with_arrays(means=scene.gaussians.means * np.array([1, 1, 0], np.float32))
     above = scenes.looking_camera((0, 0, 5.0), (0, 0, -1.0), 0.8, 80, 72, up=(0, 1.0, 0))
@@ -103,7 +103,7 @@ def test_bodies_at_equal_depths_keep_their_order_whoever_moves():
         assert_shows(theatre, flat, shown, above)
 
 
-def test_a_bad_instance_is_numbered_as_the_caller_does(scene):
+def test_a_bad_instance_is_named_by_the_callers_index(scene):
     theatre, instances = incremental_renderer.Stage(scene), group_instances(scene, 0.4)
     theatre.render(instances, CAMERA)
     theatre.render(group_instances(scene, 0.5), CAMERA)
@@ -117,7 +117,7 @@ def test_a_bad_instance_is_numbered_as_the_caller_does(scene):
 
 @pytest.fixture(scope="module")
 def pair():
-    """Two scenes of other degrees, one with shading and a light, one without; and where the second one's world lies."""
+    """Two scenes of different degrees, one with shading and a light, and the transform of the second one's world."""
     lit = scenes.make_scene(n=500, sh_degree=1, seed=3)
     plain = scenes.make_scene(n=400, sh_degree=0, seed=8, shading=False)
     assert lit.shading is not None and lit.shading is not None
@@ -201,7 +201,7 @@ def test_another_tint_or_near_limit_is_another_picture(pair):
     assert near.alpha.max() == 0 and plain.alpha.max() > 0.5
 
 
-def test_a_sky_turns_with_its_world(pair):
+def test_a_sky_rotates_with_its_world(pair):
     lit, _, world = pair
     sky = np.random.default_rng(0).normal(scale=0.3, size=(9, 3)).astype(np.float32)
     scene = lit.with_arrays(background_sh=sky)
@@ -213,7 +213,7 @@ def test_a_sky_turns_with_its_world(pair):
     np.testing.assert_allclose(scaled.color, found.color, atol=1e-5)
 
 
-def test_no_scene_at_all_leaves_black():
+def test_without_any_scene_the_picture_is_black():
     found = incremental_renderer.Stage([]).render([], CAMERA, sky=None)
     assert np.abs(found.color).max() == 0 and found.ids.max() == -1
 
@@ -300,7 +300,7 @@ def test_depths_may_count_from_before_a_far_camera(pair):
 
 
 @pytest.mark.parametrize("t", [None, 0.2])
-def test_many_stretches_are_their_instances(bending, t):
+def test_many_ranges_give_the_picture_of_their_instances(bending, t):
     world = matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2))
     starts = [*range(0, 300, 7), *range(20, 100, 5)]
     stretches = [Instance(start, 4, world, 0, world, (0.5, 1.0, 1.0), t) for start in starts]

@@ -111,7 +111,7 @@ def test_a_mirrored_object_looks_mirrored(scene):
     )
 
 
-def test_nothing_shown_leaves_the_sky(scene):
+def test_an_empty_selection_leaves_the_sky(scene):
     sky = np.zeros((4, 3), np.float32)
     sky[0], sky[2] = [0.4, 0.2, 0.1], [0.3, 0.3, 0.3]  # brighter upwards
     scene = scene.with_arrays(background_sh=sky)
@@ -121,7 +121,7 @@ def test_nothing_shown_leaves_the_sky(scene):
     assert scene_renderer.sky(scene, CAMERA)[0].mean() > scene_renderer.sky(scene, CAMERA)[-1].mean() + 0.01
 
 
-def test_a_range_left_out_is_not_seen_and_a_range_given_twice_is_seen_twice(scene):
+def test_an_omitted_range_is_not_drawn_and_a_repeated_range_is_drawn_twice(scene):
     body = scene.object(1)
     here, there = np.eye(4), matrix(translation=(0, 0, 0.5))
     ids = scene_renderer.render_frame(
@@ -188,7 +188,7 @@ def test_the_near_plane_is_the_scene_s(scene):
     np.testing.assert_array_equal(image(far, frame, settings=RasterSettings()), image(scene, frame))
 
 
-def test_neither_dark_colours_nor_turned_shading_give_light(scene):
+def test_negative_colours_and_shading_never_add_light(scene):
     """max(0, colour) times max(0, factor): two negatives are black, as in training."""
     rng = np.random.default_rng(0)
     dark = scene.with_arrays(
@@ -219,7 +219,7 @@ def moved_away(scene, shift):
 
 
 @pytest.mark.parametrize("t", [0.31, scenes.T_MAX, 1.2])
-def test_a_picture_far_from_the_origin_is_the_one_near_it(t):
+def test_a_picture_far_from_the_origin_equals_the_one_near_it(t):
     scene = scenes.make_scene(n=300, sh_degree=2, seed=3)
     scene = scene.with_arrays(means=(np.round(scene.gaussians.means * 64) / 64).astype(np.float32))
     far, camera = moved_away(scene, np.array([1e5, -1e5, 65536.0]))
@@ -234,7 +234,7 @@ def test_a_picture_far_from_the_origin_is_the_one_near_it(t):
     assert psnr(blunt) < 56 or t == scenes.T_MAX, "what the origin is for"
 
 
-def test_harmonics_follow_what_turns_on_its_own():
+def test_harmonics_follow_gaussians_that_rotate_on_their_own():
     """Bodies whose members all have the twist of their body look alike whichever of them carries the harmonics."""
     scene = scenes.make_scene(n=300, sh_degree=2, seed=3, shadows=False)
     dynamics = np.zeros((len(scene.gaussians.means), 12), np.float32)

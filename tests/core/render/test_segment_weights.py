@@ -1,4 +1,4 @@
-"""Weights of Gaussians in segments: what they add up to, that a picture is made of them, and that backends agree."""
+"""Weights of Gaussians in segments: their sums, the picture made of them, and agreement of the backends."""
 
 import numpy as np
 import pytest
@@ -85,7 +85,7 @@ def test_segments_of_another_size_are_refused(splats, camera):
         segment_weights.segment_weights(*splats, camera, torch.zeros(SIZE, SIZE - 1, dtype=torch.int64), 1)
 
 
-def test_no_gradient_is_asked_for_and_none_is_left(splats, camera):
+def test_weights_neither_need_nor_leave_gradients(splats, camera):
     means = splats[0].clone().requires_grad_(True)
     with torch.no_grad():
         weights = segment_weights.segment_weights(

@@ -65,7 +65,7 @@ def request(number, **arguments):
 
 
 def headers(stream):
-    """The JSON lines of a worker, the bytes between them left out."""
+    """The JSON lines of a worker, without the bytes between them."""
     while line := stream.readline():
         header = json.loads(line)
         for entry in header["arrays"]:
@@ -127,7 +127,7 @@ def warm_ups(cold, cache):
     return calls
 
 
-def test_a_cold_worker_compiles_in_the_background_and_announces_it(cold):
+def test_a_cold_worker_announces_compilation_in_the_background(cold):
     said = [header.get("event", header.get("id")) for header in cold]
     assert sorted(map(str, said)) == ["0", "1", "2", "3", "compiling", "ready"]
     assert said[0] == 0 and said.index(1) < said.index("ready") < said.index(2) < said.index(3)
@@ -140,7 +140,7 @@ def test_a_warm_worker_announces_no_compilation(warm_ups, cache, scene_path):
     assert [header.get("event", header.get("id")) for header in talk(cache, scene_path)] == [0, 1, 2, 3]
 
 
-def test_the_command_compiles_what_is_missing_and_then_finds_it_ready(warm_ups, cache):
+def test_the_command_compiles_missing_kernels_and_then_finds_them_ready(warm_ups, cache):
     (first, first_complaints), (second, second_complaints) = warm_ups
     notices = [[event for event in events if event["event"] == "notice"] for events in (first, second)]
     assert notices == [[{"event": "notice", "text": compilation.NOTICE}], []]
@@ -152,14 +152,14 @@ def test_the_command_compiles_what_is_missing_and_then_finds_it_ready(warm_ups, 
     assert stages[0] == "splats" and {"gradients of splats", "sky", "loss"} <= set(stages)
 
 
-def test_after_it_neither_pictures_nor_training_compile_anything(warm_ups, cache, tiny, scene_path, tmp_path):
+def test_after_warm_up_neither_pictures_nor_training_compile_anything(warm_ups, cache, tiny, scene_path, tmp_path):
     overrides = (*tiny_datasets.SETTINGS, "train.iterations=5", "identity.iterations=2")
     process = start(cache, "-c", USE_EVERYTHING, scene_path, tiny.root, tmp_path / "run", *overrides)
     out, complaints = finish(process)
     assert out.split()[-1] == b"0" and "compiling" not in complaints
 
 
-def test_a_worker_that_is_left_while_it_compiles_ends_at_once(tmp_path):
+def test_a_worker_whose_client_leaves_while_it_compiles_ends_at_once(tmp_path):
     process = start(tmp_path / "empty", "-m", "r5dgs_core.worker.server")
     process.stdin.write(request(0, command="hello"))
     process.stdin.flush()
@@ -170,7 +170,7 @@ def test_a_worker_that_is_left_while_it_compiles_ends_at_once(tmp_path):
 
 
 @pytest.mark.parametrize("mode", [torch.inference_mode, torch.no_grad])
-def test_kernels_of_gradients_are_made_ready_inside_inference_too(mode):
+def test_gradient_kernels_are_also_compiled_inside_inference_mode(mode):
     stages = []
     with mode():
         warm_up.warm_up(progress=stages.append)

@@ -79,7 +79,7 @@ def perspective_projection(camera):
     return p
 
 
-def test_a_perspective_projection_is_its_camera_again(camera):
+def test_a_perspective_projection_gives_back_its_camera(camera):
     shifted = cameras.crop(camera, 13, -7, 100, 60)
     world = cameras.cam_world_to_opengl(shifted.T_cam_world)
     found, away = cameras.from_projection(perspective_projection(shifted), world, 100, 60, name=shifted.name)
@@ -89,7 +89,7 @@ def test_a_perspective_projection_is_its_camera_again(camera):
 
 
 @pytest.mark.parametrize("depths", [(2.0, 5.0), (-3.0, 4.0), (1e3, 1e3 + 1)])
-def test_a_parallel_projection_is_seen_from_so_far_that_its_lines_are_parallel(camera, depths):
+def test_a_parallel_projection_is_approximated_from_very_far_away(camera, depths):
     world = cameras.cam_world_to_opengl(camera.T_cam_world)
     projection = np.diag([0.5, 0.8, -0.01, 1.0])
     projection[:2, 3] = 0.1, -0.3
@@ -103,7 +103,7 @@ def test_a_parallel_projection_is_seen_from_so_far_that_its_lines_are_parallel(c
     np.testing.assert_allclose(depth - away, -local[:, 2], atol=1e-6 * max(map(abs, depths)))
 
 
-def test_a_part_of_a_picture_and_another_size_see_the_same_rays(camera):
+def test_cropped_and_resized_cameras_keep_their_rays(camera):
     part, small = cameras.crop(camera, 20, 10, 50, 30), cameras.resize(camera, 80, 30)
     np.testing.assert_allclose(cameras.pixel_rays(part), cameras.pixel_rays(camera)[10:40, 20:70], atol=1e-12)
     points = camera.center + 3 * cameras.pixel_rays(camera)[::7, ::9].reshape(-1, 3)
@@ -112,7 +112,7 @@ def test_a_part_of_a_picture_and_another_size_see_the_same_rays(camera):
     np.testing.assert_allclose(other, one * [80 / 160, 30 / 90], atol=1e-9)
 
 
-def test_a_moved_camera_sees_a_moved_world(camera):
+def test_a_moved_camera_shows_a_moved_world(camera):
     shift, points = np.array([3.0, -1.0, 0.5]), camera.center + cameras.pixel_rays(camera)[::30, ::40].reshape(-1, 3)
     for found, expected in zip(
         cameras.project(cameras.moved(camera, shift), points + shift), cameras.project(camera, points), strict=True

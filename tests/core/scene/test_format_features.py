@@ -72,7 +72,7 @@ def test_an_origin_makes_version_2_and_comes_back_bit_for_bit(path, tmp_path):
     assert members(scene_file.write(near, tmp_path / "near.r5dgs")) == members(path)
 
 
-def test_a_required_feature_that_is_lacking_is_named_with_its_release(path, tmp_path):
+def test_a_missing_required_feature_is_named_with_its_release(path, tmp_path):
     listed = [
         {"name": "origin", "required": True, "since": "0.2.0"},
         {"name": "quantised", "required": True, "since": "0.9.1"},

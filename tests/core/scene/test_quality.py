@@ -56,12 +56,12 @@ def test_an_evaluation_beside_the_file_is_found(scene, path, name):
         {"splits": {"val": {"rigid": {"psnr": None}}}},
     ],
 )
-def test_an_evaluation_of_something_else_or_of_nothing_is_none(scene, path, content):
+def test_an_evaluation_of_another_scene_is_ignored(scene, path, content):
     write(path.with_name("evaluation.json"), evaluation(scene, **content))
     assert quality.of(scene, path).psnr_observed is None
 
 
-def test_an_evaluation_of_an_older_file_is_none(scene, path):
+def test_an_evaluation_of_an_older_file_is_ignored(scene, path):
     write(path.with_name("evaluation.json"), evaluation(scene), later=-100.0)
     assert quality.of(scene, path).psnr_observed is None
     path.with_name("evaluation.json").write_text("no JSON")

@@ -92,7 +92,7 @@ def test_optional_members_may_be_absent_or_present(tmp_path):
     assert back.provenance == {"seed": 3, "rates": [1.0, 2.0], "nested": {"ok": True, "none": None}}
 
 
-def test_meanings_are_read_without_the_rest(scene, path, tmp_path):
+def test_embeddings_are_read_without_the_other_members(scene, path, tmp_path):
     assert scene_file.read_meanings(path) is None
     rng = np.random.default_rng(1)
     rich = dataclasses.replace(
@@ -287,7 +287,7 @@ def test_each_member_is_needed(path, tmp_path):
             scene_file.read(broken)
 
 
-def test_members_of_later_versions_are_passed_over(path, tmp_path):
+def test_members_of_later_versions_are_skipped(path, tmp_path):
     extended = tmp_path / "extended.r5dgs"
     with zipfile.ZipFile(rewrite(path, extended), "a") as archive:
         archive.writestr("residuals.npy", b"anything")
@@ -430,7 +430,7 @@ def test_unplayable_scenes_are_rejected_on_reading(path, tmp_path, change, messa
     ("member", "value"),
     [("means", 3e38), ("log_scales", 80.0), ("sh", 1e30), ("track_poses", 1e200), ("track_times", -1e300)],
 )
-def test_numbers_that_no_picture_can_show_are_refused(scene, tmp_path, member, value):
+def test_numbers_beyond_the_range_of_pictures_are_refused(scene, tmp_path, member, value):
     exact = scene_file.write(scene, tmp_path / "exact.r5dgs", exact=True)
     array = scene.arrays()[member].copy()
     array.reshape(len(array), -1)[0, -1] = value

@@ -50,7 +50,7 @@ def test_each_degree_is_a_harmonic_polynomial_of_that_parity():
         ((1, 0, 0), 15, -0.5900435899266435),
     ],
 )
-def test_signs_and_order_are_those_of_3dgs(direction, index, value):
+def test_signs_and_order_match_3dgs(direction, index, value):
     assert harmonics.basis(np.array(direction, np.float64), 3)[index] == pytest.approx(value, rel=1e-12)
 
 
@@ -80,7 +80,7 @@ def test_other_counts_are_refused():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_turned_coefficients_show_from_a_turned_direction_what_the_old_ones_showed(degree):
+def test_rotated_coefficients_equal_the_old_ones_in_the_rotated_direction(degree):
     draws = np.random.default_rng(degree)
     sh = draws.normal(size=(5, (degree + 1) ** 2, 3))
     quats = rotations.normalize(draws.normal(size=(5, 4)))

@@ -64,7 +64,7 @@ def test_a_score_passes_exactly_where_the_cosine_reaches_the_threshold(cosine, t
 
 
 @given(cosines, st.floats(0.01, 0.5))
-def test_scores_do_not_depend_on_how_near_all_cosines_of_an_encoder_lie(cosine, threshold):
+def test_scores_do_not_depend_on_the_spread_of_an_encoders_cosines(cosine, threshold):
     """An encoder whose cosines are twice as close has thresholds and a margin that are so, too."""
     wide = table_of([around(cosine)], [threshold], margin=0.4)
     close = table_of([around(cosine / 2)], [threshold / 2], margin=0.2)
@@ -79,7 +79,7 @@ def test_scores_of_one_threshold_are_in_the_order_of_cosines(found, threshold):
     assert all(a.cosine >= b.cosine - 1e-4 for a, b in itertools.pairwise(answers) if a.score > b.score)
 
 
-def test_several_match_where_several_fit_and_none_far_below_the_best():
+def test_several_objects_match_but_none_far_below_the_best():
     known = table_of([around(0.9), around(0.85), around(0.6), around(0.2)], [0.5] * 4, margin=0.2)
     scores = {one.object_id: one.score for one in embedding_search.ask(known, np.eye(4)[0])}
     assert {object_id for object_id, score in scores.items() if score >= embedding_search.PASS} == {1, 2}
@@ -94,7 +94,7 @@ def test_scores_below_thresholds_fail_and_objects_without_embedding_are_skipped(
     assert embedding_search.ask(table_of(np.zeros((0, 4)), []), np.eye(4)[0]) == []
 
 
-def test_the_best_view_answers_or_their_mean():
+def test_the_best_view_or_the_mean_of_the_views_decides():
     views = ((View("mug", 0.5), View("a blue mug", 0.5)),)
     stored = np.stack([around(0.9), around(0.1)])[None]
     mean = unit(*stored[0].mean(0))
@@ -104,7 +104,7 @@ def test_the_best_view_answers_or_their_mean():
     assert embedding_search.ask(other, np.eye(4)[0])[0].cosine == pytest.approx(mean[0])
 
 
-def test_a_name_settles_a_wish_and_others_are_asked_by_meaning():
+def test_a_phrase_with_a_name_is_not_searched_by_meaning():
     known = table_of([around(0.9), around(0.95)], [0.5, 0.5])
     labels = [object_search.Label(1, "ball"), object_search.Label(2, "globe")]
     assert [m.object_id for m in object_search.search_labels(labels, "spheres", meanings=known)] == [2, 1]
@@ -114,7 +114,7 @@ def test_a_name_settles_a_wish_and_others_are_asked_by_meaning():
     assert [(m.object_id, m.cosine is None) for m in both] == [(1, True), (2, False)]
 
 
-def test_a_known_word_is_neither_a_typo_nor_the_beginning_of_another():
+def test_a_known_word_is_neither_a_typo_nor_a_prefix_of_another():
     labels = [object_search.Label(1, "cart"), object_search.Label(2, "racecar")]
     assert {m.object_id for m in object_search.search_labels(labels, "car")} == {1, 2}
     known = dataclasses.replace(table_of([around(0.1), around(0.1)], [0.5, 0.5]), vocabulary=("car",))
@@ -124,7 +124,7 @@ def test_a_known_word_is_neither_a_typo_nor_the_beginning_of_another():
     assert {m.object_id for m in object_search.search_labels(labels, "car", meanings=fitting)} == {1, 2}
 
 
-def test_an_encoder_is_asked_for_words_that_are_neither_names_nor_stored():
+def test_the_encoder_embeds_only_words_that_are_neither_names_nor_stored():
     known = table_of([around(0.9), around(0.3)], [0.5, 0.5])
     labels = [object_search.Label(1, "ball"), object_search.Label(2, "desk")]
     asked = []
@@ -141,7 +141,7 @@ def test_an_encoder_is_asked_for_words_that_are_neither_names_nor_stored():
     assert object_search.unknown(labels, "desk and sphere", None) == ["sphere"]
 
 
-def test_a_vocabulary_is_read_like_a_prompt():
+def test_words_of_a_vocabulary_are_normalised_like_prompts():
     words = ("salt and pepper", "cutting boards", "The Mug")
     assert (
         object_search.vocabulary_row(words, ["cutting", "board"]) == 1
@@ -191,7 +191,7 @@ def test_a_file_keeps_the_table(rich, tmp_path):
     assert scene_file.write(back, tmp_path / "again.r5dgs").read_bytes() == path.read_bytes()
 
 
-def test_a_file_without_a_table_is_as_before(tmp_path):
+def test_a_file_without_a_table_does_not_change(tmp_path):
     path = scene_file.write(make_scene(n=60, objects=1), tmp_path / "plain.r5dgs")
     assert scene_file.read(path).lookup is None and b'"lookup"' not in scene_json.dump(scene_file.read(path), {})
     assert scene_info.info(scene_file.read(path))["lookup"] is None
@@ -235,6 +235,6 @@ def test_rows_of_a_table_are_chosen_like_those_of_objects(rich):
     assert chosen.thresholds == (0.25, 0.25, 0.25) and chosen.encoder == rich.lookup.encoder
 
 
-def test_whether_a_file_is_exact_is_read_from_it(rich, tmp_path):
+def test_the_precision_of_a_file_is_read_from_it(rich, tmp_path):
     assert not scene_file.is_exact(scene_file.write(rich, tmp_path / "compact.r5dgs"))
     assert scene_file.is_exact(scene_file.write(rich, tmp_path / "exact.r5dgs", exact=True))

@@ -70,17 +70,17 @@ def test_matches_give_their_reason(scene):
     assert "'aple'" in match.why
 
 
-def test_the_threshold_is_the_callers(scene):
+def test_the_threshold_is_set_by_the_caller(scene):
     assert object_search.search(scene, "aple", threshold=0.95) == []
     assert object_search.search(scene, "coffee mug", threshold=0.95) == []
 
 
-def test_an_exact_name_goes_before_a_longer_one():
+def test_an_exact_name_precedes_a_longer_one():
     labels = [object_search.Label(1, "red car"), object_search.Label(2, "car"), object_search.Label(3, "carafe")]
     assert [m.object_id for m in object_search.search_labels(labels, "car")] == [2, 1, 3]
 
 
-def test_other_scripts_and_accents_are_words():
+def test_words_may_have_accents_and_other_scripts():
     labels = [object_search.Label(1, "Café"), object_search.Label(2, "кружка"), object_search.Label(3, "杯子")]
     assert [m.object_id for m in object_search.search_labels(labels, "cafe")] == [1]
     assert [m.object_id for m in object_search.search_labels(labels, "Кружка")] == [2]
@@ -107,7 +107,7 @@ def test_plurals_become_singular(plural, singular):
 
 
 @pytest.mark.parametrize("name", ["salt and pepper", "R/C car", "mug, chipped", "the mug", "two mugs"])
-def test_a_name_that_reads_like_several_wishes_is_found_as_a_whole(name):
+def test_a_name_that_looks_like_several_phrases_is_found_as_a_whole(name):
     others = ["pepper mill", "car", "mug", "lemon"]
     labels = [object_search.Label(1, name), *(object_search.Label(2 + k, other) for k, other in enumerate(others))]
     first = object_search.search_labels(labels, name.upper())[0]
@@ -176,7 +176,7 @@ def test_phrases_without_match_suggest_similar_names_and_aliases(scene, text, me
         assert f"did you mean {meant[0]!r}" in object_search.explain_nothing(labels, text)
 
 
-def test_suggestions_are_the_closest_first_and_no_more_than_wanted():
+def test_suggestions_are_limited_and_sorted_by_similarity():
     labels = [
         object_search.Label(1, "handle"),
         object_search.Label(2, "candle"),
@@ -202,7 +202,7 @@ def edit_distance(a, b):
 
 
 @given(st.text("abc", max_size=8), st.text("abc", max_size=8), st.integers(0, 8))
-def test_slips_are_counted_up_to_a_limit(a, b, most):
+def test_typos_are_counted_up_to_a_limit(a, b, most):
     assert spelling.edit_distance(a, b, most) == min(edit_distance(a, b), most + 1)
 
 
@@ -232,7 +232,7 @@ def test_long_words_are_compared_letter_by_letter_in_a_narrow_band(monkeypatch):
 
 
 @given(st.text("abc", max_size=6), st.text("abc", max_size=6), st.text("abc", max_size=6))
-def test_edit_distance_counts_slips(a, b, c):
+def test_edit_distance_counts_typos(a, b, c):
     distance = edit_distance(a, b)
     assert distance == edit_distance(b, a) and (distance == 0) == (a == b)
     assert abs(len(a) - len(b)) <= distance <= max(len(a), len(b))
@@ -240,13 +240,13 @@ def test_edit_distance_counts_slips(a, b, c):
     assert edit_distance(a, a[:1] + c + a[1:]) <= len(c)
 
 
-def test_each_slip_counts_one():
+def test_each_typo_counts_one():
     for word in ("aple", "appple", "apble", "appel"):
         assert edit_distance(word, "apple") == 1
     assert edit_distance("elppa", "apple") == 4 and edit_distance("", "mug") == 3
 
 
-def test_two_of_a_kind_are_two_matches():
+def test_two_objects_of_a_kind_are_two_matches():
     labels = [
         object_search.Label(1, "red chair"),
         object_search.Label(2, "table"),
@@ -263,7 +263,7 @@ def test_phrases_without_match_are_listed():
     assert object_search.unanswered(labels, "mugs", threshold=1.0) == []
 
 
-def test_counts_are_no_part_of_what_is_counted_but_may_be_of_a_name():
+def test_numbers_are_ignored_unless_they_are_part_of_a_name():
     labels = [
         object_search.Label(1, "mug one"),
         object_search.Label(2, "mug two"),
@@ -275,7 +275,7 @@ def test_counts_are_no_part_of_what_is_counted_but_may_be_of_a_name():
     assert [m.object_id for m in object_search.search_labels(labels, "two mugs")] == [1, 2]
 
 
-def test_embeddings_answer_beside_labels_that_were_renamed():
+def test_embeddings_match_after_labels_were_renamed():
     meanings = object_search.Meanings((1, 2), np.eye(2), ("sphere",), np.array([[1.0, 0.0]]))
     labels = [object_search.Label(1, "planet"), object_search.Label(2, "desk")]
     assert [m.object_id for m in object_search.search_labels(labels, "spheres", meanings=meanings)] == [1]

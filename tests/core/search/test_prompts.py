@@ -1,4 +1,4 @@
-"""Prompts mean what they say: everything, nothing, and what is left out."""
+"""Prompts with operators: everything, nothing and exclusions."""
 
 import dataclasses
 
@@ -81,7 +81,7 @@ def test_not_is_the_complement_among_the_objects(scene, text):
         ("mug and nothing", {MUG}),
     ],
 )
-def test_exclusions_belong_to_what_stands_before_them(scene, text, ids):
+def test_exclusions_apply_to_the_preceding_words(scene, text, ids):
     assert found(scene, text) == ids
 
 
@@ -107,7 +107,7 @@ def test_an_incomplete_prompt_raises(scene, text):
 @pytest.mark.parametrize(
     "name", ["all", "Everything", "Not", "nothing", "not the mug", "everything but the mug", "But"]
 )
-def test_an_object_with_such_a_name_is_found_by_it(scene, name):
+def test_an_object_named_like_an_operator_is_found_by_its_name(scene, name):
     objects = tuple(dataclasses.replace(item, name=name) if item.id == LEMON else item for item in scene.objects)
     named = dataclasses.replace(scene, objects=objects)
     for text in (name, name.upper(), f" {name} "):
@@ -117,7 +117,7 @@ def test_an_object_with_such_a_name_is_found_by_it(scene, name):
         assert found(named, f"{word} {name}") == ALL - found(named, name)
 
 
-def test_words_inside_names_leave_nothing_out():
+def test_operators_inside_names_exclude_nothing():
     labels = [
         object_search.Label(1, "butter"),
         object_search.Label(2, "knot"),
@@ -129,7 +129,7 @@ def test_words_inside_names_leave_nothing_out():
     assert prompts.parse("a mug without a handle") == prompts.Prompt(wanted=(phrase,))
 
 
-def test_unknown_phrases_that_are_left_out_are_asked_of_the_encoder(scene):
+def test_unknown_excluded_phrases_are_embedded_by_the_encoder(scene):
     labels = object_search.labels_of(scene)
     assert object_search.unknown(labels, "everything but sour things", None) == ["sour things"]
     assert object_search.not_excluded(labels, "everything but sour things and mug") == ["sour things"]

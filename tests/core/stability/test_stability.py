@@ -79,7 +79,7 @@ def test_the_table_is_the_same_on_every_run(rows):
         assert row.measured == first[row.topic, row.name]
 
 
-def test_traces_integrator_shows_the_errors_that_theory_predicts(rows):
+def test_traces_integrator_shows_the_errors_predicted_by_theory(rows):
     by_name = {(row.topic, row.name): row for row in rows}
     assert by_name["growth", "one step of 1 rad"].trace_rk2 == pytest.approx(math.sqrt(1.25) - 1)
     assert by_name["direction of time", "forward, then backward, 4 steps"].trace_rk2 > 1
@@ -190,7 +190,7 @@ def test_the_table_fits_80_columns(rows):
     assert sum("pass" in line for line in lines) == len(rows)
 
 
-def test_rows_are_json_whatever_they_measured(tmp_path):
+def test_rows_are_valid_json_for_all_values(tmp_path):
     found = stability.run([case(lambda: math.inf, trace_rk2=lambda: math.nan), case(lambda: 0.0)])
     path = stability.write(found, tmp_path / "rows.json")
     read = json.loads(path.read_text(), parse_constant=pytest.fail)
@@ -217,7 +217,7 @@ def test_an_unwritable_path_is_rejected_before_the_work(monkeypatch, tmp_path, c
     assert "create it first" in capsys.readouterr().err
 
 
-def test_scenes_of_the_table_are_scenes_that_a_file_may_hold():
+def test_scenes_of_the_table_can_be_stored_in_files():
     validation.check(stability_scenes.every_motion(singles=True), "every motion")
     validation.check(stability_scenes.scene_of([], [], singles=True), "empty")
 

@@ -135,7 +135,7 @@ def test_the_old_checkpoint_survives_a_crash_while_the_new_one_is_written(tmp_pa
     assert checkpoint.load(tmp_path).iteration == 9
 
 
-def test_a_run_is_opened_as_it_was_made(tmp_path):
+def test_a_run_is_opened_with_its_own_configuration(tmp_path):
     settings = config.load(None, ["train.seed=5", "losses.ssim=0.3"])
     made = checkpoint.create_run(tmp_path / "deep" / "run", dataset(), settings)
     opened = checkpoint.open_run(tmp_path / "deep" / "run")
@@ -154,7 +154,7 @@ def test_a_new_run_in_an_old_run_folder_starts_clean(tmp_path):
     assert os.listdir(tmp_path) == [checkpoint.RUN_FILE]
 
 
-def test_a_folder_with_other_things_is_left_alone(tmp_path):
+def test_a_folder_with_other_files_does_not_change(tmp_path):
     (tmp_path / "thesis.tex").write_text("precious")
     with pytest.raises(CheckpointError, match="is not a run folder; choose another --out"):
         checkpoint.create_run(tmp_path, dataset(), config.Config())
@@ -198,7 +198,7 @@ def test_a_configuration_of_another_version_is_named_with_the_remedy(tmp_path):
         checkpoint.open_run(tmp_path)
 
 
-def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+def test_a_folder_that_cannot_be_created_is_named(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(CheckpointError, match="file/run: cannot be created or written: .*choose another --out"):
         checkpoint.create_run(tmp_path / "file" / "run", dataset(), config.Config())

@@ -141,7 +141,7 @@ def stopped_run(tiny, tmp_path_factory):
 
 
 @pytest.mark.parametrize("damage", ["flipped", "empty", "missing"])
-def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
+def test_a_run_with_a_damaged_newest_checkpoint_continues_from_the_previous_one(
     tiny, reference, stopped_run, tmp_path, caplog, damage
 ):
     shutil.copytree(stopped_run, tmp_path / "run")
@@ -163,7 +163,7 @@ def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
     assert steps(newest.parent) == steps(reference)
 
 
-def test_a_damaged_checkpoint_never_replaces_the_whole_one_before_it(tiny, tmp_path, monkeypatch):
+def test_a_damaged_checkpoint_never_replaces_the_previous_one(tiny, tmp_path, monkeypatch):
     newest, previous = interrupted(tiny, tmp_path / "run")
     flip(newest, 8 * (newest.stat().st_size // 2))
     kept = checkpoint.load(newest.parent, mend=True)
@@ -234,7 +234,7 @@ def test_a_state_that_does_not_fit_the_run_is_named_on_resuming(tiny, reference,
 
 
 @pytest.mark.slow
-def test_runs_that_are_killed_at_random_moments_resume_to_the_same_bits(tiny, reference, tmp_path, pytestconfig):
+def test_runs_killed_at_random_moments_resume_to_the_same_bits(tiny, reference, tmp_path, pytestconfig):
     draw = random.Random(11)
     options = [text for override in (*tiny_datasets.SETTINGS, *OVERRIDES) for text in ("--set", override)]
     span = None  # seconds from the first event to the end, by a run that is not killed

@@ -28,12 +28,12 @@ def write_log(folder, rows, tail=""):
     return learning_curves.Curves(folder)
 
 
-def test_each_curve_has_a_panel_and_only_what_was_looked_at_is_shown():
+def test_each_measured_curve_has_a_panel():
     three, two = learning_curves.draw(ROWS), learning_curves.draw(BLIND)
     assert size(three)[0] == size(two)[0] and size(three)[1] * 2 == size(two)[1] * 3
 
 
-def test_some_steps_may_have_no_look_at_held_out_views():
+def test_some_steps_may_have_no_measurement_of_held_out_views():
     mixed = [BLIND[0], ROWS[1], BLIND[2], ROWS[3]]
     assert size(learning_curves.draw(mixed)) == size(learning_curves.draw(ROWS)) and learning_curves.draw(
         mixed
@@ -45,7 +45,7 @@ def test_a_finished_run_is_drawn_whatever_the_time_and_a_torn_line_is_left_out(t
     assert (tmp_path / checkpoint.CURVES_FILE).read_bytes() == learning_curves.draw(ROWS)
 
 
-def test_a_run_that_goes_on_is_drawn_seldom_enough_to_cost_nothing(tmp_path, monkeypatch):
+def test_an_active_run_is_plotted_rarely_enough_to_cost_little(tmp_path, monkeypatch):
     now, drawn = [0.0], []
     monkeypatch.setattr(learning_curves.time, "monotonic", lambda: now[0])
 
@@ -64,7 +64,7 @@ def test_a_run_that_goes_on_is_drawn_seldom_enough_to_cost_nothing(tmp_path, mon
     assert len(drawn) > 3 and all(1.1 * learning_curves.SHARE * gap >= 3.0 for gap in gaps)
 
 
-def test_one_point_is_no_curve(tmp_path):
+def test_a_single_point_is_not_plotted(tmp_path):
     write_log(tmp_path, ROWS[:1]).update(finished=True)
     assert not (tmp_path / checkpoint.CURVES_FILE).exists()
 
@@ -74,7 +74,7 @@ def full_disk(*args):
 
 
 @pytest.mark.parametrize("fault", ["matplotlib", "disk", "log"])
-def test_a_picture_that_cannot_be_drawn_is_one_warning(tmp_path, monkeypatch, caplog, fault):
+def test_a_plot_that_cannot_be_drawn_is_one_warning(tmp_path, monkeypatch, caplog, fault):
     pictures = write_log(tmp_path, ROWS)
     if fault == "matplotlib":
         monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
@@ -88,7 +88,7 @@ def test_a_picture_that_cannot_be_drawn_is_one_warning(tmp_path, monkeypatch, ca
     assert not (tmp_path / checkpoint.CURVES_FILE).exists()
 
 
-def test_a_run_leaves_its_curves_and_begins_again_without_them(tiny, tmp_path):
+def test_a_run_writes_its_curves_and_a_new_run_removes_them(tiny, tmp_path):
     folder, short = tmp_path / "run", ("identity.iterations=0", "train.log_every=5")
     run.train(tiny.root, folder, tiny_datasets.settings("train.iterations=20", *short))
     assert size((folder / checkpoint.CURVES_FILE).read_bytes())[0] > 300

@@ -86,7 +86,7 @@ def test_awkward_images_have_the_gradient_of_the_definition(kind):
     torch.testing.assert_close(single.grad.double() / scale, double.grad / scale, rtol=0, atol=1e-3)
 
 
-def test_the_definition_that_the_kernel_is_held_to_has_the_gradient_of_its_own_value():
+def test_the_reference_definition_has_the_gradient_of_its_own_value():
     x, y = (image.double() for image in pair(3, 4))
     assert torch.autograd.gradcheck(lambda image: by_definition(image, y, 0.2), (x.requires_grad_(True),))
 
@@ -115,7 +115,7 @@ def test_equal_images_have_no_loss_and_no_gradient():
         assert float(leaf.grad.abs().max()) < 1e-6
 
 
-def test_the_gradient_scales_with_what_comes_from_above():
+def test_the_gradient_scales_with_the_incoming_gradient():
     x, y = pair(9, 12)
     gradients = []
     for factor in (1.0, 3.0):

@@ -55,7 +55,7 @@ def test_bodies_are_separated_by_motion_and_position(seed):
     assert (labels[truth < 0] >= 0).mean() < 0.2
 
 
-def test_touching_bodies_that_move_as_one_are_one():
+def test_touching_bodies_with_equal_motion_are_one():
     rng = np.random.default_rng(0)
     motion = ([0.5, 0.2, 0], [0, 0, 1.0])
     left = body(rng, [0, 0, 0], *motion)
@@ -68,7 +68,7 @@ def test_touching_bodies_that_move_as_one_are_one():
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 19])
-def test_fewer_points_than_a_part_needs_are_none(count):
+def test_too_few_points_form_no_part(count):
     rng = np.random.default_rng(0)
     paths = body(rng, [0, 0, 0], [1, 0, 0], [0, 0, 0], count)
     assert (motion_clusters.find(paths, np.ones(count), 0.02, 20, rng) == -1).all()
@@ -90,7 +90,7 @@ def test_without_moving_points_no_labels_are_extended():
     assert found.shape == (0,)
 
 
-def test_points_that_were_not_asked_about_join_the_part_that_they_move_with():
+def test_remaining_points_join_the_part_that_they_move_with():
     rng = np.random.default_rng(5)
     paths, truth = scene(rng, 0.01)
     asked = rng.random(len(paths)) < 0.6

@@ -51,7 +51,7 @@ def test_moving_objects_are_found_and_separated(unmasked, tiny):
     assert len({a for _, a in best.values()}) == 2
 
 
-def test_a_run_looks_only_where_it_has_to(unmasked, tiny):
+def test_a_run_searches_only_if_necessary(unmasked, tiny):
     config = tiny_datasets.settings()
     assert training_needs.discovery(datasets.read(unmasked.root), config)
     assert not training_needs.discovery(datasets.read(tiny.root), config)
@@ -68,7 +68,7 @@ def test_static_scenes_get_no_masks(unmasked, monkeypatch):
     assert object_discovery.find(datasets.read(unmasked.root), config) is None
 
 
-def test_found_masks_start_a_run_as_given_ones_do(unmasked, tiny):
+def test_found_masks_start_a_run_like_given_ones(unmasked, tiny):
     config, truth = tiny_datasets.settings(*BRIEF), true_masks(tiny)
     found, given = Trainer(datasets.read(unmasked.root), config, truth), Trainer(datasets.read(tiny.root), config)
     for name, value in given.gaussians.params.items():
@@ -108,14 +108,14 @@ def test_a_resumed_run_keeps_the_masks_that_it_began_with(unmasked, tiny, tmp_pa
     np.testing.assert_array_equal(scene.gaussians.object_ids[bodies], scene.gaussians.motion_ids[bodies])
 
 
-def test_the_short_run_is_that_of_the_run_it_is_for(unmasked):
+def test_the_short_run_uses_the_settings_of_the_run(unmasked):
     config = tiny_datasets.settings("densify.max_gaussians=900", "train.background='white'", "train.seed=7")
     short = object_discovery._short(config, 0.75)
     assert short.train.representation == "field" and short.densify.max_gaussians == 900
     assert short.train.background == "white" and short.train.seed == 7
 
 
-def test_objects_that_were_found_are_measured_against_the_true_ones_in_their_place(tiny):
+def test_found_objects_are_measured_against_the_true_ones(tiny):
     truth = datasets.read(tiny.root).ground_truth
     strange = dataclasses.replace(truth, object_ids=truth.object_ids[::-1])
     named = evaluate.object_errors(tiny.truth, strange)
@@ -124,7 +124,7 @@ def test_objects_that_were_found_are_measured_against_the_true_ones_in_their_pla
     assert max(row["position_error"] for row in found) < 1e-3 and [row["id"] for row in found] == [1, 2]
 
 
-def test_a_field_without_masks_sorts_what_moves_in_the_end(unmasked, tmp_path, monkeypatch):
+def test_a_field_without_masks_groups_moving_gaussians_at_the_end(unmasked, tmp_path, monkeypatch):
     """The parts become objects with groups of their own, and nobody takes their ids for those of the data."""
     config = tiny_datasets.settings(
         "train.representation='field'", "field.size='small'", "train.iterations=60", "densify.stop=0.6"
@@ -155,7 +155,7 @@ def test_a_field_without_masks_sorts_what_moves_in_the_end(unmasked, tmp_path, m
     assert len(sorted_ones) == 1 and checkpoint.load(again.folder).finished
 
 
-def test_a_field_is_sorted_only_without_other_grouping(unmasked, tiny):
+def test_a_field_is_clustered_only_without_other_groups(unmasked, tiny):
     data = datasets.read(unmasked.root)
     field = "train.representation='field'"
     assert training_needs.sorting(data, tiny_datasets.settings(field))

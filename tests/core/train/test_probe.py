@@ -1,4 +1,4 @@
-"""Looking at held-out views tells how a run goes and changes none of its numbers."""
+"""Measuring held-out views shows the progress of a run and does not change its result."""
 
 import json
 
@@ -23,7 +23,7 @@ def events_of(root, folder, *overrides):
     return [event for event in found if event["event"] == "step"]
 
 
-def test_a_run_that_looks_at_held_out_views_ends_with_the_same_bits(tiny, tmp_path):
+def test_measuring_held_out_views_does_not_change_a_run(tiny, tmp_path):
     looking = events_of(tiny.root, tmp_path / "looking", "train.probe_every=7")
     blind = events_of(tiny.root, tmp_path / "blind", "train.probe_every=0")
     ours, theirs = (checkpoint.load(tmp_path / name) for name in ("looking", "blind"))
@@ -40,7 +40,7 @@ def test_training_raises_the_psnr_of_held_out_views(tiny, tmp_path):
     assert 5 < found[0] < found[-1] < 60
 
 
-def test_the_look_agrees_with_the_evaluation(tiny, trained, baked):
+def test_the_measurement_agrees_with_the_evaluation(tiny, trained, baked):
     dataset = datasets.read(tiny.root)
     trainer = Trainer(dataset, trained.config)
     trainer.restore(checkpoint.load(trained.folder))
@@ -50,12 +50,12 @@ def test_the_look_agrees_with_the_evaluation(tiny, trained, baked):
     assert probe.psnr() == pytest.approx(result["splits"]["val"]["rigid"]["psnr"], abs=0.1)
 
 
-def test_few_views_are_taken_where_few_are_wanted(tiny):
+def test_the_number_of_measured_views_is_limited(tiny):
     trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings())
     assert len(train_probe.Probe(trainer, 1)) == 1
 
 
-def test_without_held_out_views_nothing_is_looked_at(tmp_path):
+def test_without_held_out_views_nothing_is_measured(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path / "data", views=3)
     (data.root / "transforms_val.json").unlink()
     steps = events_of(data.root, tmp_path / "run", "train.probe_every=1", "train.iterations=3")
@@ -63,7 +63,7 @@ def test_without_held_out_views_nothing_is_looked_at(tmp_path):
 
 
 @pytest.mark.parametrize("levels", [1, 10, 255])
-def test_the_psnr_is_that_of_a_constant_error(levels):
+def test_the_psnr_of_a_constant_error_is_exact(levels):
     target = np.zeros((4, 5, 3), np.uint8)
     image = np.full((4, 5, 3), levels / 255, np.float32)
     assert train_probe.psnr(image, target) == pytest.approx(20 * np.log10(255 / levels))

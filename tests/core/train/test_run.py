@@ -1,4 +1,4 @@
-"""Runs that are killed or stopped go on to the numbers of an unbroken one."""
+"""Runs that are killed or stopped resume to the result of an uninterrupted run."""
 
 import dataclasses
 import json
@@ -103,7 +103,7 @@ def stop_at(step, number, options, folder):
         )
 
 
-def test_a_run_killed_before_its_first_checkpoint_begins_again(tiny, unbroken, tmp_path):
+def test_a_run_killed_before_its_first_checkpoint_starts_again(tiny, unbroken, tmp_path):
     folder = tmp_path / "run"
     stop_at(30, signal.SIGKILL, arguments(tiny, folder, "train.checkpoint_every=1000"), folder)
     assert not (folder / checkpoint.CHECKPOINT_FILE).exists() and len(log_of(folder)) >= 3
@@ -122,7 +122,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(tiny, unbroken, t
     ],
     ids=["compiling", "placing", "voting", "identities"],
 )
-def test_a_run_stopped_beside_its_steps_names_the_way_to_go_on(tiny, unbroken, tmp_path, moment, number):
+def test_a_run_stopped_outside_its_steps_names_the_command_that_continues_it(tiny, unbroken, tmp_path, moment, number):
     folder, settings = tmp_path / "my run", tiny_datasets.settings(*OVERRIDES)
 
     def stop(event):
@@ -138,7 +138,7 @@ def test_a_run_stopped_beside_its_steps_names_the_way_to_go_on(tiny, unbroken, t
     assert log_of(folder) == log_of(unbroken[0])
 
 
-def test_a_run_killed_before_its_last_labels_only_makes_these(tiny, unbroken, tmp_path, monkeypatch):
+def test_a_run_killed_before_its_labels_resumes_with_the_labels(tiny, unbroken, tmp_path, monkeypatch):
     folder, settings = tmp_path / "run", tiny_datasets.settings(*OVERRIDES)
 
     def die(*args, **kwargs):
@@ -187,7 +187,7 @@ def test_resuming_on_other_data_is_refused(unbroken, tmp_path):
         run.train(other.root, unbroken[0], tiny_datasets.settings(), resume=True)
 
 
-def test_signal_handlers_are_the_callers_again_after_training(tiny, tmp_path):
+def test_signal_handlers_of_the_caller_are_restored_after_training(tiny, tmp_path):
     before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
     run.train(tiny.root, tmp_path / "run", tiny_datasets.settings("train.iterations=2", "identity.iterations=0"))
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
@@ -214,7 +214,7 @@ def test_a_run_is_replaced_only_on_request(tiny, copied):
     assert contents(copied) == {**before, **torn}
 
 
-def test_overwriting_begins_again_with_nothing_of_the_old_run(tiny, copied):
+def test_overwriting_starts_again_without_files_of_the_old_run(tiny, copied):
     settings = tiny_datasets.settings("train.iterations=3", "identity.iterations=0")
     run.train(tiny.root, copied, settings, overwrite=True)
     assert checkpoint.open_run(copied).config == settings and checkpoint.load(copied).iteration == 3
@@ -223,7 +223,7 @@ def test_overwriting_begins_again_with_nothing_of_the_old_run(tiny, copied):
 
 
 @pytest.mark.parametrize("failure", [TrainingError("no start"), KeyboardInterrupt()], ids=["error", "signal"])
-def test_a_run_stays_where_the_one_that_replaces_it_cannot_begin(tiny, copied, monkeypatch, failure):
+def test_a_run_is_kept_if_its_replacement_cannot_start(tiny, copied, monkeypatch, failure):
     def fail(*args):
         raise failure
 
@@ -243,7 +243,7 @@ def test_resuming_without_a_run_starts_a_new_one_with_a_message(tiny, tmp_path, 
     assert checkpoint.load(tmp_path / "run").finished
 
 
-def test_half_written_files_of_a_kill_are_removed(tiny, tmp_path):
+def test_files_half_written_by_a_killed_run_are_removed(tiny, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / f".{checkpoint.RUN_FILE}.12ab.part").write_text("half")

@@ -26,7 +26,7 @@ from tests.support.command_line import complaint
 pytestmark = pytest.mark.heavy
 
 OVERRIDES = ("train.iterations=40", "identity.iterations=4", "train.checkpoint_every=10", "train.probe_every=0")
-# What a process does to itself when it writes its second checkpoint.
+# Code of a process that kills itself when it writes its second checkpoint.
 KILLED_WITHIN_A_WRITE = """
 import contextlib, os, signal, sys
 from r5dgs_core.cli import main as cli
@@ -99,7 +99,7 @@ def assert_equal(ours, theirs):
 
 
 @pytest.mark.parametrize(("moment", "kept"), [("half", 10), ("before", 10), ("between", 10), ("after", 20)])
-def test_a_kill_within_a_write_leaves_a_whole_checkpoint(tiny, reference, tmp_path, moment, kept):
+def test_a_kill_during_a_write_leaves_a_complete_checkpoint(tiny, reference, tmp_path, moment, kept):
     folder = tmp_path / "run"
     killed = processes.run(KILLED_WITHIN_A_WRITE, moment, *arguments(tiny.root, folder))
     assert killed.returncode == -signal.SIGKILL
@@ -110,7 +110,7 @@ def test_a_kill_within_a_write_leaves_a_whole_checkpoint(tiny, reference, tmp_pa
 
 
 @needs_limits
-def test_a_full_disk_stops_a_run_that_goes_on_when_there_is_room(tiny, reference, tmp_path):
+def test_a_run_stopped_by_a_full_disk_resumes_after_space_is_freed(tiny, reference, tmp_path):
     folder = tmp_path / "run"
 
     def stop(event):
@@ -131,7 +131,7 @@ def test_a_full_disk_stops_a_run_that_goes_on_when_there_is_room(tiny, reference
 
 
 @needs_limits
-def test_a_full_disk_at_the_very_start_is_one_line(tiny, tmp_path):
+def test_a_full_disk_at_the_start_is_an_error_of_one_line(tiny, tmp_path):
     full = processes.run(FULL_DISK, 1000, *arguments(tiny.root, tmp_path / "run"))
     assert full.returncode == 3 and "Traceback" not in full.stderr
     assert f"{tmp_path / 'run'}: cannot be created or written" in full.stderr
@@ -166,7 +166,7 @@ def test_a_truncated_file_is_named_before_anything_is_trained(data, tmp_path, ca
     assert not (folder / checkpoint.CHECKPOINT_FILE).exists()
 
 
-def test_a_run_that_damaged_data_kept_from_starting_starts_when_the_data_is_whole(data, reference, tmp_path, capsys):
+def test_a_run_that_damaged_data_prevented_starts_once_the_data_is_repaired(data, reference, tmp_path, capsys):
     path, folder = data / "train/r_011.png", tmp_path / "run"
     whole = path.read_bytes()
     damage(path, whole[:-200])
@@ -190,7 +190,7 @@ def test_a_camera_file_that_lacks_a_key_is_named_with_frame_and_key(data, tmp_pa
     assert not (tmp_path / "run").exists()
 
 
-def test_an_object_that_one_mask_names_is_background_with_a_warning(data, tmp_path, caplog):
+def test_an_object_in_a_single_mask_becomes_background_with_a_warning(data, tmp_path, caplog):
     first = data / "object_mask/train/r_010.png"
     ids = images.read_raw(first)[..., 0].copy()
     floor = np.argwhere(ids == 0)
@@ -205,7 +205,7 @@ def test_an_object_that_one_mask_names_is_background_with_a_warning(data, tmp_pa
     assert np.isfinite(scene.tracks.poses).all() and np.isfinite(scene.gaussians.means).all()
 
 
-def test_an_object_of_a_single_pixel_is_no_obstacle(data, tmp_path):
+def test_an_object_of_a_single_pixel_is_supported(data, tmp_path):
     for name in ("r_000.png", "r_010.png"):
         path = data / "object_mask/train" / name
         ids = images.read_raw(path)[..., 0].copy()
@@ -229,7 +229,7 @@ def spoil_camera(trainer):
 @pytest.mark.parametrize(
     ("spoil", "found"), [(spoil_image, "loss|gradient of"), (spoil_camera, "cannot be drawn|camera|finite")]
 )
-def test_a_nan_stops_the_run_at_its_step_and_view_and_the_run_goes_on_from_before(
+def test_a_nan_stops_the_run_at_its_step_and_view_and_the_run_resumes_before_it(
     tiny, reference, tmp_path, monkeypatch, spoil, found
 ):
     real = Trainer.step

@@ -1,4 +1,4 @@
-"""Training recovers a known motion, goes on from a state as if nothing had happened, and stops at the first NaN."""
+"""Training recovers a known motion, resumes exactly from a saved state, and stops at the first NaN."""
 
 import dataclasses
 
@@ -94,7 +94,7 @@ def unbroken(tiny, tmp_path_factory):
 
 
 @pytest.mark.parametrize("broken_at", [9, 30])
-def test_a_new_trainer_goes_on_to_the_same_bits(tiny, unbroken, broken_at):
+def test_a_restored_trainer_continues_to_the_same_bits(tiny, unbroken, broken_at):
     folder, reference = unbroken
     trainer = make(tiny)
     trainer.restore(checkpoint.load(folder / str(broken_at)))
@@ -117,7 +117,7 @@ def test_training_does_not_change_a_saved_state(tiny, unbroken):
 
 
 @pytest.mark.parametrize("name", ["means", "sh", "translations", "background"])
-def test_a_gradient_that_is_not_finite_stops_before_it_does_harm(tiny, name):
+def test_a_gradient_that_is_not_finite_stops_the_run_before_the_update(tiny, name):
     trainer = make(tiny)
     for _ in range(3):
         trainer.step()
@@ -150,7 +150,7 @@ def test_times_enter_from_the_first_one_outwards_until_all_are_in(tiny):
     assert seen[-1] == (0, 5) and len(set(seen)) > 2
 
 
-def test_background_that_a_single_camera_sees_keeps_its_place(tiny):
+def test_background_seen_by_a_single_camera_keeps_its_position(tiny):
     trainer = make(tiny, "densify.start=1000")
     means = trainer.gaussians.params["means"]
     row = int(torch.nonzero(trainer.gaussians.motion_ids == 0)[0, 0])
@@ -174,7 +174,7 @@ def test_without_masks_everything_is_one_pinned_group(tmp_path):
     assert mean_loss(trainer) < before
 
 
-def test_transparent_images_are_trained_on_a_background_that_stays(tmp_path):
+def test_transparent_images_are_trained_on_a_fixed_background(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path, alpha=True)
     trainer = make(data)
     before = mean_loss(trainer)

@@ -1,4 +1,4 @@
-"""The worker holds edited points, and draws them in the place of the scene's own."""
+"""The worker caches edited points and draws them instead of the scene's own."""
 
 import base64
 
@@ -53,7 +53,7 @@ def scattered(scene, rows):
     )
 
 
-def test_edited_points_are_drawn_beside_untouched_rows(path, scene):
+def test_edited_points_are_drawn_with_unedited_rows(path, scene):
     edit = scattered(scene, np.arange(20, 90, 2))
     whole = {"scene": 0, "start": 100, "count": 50, "matrix": EYE}
     extended, (place,) = point_edits.extend(scene, [edit])
@@ -66,7 +66,7 @@ def test_edited_points_are_drawn_beside_untouched_rows(path, scene):
     np.testing.assert_allclose(arrays["color"], expected, atol=1e-5)
 
 
-def test_held_points_are_not_sent_again_and_unused_ones_are_dropped(path, scene):
+def test_cached_points_are_not_sent_again_and_unused_ones_are_dropped(path, scene):
     a, b = scattered(scene, np.arange(20, 60)), scattered(scene, np.arange(60, 90))
     answers = talk(
         load(path),
@@ -82,7 +82,7 @@ def test_held_points_are_not_sent_again_and_unused_ones_are_dropped(path, scene)
         assert header["error"]["kind"] == "ConfigError" and "'b'" in header["error"]["message"]
 
 
-def test_a_picture_without_edits_is_that_of_the_scene_again(path, scene):
+def test_a_picture_without_edits_shows_the_scene_again(path, scene):
     whole = {"scene": 0, "start": 0, "count": 200, "matrix": EYE}
     edit = scattered(scene, np.arange(200))
     answers = talk(load(path), picture(whole), points("a", a=edit), picture(entry("a")), picture(whole))

@@ -1,4 +1,4 @@
-"""Hostile requests to the worker: each gets one answer with an error of ours, and the worker lives on."""
+"""Hostile requests to the worker: each gets one answer with an `R5dgsError`, and the worker continues."""
 
 import copy
 import io
@@ -152,7 +152,7 @@ def little_memory(monkeypatch):
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_request_gets_one_error_of_ours_and_the_worker_lives_on(path, name, capsys):
+def test_a_hostile_request_gets_one_error_and_the_worker_continues(path, name, capsys):
     _, (refused, arrays), (after, picture) = talk(load(path), HOSTILE[name], RENDER)
     if isinstance(HOSTILE[name], dict) and HOSTILE[name].get("command") == "load":  # its scenes are gone then
         assert after["ok"] or "no scene is loaded" in after["error"]["message"]
@@ -167,7 +167,7 @@ def test_there_are_more_than_the_trials_had():
     assert len(HOSTILE) >= 66
 
 
-def test_a_giant_line_is_skipped_without_being_kept(path, monkeypatch):
+def test_a_giant_line_is_skipped_without_being_stored(path, monkeypatch):
     monkeypatch.setattr(fields, "MOST_LINE", 4 << 20)
     most = []
 
@@ -184,7 +184,7 @@ def test_a_giant_line_is_skipped_without_being_kept(path, monkeypatch):
     assert all(0 < size <= (4 << 20) + 1 for size in most)
 
 
-def test_a_last_line_without_an_end_is_answered():
+def test_a_last_line_without_a_newline_is_answered():
     out = io.BytesIO()
     server.serve(io.BytesIO(b'{"id": 1, "command": "hello"}'), out)
     ((answered, _),) = parse(out.getvalue())
@@ -192,12 +192,12 @@ def test_a_last_line_without_an_end_is_answered():
 
 
 @pytest.mark.parametrize(("number", "back"), [(7, 7), ("a", "a"), (None, None), ([1] * 9, None), ("a" * 500, None)])
-def test_only_plain_numbers_and_names_come_back_as_the_id(number, back):
+def test_only_plain_numbers_and_names_are_returned_as_the_id(number, back):
     ((answered, _),) = talk({"id": number, "command": "hello"})
     assert answered["ok"] and answered["id"] == back
 
 
-def test_a_fault_of_the_worker_itself_is_an_error_of_ours_too(monkeypatch, capsys):
+def test_a_defect_of_the_worker_is_reported_as_an_error(monkeypatch, capsys):
     def fail(*_):
         raise MemoryError("no room")
 
@@ -213,7 +213,7 @@ def test_the_free_memory_is_that_of_the_machine(monkeypatch):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no pipes with paths")
-def test_a_pipe_is_not_waited_for(tmp_path):
+def test_the_worker_does_not_wait_for_a_pipe(tmp_path):
     os.mkfifo(tmp_path / "a.r5dgs")
     ((answered, _),) = talk(load(tmp_path / "a.r5dgs"))
     assert answered["error"]["kind"] == "SceneFileError"

@@ -56,7 +56,7 @@ def parse(data):
             count = int(np.prod(entry["shape"]))
             dtype = np.dtype(entry["dtype"])
             arrays[entry["name"]] = np.frombuffer(stream.read(count * dtype.itemsize), dtype).reshape(entry["shape"])
-        if "event" not in header:  # these are told in test_warming.py
+        if "event" not in header:  # tested in tests/core/render/test_warm_up.py
             answers.append((header, arrays))
     return answers
 
@@ -80,7 +80,7 @@ def test_a_rendered_time_is_the_cores_picture(path):
         np.testing.assert_array_equal(arrays[name], getattr(expected, name))
 
 
-def test_instances_are_moved_and_the_rest_is_not_seen(path):
+def test_instances_are_moved_and_other_gaussians_are_not_drawn(path):
     scene = scene_file.read(path)
     body = scene.object(2)
     matrix = np.eye(4)
@@ -94,7 +94,7 @@ def test_instances_are_moved_and_the_rest_is_not_seen(path):
     np.testing.assert_array_equal(arrays["color"], expected.color)
 
 
-def test_scenes_that_are_loaded_together_are_in_one_picture(path, tmp_path):
+def test_scenes_loaded_together_are_in_one_picture(path, tmp_path):
     other = scene_file.write(scenes.make_scene(n=150, sh_degree=2, seed=9), tmp_path / "other.r5dgs")
     world = matrix((0.8, 0.1, 0.3, -0.2), (0.3, -0.2, 0.1), 0.8)
     rows = {"start": 20, "count": 60, "matrix": world.tolist(), "world": world.tolist(), "tint": [0.5, 1.0, 2.0]}
@@ -115,7 +115,7 @@ def test_scenes_that_are_loaded_together_are_in_one_picture(path, tmp_path):
     assert {0, 1} <= set(arrays["owners"].ravel().tolist())
 
 
-def test_coverage_comes_beside_the_picture(path):
+def test_coverage_is_returned_with_the_picture(path):
     entries = [{**ROWS, "count": 90}, {**ROWS, "start": 90, "count": 110}]
     request = {"command": "render", "camera": CAMERA_JSON, "instances": entries, "want": ["alpha"], "sky": None}
     _, (header, arrays) = talk(load(path), {**request, "coverage": {"groups": [5, 3], "ranks": 3}})
@@ -129,7 +129,7 @@ def test_coverage_comes_beside_the_picture(path):
         )
 
 
-def test_a_file_that_is_named_twice_is_two_scenes(path):
+def test_a_file_named_twice_is_two_scenes(path):
     moved = matrix(translation=(0.3, 0, 0)).tolist()
     one, other = {**ROWS, "count": 200}, {**ROWS, "count": 200, "matrix": moved}
     render = {"command": "render", "camera": CAMERA_JSON, "want": ["owners"]}
@@ -175,13 +175,13 @@ def test_scenes_no_longer_requested_are_released(path, tmp_path, monkeypatch):
         ({"command": "load", "path": "/nowhere/at all.r5dgs"}, "ConfigError", "paths"),
     ],
 )
-def test_impossible_requests_are_answered_by_name_and_the_worker_goes_on(path, request_, kind, message):
+def test_impossible_requests_are_named_and_the_worker_continues(path, request_, kind, message):
     _, (header, arrays), (after, _) = talk(load(path), request_, {"command": "hello"})
     assert not header["ok"] and header["error"]["kind"] == kind and message in header["error"]["message"]
     assert not arrays and after["ok"]
 
 
-def test_rendering_without_a_scene_and_lines_that_are_no_requests_are_errors():
+def test_rendering_without_a_scene_and_invalid_lines_are_errors():
     (first, _), (second, _), (third, _) = talk(
         {"command": "render", "camera": CAMERA_JSON, "t": 0.0}, b"not json", b"[1, 2]"
     )
@@ -189,7 +189,7 @@ def test_rendering_without_a_scene_and_lines_that_are_no_requests_are_errors():
     assert "not valid JSON" in second["error"]["message"] and "JSON object" in third["error"]["message"]
 
 
-def test_a_failed_load_forgets_the_scene_before(path, tmp_path):
+def test_a_failed_load_unloads_the_previous_scene(path, tmp_path):
     broken = tmp_path / "broken.r5dgs"
     broken.write_bytes(path.read_bytes()[:300])
     _, (failed, _), (render, _) = talk(load(path), load(broken), {"command": "render", "camera": CAMERA_JSON, "t": 0.0})
@@ -222,13 +222,13 @@ def test_a_changed_file_is_read_again(path, tmp_path):
     assert server.answer(load(copy))[0]["scenes"][0]["gaussians"] == 120
 
 
-def test_the_rasterizer_is_made_ready_on_request():
+def test_the_rasterizer_is_compiled_on_request():
     (header, _), (again, _) = talk({"command": "warm_up"}, {"command": "warm_up"})
     assert header["ok"] and again["result"] == header["result"] == {"compiled": compilation.compiled()}
 
 
 @pytest.mark.parametrize("compiled", [3, 0])
-def test_a_warm_up_that_fails_after_it_was_announced_ends_with_the_reason(monkeypatch, capsys, compiled):
+def test_an_announced_warm_up_that_fails_reports_the_reason(monkeypatch, capsys, compiled):
     def fail(gradients):
         if compiled:
             compilation._watch.tell(compilation.NOTICE)
@@ -287,7 +287,7 @@ def test_words_find_objects(path):
     assert header["result"]["matches"][0]["object_id"] == 1
 
 
-def test_phrases_are_embedded_by_an_encoder_and_asked_of_its_table(tmp_path):
+def test_phrases_are_embedded_by_an_encoder_and_matched_with_its_table(tmp_path):
     folder = encoder_folders.sentences(tmp_path / "tiny")
     encoder = registry.open_encoder(folder)
     made = build_table.make(scenes.make_scene(n=120, objects=2), encoder).scene

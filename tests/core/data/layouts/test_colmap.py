@@ -1,4 +1,4 @@
-"""Images with a COLMAP reconstruction are the data set that camera files would give."""
+"""Images with a COLMAP reconstruction give the same data set as camera files."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def rig(tmp_path):
 
 
 def same_camera(view, expected):
-    """A view has a camera to the last digits."""
+    """Assert that a view has a camera up to rounding."""
     np.testing.assert_allclose(view.camera.T_cam_world, expected.T_cam_world, atol=1e-12)
     np.testing.assert_allclose(view.camera.intrinsics, expected.intrinsics, atol=1e-10)
 
@@ -126,7 +126,7 @@ def test_a_moving_camera_has_a_time_and_a_pose_per_image(flat):
     root, views = flat
     (root / "times.json").write_text(json.dumps({name: k / 9 for k, name in enumerate(views)}))
     dataset = datasets.read(root)
-    # The first image is held out by its number, and trained on as nothing else shows its time.
+    # The first image is held out by its number, but used for training because no other shows its time.
     assert [view.name for view in dataset.val] == ["img_08"]
     assert dataset.train[0].name == "img_00" and dataset.t_max == 1.0
     for view in dataset.train:

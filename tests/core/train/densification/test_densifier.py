@@ -1,4 +1,4 @@
-"""Densification: what the gradients ask for grows, within the cap, and what is not needed is removed."""
+"""Densification: Gaussians with large gradients grow, within the cap, and unneeded ones are removed."""
 
 import dataclasses
 import re
@@ -77,7 +77,7 @@ def test_the_mean_counts_only_views_that_show_the_gaussian():
     assert found.mean().tolist() == [3, 5, 0]
 
 
-def test_small_ones_with_the_largest_gradients_are_cloned():
+def test_small_gaussians_with_the_largest_gradients_are_cloned():
     gaussians, optimizer = make()
     scores = torch.linspace(0.1, 1, 40)
     before = gaussians.means.detach().clone()
@@ -87,7 +87,7 @@ def test_small_ones_with_the_largest_gradients_are_cloned():
     assert {tuple(row) for row in gaussians.means[40:].tolist()} == {tuple(row) for row in before[30:].tolist()}
 
 
-def test_large_ones_become_two_smaller_ones_near_their_place():
+def test_large_gaussians_are_split_into_two_smaller_ones_near_their_place():
     gaussians, optimizer = make(n=8, size=4 * PIXEL)
     parents, scale = gaussians.means.detach().clone(), 4 * PIXEL
     densify(gaussians, optimizer, gradients(torch.tensor([0.0, 1, 0, 0, 0, 2, 0, 0])))
@@ -122,7 +122,7 @@ def test_the_cap_holds_round_after_round(size, cap, densify):
     assert len(gaussians) == cap
 
 
-def test_faint_and_oversized_ones_go_and_without_gradients_nothing_grows():
+def test_faint_and_oversized_gaussians_are_removed_and_without_gradients_nothing_grows():
     gaussians, optimizer = make()
     with torch.no_grad():
         gaussians.opacity_logits[:5] = torch.tensor(0.009).logit()
@@ -148,7 +148,7 @@ def test_the_same_draws_give_the_same_gaussians():
     assert torch.equal(*results)
 
 
-def test_background_close_before_a_camera_that_no_other_sees_goes():
+def test_background_near_a_camera_that_no_other_camera_sees_is_removed():
     eyes = [scenes.orbit_camera(angle, 48, 36) for angle in (0.0, 1.5, 3.0)]
     before_first = torch.tensor(eyes[0].center + 0.5 * eyes[0].forward).float()
     middle = torch.tensor(eyes[0].center + np.linalg.norm(eyes[0].center) * eyes[0].forward).float()
@@ -202,7 +202,7 @@ def test_the_default_strategy_splits_by_the_extent_of_the_cameras():
         assert sizes == pytest.approx(expected)
 
 
-def test_the_default_strategy_removes_large_ones_only_once_opacities_were_reset():
+def test_the_default_strategy_removes_large_gaussians_only_after_opacities_were_reset():
     for sizes, expected in ((False, 40), (True, 37)):
         gaussians, optimizer = make()
         with torch.no_grad():
@@ -213,7 +213,7 @@ def test_the_default_strategy_removes_large_ones_only_once_opacities_were_reset(
         assert len(gaussians) == expected
 
 
-def test_a_reset_lowers_what_is_opaque_and_forgets_its_moments():
+def test_a_reset_lowers_high_opacities_and_clears_their_moments():
     gaussians, optimizer = make(n=3)
     with torch.no_grad():
         gaussians.opacity_logits.copy_(torch.tensor([0.9, 0.5, 0.006]).logit())
@@ -260,7 +260,7 @@ def test_rounds_follow_the_schedule_of_the_section():
 
 
 @pytest.mark.parametrize("name", ["share", "default", "mcmc"])
-def test_a_strategy_made_again_from_its_tensors_does_what_the_first_does(name):
+def test_a_strategy_restored_from_its_tensors_continues_identically(name):
     results = []
     for again in (False, True):
         place = conditions(cap=60, seed=3)
@@ -299,7 +299,7 @@ SETTINGS = {
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_a_run_keeps_to_its_cap_and_goes_on_to_the_same_bits(tiny, tmp_path, name):
+def test_a_run_keeps_its_cap_and_resumes_to_the_same_bits(tiny, tmp_path, name):
     def begin():
         keys = [f"densify_{name}.{setting}" for setting in SETTINGS[name]]
         sets = ("train.iterations=60", f"densify.strategy={name}", "densify.max_gaussians=1100", *keys)

@@ -1,4 +1,4 @@
-"""Densification as a Markov chain: what is divided looks the same, what died comes back to life, and noise explores."""
+"""Densification as a Markov chain: division keeps the picture, dead Gaussians are relocated, and noise explores."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def with_opacities(values, seed=0):
 
 @pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.999])
 @pytest.mark.parametrize("count", [1, 2, 3, 10, 51])
-def test_equal_parts_cover_what_the_whole_covered(opacity, count):
+def test_equal_parts_cover_the_same_as_the_whole(opacity, count):
     each, factor = mcmc.divided(torch.tensor([opacity], dtype=torch.float64), torch.tensor([count]))
     assert 1 - (1 - float(each)) ** count == pytest.approx(opacity, rel=1e-9)
     x = np.linspace(-40, 40, 200001)
@@ -63,7 +63,7 @@ def test_dead_gaussians_are_relocated_onto_live_ones():
         assert 1 - float((1 - opacities[same]).prod()) == pytest.approx(before, abs=1e-3)
 
 
-def test_opaque_ones_are_drawn_more_often():
+def test_opaque_gaussians_are_drawn_more_often():
     gaussians, optimizer = with_opacities([0.9] + [0.001] * 3000 + [0.1])
     source = strategy()._draw(torch.tensor([0.9, 0.0, 0.1, 0.0]), 4000)
     assert set(source.tolist()) == {0, 2}
@@ -82,7 +82,7 @@ def test_growth_is_a_share_up_to_the_cap_and_inherits_groups():
     assert gaussians.motion_ids.tolist() == gaussians.sh[:, 0, 0].tolist()
 
 
-def test_all_dead_or_none_at_all_is_no_error():
+def test_all_dead_or_no_gaussians_are_no_error():
     gaussians, optimizer = with_opacities([0.001, 0.002])
     before = gaussians.means.detach().clone()
     strategy().relocate(gaussians, optimizer)
@@ -93,7 +93,7 @@ def test_all_dead_or_none_at_all_is_no_error():
     assert len(empty) == 0 and chain.penalty(empty) is None
 
 
-def test_noise_has_the_shape_of_the_gaussian_and_spares_opaque_ones():
+def test_noise_has_the_shape_of_the_gaussian_and_spares_opaque_gaussians():
     n = 4000
     turn = torch.tensor([0.8, 0.0, 0.0, 0.6]).repeat(n, 1)  # about z, 73.7 degrees
     logits = torch.logit(torch.cat([torch.full((n - 1,), 0.001), torch.tensor([0.9])]))

@@ -28,7 +28,7 @@ def leaves(*tensors):
 
 @pytest.mark.parametrize("classes", [1, 2, 7, 40])
 @pytest.mark.parametrize("block", [1, 37, 1 << 24])
-def test_the_pixel_loss_and_its_slopes_are_those_of_the_definition(classes, block, monkeypatch):
+def test_the_pixel_loss_and_its_gradient_follow_the_definition(classes, block, monkeypatch):
     monkeypatch.setattr(identity_losses, "BLOCK_BYTES", 8 * classes * block)
     features, weight, bias, target = pixels(9, 11, classes=classes)
     ours, theirs = leaves(features, weight, bias), leaves(features, weight, bias)
@@ -42,13 +42,13 @@ def test_the_pixel_loss_and_its_slopes_are_those_of_the_definition(classes, bloc
         torch.testing.assert_close(a.grad, b.grad)
 
 
-def test_the_slopes_of_the_pixel_loss_are_those_of_its_value():
+def test_the_gradient_of_the_pixel_loss_matches_its_value():
     *inputs, target = pixels()
     assert torch.autograd.gradcheck(lambda *x: identity_losses.pixel_cross_entropy(*x, target), leaves(*inputs))
 
 
 @pytest.mark.parametrize("classes", [2, 5, 256])
-def test_guessing_costs_one_for_any_number_of_classes(classes):
+def test_uniform_guesses_have_loss_one_for_any_number_of_classes(classes):
     target = torch.arange(30).reshape(5, 6) % classes
     loss = identity_losses.pixel_cross_entropy(
         torch.randn(5, 6, 16), torch.zeros(classes, 16), torch.zeros(classes), target
@@ -70,7 +70,7 @@ def test_pixels_that_do_not_count_change_nothing():
     assert float(loss.detach()) == 0 and not nobody.grad.any()
 
 
-def test_answers_that_are_certain_and_wrong_stay_finite():
+def test_certain_and_wrong_answers_have_finite_losses():
     features = torch.full((2, 2, 16), 300.0, requires_grad=True)
     weight, bias = torch.eye(3, 16), torch.zeros(3)
     loss = identity_losses.pixel_cross_entropy(
@@ -89,13 +89,13 @@ LOSSES = {
 
 @pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("spread", [0.5, 5.0])
-def test_slopes_of_the_losses_in_space_are_those_of_their_values(name, spread):
+def test_gradients_of_the_spatial_losses_match_their_values(name, spread):
     inputs = leaves(answers(6, 3, spread=spread), answers(6, 4, 3, seed=1, spread=spread))
     assert torch.autograd.gradcheck(lambda p, n: LOSSES[name](p.softmax(-1), n.softmax(-1)), inputs)
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_agreement_is_free_and_disagreement_costs(name):
+def test_agreement_has_no_loss_and_disagreement_has(name):
     p = answers(7, 4).softmax(-1)
     same = p[:, None].expand(7, 5, 4)
     other = answers(7, 5, 4, seed=3).softmax(-1)
@@ -120,7 +120,7 @@ def test_the_majority_is_the_mean_of_the_others():
 
 @pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("shape", [(0, 3), (4, 0), (4, 1)])
-def test_few_or_no_neighbours_give_finite_losses_and_slopes(name, shape):
+def test_few_or_no_neighbours_give_finite_losses_and_gradients(name, shape):
     p, n = leaves(answers(shape[0], 3), answers(*shape, 3, seed=1))
     loss = LOSSES[name](p.softmax(-1), n.softmax(-1))
     loss.backward()
@@ -128,7 +128,7 @@ def test_few_or_no_neighbours_give_finite_losses_and_slopes(name, shape):
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_certain_answers_have_finite_slopes(name):
+def test_certain_answers_have_finite_gradients(name):
     p, n = leaves(1e4 * answers(5, 3).float(), 1e4 * answers(5, 4, 3, seed=1).float())
     LOSSES[name](p.softmax(-1), n.softmax(-1)).backward()
     assert torch.isfinite(p.grad).all() and torch.isfinite(n.grad).all()
@@ -147,7 +147,7 @@ def test_neighbours_are_the_nearest_others(n, count, seed):
     torch.testing.assert_close(distances.gather(1, found), expected)
 
 
-def test_points_in_one_place_are_not_their_own_neighbours():
+def test_coincident_points_are_not_their_own_neighbours():
     points = torch.zeros(9, 3)
     points[6:] = torch.tensor([1.0, 0, 0])
     rows = torch.arange(9)
@@ -157,7 +157,7 @@ def test_points_in_one_place_are_not_their_own_neighbours():
     assert (found[:6] < 6).all()
 
 
-def test_neighbours_stay_what_they_were_when_the_points_move():
+def test_neighbours_do_not_change_when_the_points_move():
     points = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
     neighbourhood = identity_losses.Neighbourhood(points)
     before = neighbourhood.nearest(torch.arange(30), 3)

@@ -41,7 +41,7 @@ def label(classes, view, splats, fallback):
     return label_votes.elect(weights, torch.tensor(fallback)).tolist()
 
 
-def test_each_gaussian_gets_the_class_of_the_pixels_that_it_paints():
+def test_each_gaussian_gets_the_class_of_its_pixels():
     view, splats = row_of_blobs()
     assert label(CLASSES, view, splats, [0, 0, 0]) == [0, 2, 1]
 
@@ -79,7 +79,7 @@ def test_encodings_start_at_their_labels_and_learn_the_masks(steps):
     assert steps == 0 or losses[-1] < 0.8 * losses[0]
 
 
-def test_more_classes_than_dimensions_are_no_obstacle():
+def test_more_classes_than_dimensions_are_supported():
     view, splats = row_of_blobs()
     many = {0: 0, 3: 18, 5: 19} | {i: i - 99 for i in range(100, 117)}
     labels, settings = torch.tensor([0, 19, 18]), config.Config().replace(**{"identity.iterations": 1})
@@ -162,7 +162,7 @@ def disagreement(identities, gaussians):
 
 
 @pytest.mark.parametrize("training", ["joint", "detached"])
-def test_identities_beside_the_geometry_learn_the_masks(training):
+def test_identities_trained_with_the_geometry_learn_the_masks(training):
     view, gaussians = wall()
     gaussians.motion_ids = gaussians.motion_ids.roll(40)  # many start with the wrong class
     identities = make_joint(view, gaussians, training, **{"identity.every": 2})
@@ -200,7 +200,7 @@ def test_only_joint_identities_reach_the_geometry(training):
 
 
 @pytest.mark.parametrize("name", ["spatial", "majority"])
-def test_each_loss_in_space_makes_neighbours_agree(name):
+def test_each_spatial_loss_makes_neighbours_agree(name):
     left = {}
     for weight in (0.0, 2.0):
         view, gaussians = wall()
@@ -210,7 +210,7 @@ def test_each_loss_in_space_makes_neighbours_agree(name):
     assert left[2.0] < 0.6 * left[0.0]
 
 
-def test_each_loss_switched_off_leaves_its_part_out():
+def test_each_disabled_loss_is_omitted():
     view, gaussians = wall()
     on = {"identity.spatial": 2.0, "identity.majority": 0.5, "identity.samples": 50}
     values = {}
@@ -238,7 +238,7 @@ def test_only_the_variant_with_extra_losses_uses_the_majority_loss(representatio
     assert (identities.loss(gaussians, posed(gaussians), view, 0) is not None) == active
 
 
-def test_after_the_run_too_neighbours_teach_what_no_pixel_shows():
+def test_neighbours_teach_invisible_gaussians_also_after_the_run():
     view, gaussians = wall()
     truth, wrong = gaussians.motion_ids, torch.arange(300) % 12 == 0
     with torch.no_grad():
@@ -308,7 +308,7 @@ def test_encodings_grow_and_shrink_with_the_gaussians():
 
 
 @pytest.mark.parametrize(("name", "count"), [("identities", 299), ("identity", 300)])
-def test_gaussians_take_only_parameters_that_are_known_and_fit(name, count):
+def test_gaussians_accept_only_known_parameters_of_matching_shape(name, count):
     with pytest.raises(ValueError, match=name):
         wall()[1].add(name, torch.zeros(count, 16))
 
@@ -325,7 +325,7 @@ def test_joint_identities_need_masks_of_objects():
 
 @pytest.mark.parametrize("training", ["joint", "detached"])
 @pytest.mark.parametrize("grown", [False, True])
-def test_identities_go_on_to_the_same_bits(training, grown):
+def test_identities_resume_to_the_same_bits(training, grown):
     """Broken off after 7 steps, with the Gaussians moved since neighbours were looked for, or grown just before."""
     changes = {"identity.spatial": 1.0, "identity.samples": 64, "identity.every": 2}
     view, gaussians = wall()
@@ -359,7 +359,7 @@ def test_pixels_of_the_trained_scene_belong_to_the_objects_of_the_masks(baked, t
     assert metrics.miou(counts) > 0.8
 
 
-def test_members_of_an_object_lie_where_it_is(baked, tiny):
+def test_most_members_of_an_object_lie_near_its_centre(baked, tiny):
     for k in (1, 2):
         members = baked.gaussians.means[baked.gaussians.object_ids == k]
         assert len(members) > 50

@@ -1,4 +1,4 @@
-"""Labels that the masks leave undecided follow what lies around and what moves along; decided ones stay."""
+"""Uncertain labels are decided by neighbours and motion; certain labels do not change."""
 
 import dataclasses
 
@@ -81,7 +81,7 @@ def test_objects_that_touch_keep_their_border_and_thin_ones_survive():
     assert changes == label_cleanup.Changes(gaussians=len(truth))
 
 
-def test_masks_that_miss_an_object_now_and_then_do_not_shrink_it():
+def test_masks_that_sometimes_miss_an_object_do_not_shrink_it():
     points, truth, opacities = scene()
     weights = votes_for(truth, 0.65)
     edge = np.flatnonzero((truth == LEFT) & (points[:, 2] > 0.9) & (points[:, 0] < -0.3))
@@ -112,7 +112,7 @@ def test_unseen_gaussians_take_the_surrounding_label():
     np.testing.assert_array_equal(found[unseen], RIGHT)
 
 
-def test_small_parts_far_from_their_object_go_and_large_ones_stay():
+def test_small_distant_parts_change_their_label_and_large_ones_keep_it():
     points, truth, opacities = scene()
     draw = np.random.default_rng(3)
     for count, expected in ((8, 0), (120, LEFT)):
@@ -124,7 +124,7 @@ def test_small_parts_far_from_their_object_go_and_large_ones_stay():
         np.testing.assert_array_equal(found[-count:], expected)
         np.testing.assert_array_equal(found[:-count], truth)
         assert changes.outliers == (count if expected == 0 else 0)
-        weights[-count:] = [0.1 * PIXELS, 0.9 * PIXELS, 0, 0]  # well supported: where it lies says nothing
+        weights[-count:] = [0.1 * PIXELS, 0.9 * PIXELS, 0, 0]  # well supported, so its position is no evidence
         found, _ = label_cleanup.clean(weights, labels, every, np.full(len(labels), 0.8))
         np.testing.assert_array_equal(found, labels)
 
@@ -141,7 +141,7 @@ def test_undecided_gaussians_take_the_label_that_their_motion_suggests():
         assert (changes.motion > 0) == moves
     unknown, _ = label_cleanup.clean(weights, said, points, opacities)
     assert right[True] > 0.9 and right[False] < 0.8
-    assert (unknown[border] == LEFT).mean() == right[False]  # a scene that stands still says nothing by its motion
+    assert (unknown[border] == LEFT).mean() == right[False]  # in a static scene, motion is no evidence
 
 
 def test_a_halo_that_rests_while_its_object_moves_is_background():
@@ -154,7 +154,7 @@ def test_a_halo_that_rests_while_its_object_moves_is_background():
     assert (told[halo] == 0).sum() > (around == 0).sum()
 
 
-def test_an_outline_that_background_and_object_share_evenly_stays_with_the_background():
+def test_an_outline_shared_evenly_with_the_background_belongs_to_the_background():
     points, truth, opacities = scene()
     rows = np.flatnonzero(truth == LEFT)[:25]
     weights, said = plant(votes_for(truth), truth, rows, 0, 0.501)
@@ -162,7 +162,7 @@ def test_an_outline_that_background_and_object_share_evenly_stays_with_the_backg
     np.testing.assert_array_equal(found, said)
 
 
-def test_faint_gaussians_do_not_come_to_an_object():
+def test_faint_gaussians_are_never_added_to_an_object():
     points, truth, opacities = scene()
     rows = np.flatnonzero(truth == LEFT)[:25]
     weights, said = plant(votes_for(truth), truth, rows, 0, 0.501, pixels=1.0)
@@ -196,7 +196,7 @@ def test_the_numbers_of_the_objects_and_the_order_of_the_gaussians_do_not_matter
     assert same == changes
 
 
-def test_nothing_and_little_are_left_as_they_are():
+def test_empty_and_tiny_inputs_do_not_change():
     for count in (0, 1, 2, 5):
         points = np.arange(3.0 * count).reshape(count, 3)
         weights = np.tile([0.0, 5.0, 0.0], (count, 1))

@@ -26,7 +26,7 @@ def train_to(trainer, iteration):
 
 
 @pytest.mark.parametrize(("training", "broken_at"), [("joint", 20), ("detached", 9)])  # at 20 Gaussians just grew
-def test_identities_go_on_to_the_same_bits_with_the_geometry(tiny, tmp_path, training, broken_at):
+def test_identities_resume_to_the_same_bits_together_with_the_geometry(tiny, tmp_path, training, broken_at):
     unbroken = train_to(make(tiny, training), broken_at)
     checkpoint.save(tmp_path, unbroken.state())
     resumed = make(tiny, training)
@@ -37,7 +37,7 @@ def test_identities_go_on_to_the_same_bits_with_the_geometry(tiny, tmp_path, tra
         assert torch.equal(tensor, states[1].tensors[name]), name
 
 
-def test_detached_identities_leave_the_geometry_as_it_is_and_joint_ones_do_not(tiny):
+def test_detached_identities_do_not_change_the_geometry_and_joint_ones_do(tiny):
     without, detached, joint = (train_to(make(tiny, how), 24) for how in ("off", "detached", "joint"))
     assert "identities" not in without.gaussians.params
     for name, values in without.gaussians.params.items():
@@ -46,7 +46,7 @@ def test_detached_identities_leave_the_geometry_as_it_is_and_joint_ones_do_not(t
 
 
 @pytest.mark.parametrize("training", ["joint", "detached", "off"])
-def test_a_run_hands_its_identities_to_the_scene(tiny, tmp_path, training):
+def test_the_identities_of_a_run_are_stored_in_the_scene(tiny, tmp_path, training):
     settings = tiny_datasets.settings(*CHANGES, f"identity.training={training}")
     finished = run.train(tiny.root, tmp_path / "run", settings)
     scene = bake.bake(tiny_datasets.as_trained(finished), datasets.read(tiny.root))

@@ -1,4 +1,4 @@
-"""Evidence of a body in images: texture shows its turn, masks how much is seen, background images if it is there."""
+"""Evidence of a body in images: rotation from texture, visibility from masks, presence from background images."""
 
 import dataclasses
 
@@ -55,7 +55,7 @@ def stiffness(paint, light=None):
     return evidence.turn_stiffness(seen, triangulation.locate(seen, TIMES, 5e-4), TIMES)[0]
 
 
-def test_texture_leaves_rotations_free_and_its_lack_makes_them_stiff():
+def test_texture_leaves_rotations_free_and_its_absence_makes_them_stiff():
     for matrix in stiffness(checkered):
         assert np.linalg.eigvalsh(matrix)[-1] < 1.5
     for light in (None, [0.4, 0.3, 0.8]):  # shading is no texture: it stays as the ball turns
@@ -63,20 +63,20 @@ def test_texture_leaves_rotations_free_and_its_lack_makes_them_stiff():
             assert np.linalg.eigvalsh(matrix)[0] > 30
 
 
-def test_a_turn_that_does_not_show_is_stiff_about_its_own_axis_alone():
+def test_an_invisible_rotation_is_stiff_only_about_its_own_axis():
     for matrix in stiffness(banded):
         values, axes = np.linalg.eigh(matrix)
         assert abs(axes[2, -1]) > 0.98 and values[-1] > 5 * values[1]
 
 
-def test_stiffness_grows_as_less_is_seen_up_to_a_limit():
+def test_stiffness_grows_as_less_is_visible_up_to_a_limit():
     found = evidence.shift_stiffness(np.array([[1.0, 0.5, 0.1, 0.0]]))[0]
     assert found.tolist() == [1.0, 2.0, 10.0, evidence.STIFFEST]
 
 
 @pytest.mark.parametrize(("shown", "gone"), [(False, True), (True, False)])
 def test_an_object_without_masks_is_absent_only_if_its_place_looks_empty(shown, gone):
-    """Before time 0.5 no mask shows the ball: either it is not there, or it is not marked yet."""
+    """Before time 0.5 no mask shows the ball: either it is absent, or it is not marked."""
     path = np.array([-0.8, 0.0, 0.3]) + TIMES[:, None] * np.array([1.6, 0.2, 0.0])
     seen = [
         ball_view(c, t, p, checkered, marked=t >= 0.5, shown=shown or t >= 0.5)
@@ -89,7 +89,7 @@ def test_an_object_without_masks_is_absent_only_if_its_place_looks_empty(shown, 
     assert found[0].tolist() == [gone, gone, False, False, False]
 
 
-def test_an_object_that_rests_unmarked_is_not_absent_though_it_always_looked_so():
+def test_an_unmarked_resting_object_is_not_absent():
     seen = [ball_view(c, t, [0, 0, 0.3], checkered, marked=t > 0.6) for t in TIMES for c in ring()]
     places = triangulation.locate(seen, TIMES, 5e-4)
     assert not evidence.absent(seen, places, TIMES).any()
@@ -124,7 +124,7 @@ def test_knots_are_the_observed_times():
     assert initialize.observed_times(alone).tolist() == [0.0, 0.01, 0.011, 0.5]
 
 
-def test_cameras_a_little_out_of_step_share_their_knots():
+def test_cameras_with_slightly_different_times_share_their_knots():
     shifts = [0.0, 0.001, -0.002, 0.003]
     seen = [at(c, 0.1 * k + shift) for k in range(1, 9) for c, shift in zip(ring(), shifts, strict=True)]
     knots = initialize.observed_times(seen)
@@ -132,7 +132,7 @@ def test_cameras_a_little_out_of_step_share_their_knots():
     np.testing.assert_allclose(knots[1:-1], 0.1 * np.arange(2, 8) + 0.0005, atol=1e-9)
 
 
-def test_too_many_times_give_knots_among_them_where_they_are_dense():
+def test_too_many_times_are_thinned_to_knots_among_them():
     times = np.concatenate([np.linspace(0, 0.2, 300), np.linspace(0.3, 1, 100)])
     knots = initialize.observed_times([at(ring()[0], t) for t in times], limit=40)
     assert len(knots) == 40 and np.isin(knots, np.round(times, 9)).all() and (np.diff(knots) > 0).all()

@@ -1,4 +1,4 @@
-"""The plane sweep finds a textured floor, and nothing where there is nothing to find."""
+"""The plane sweep finds a textured floor, and nothing in images without texture or parallax."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ NO_PLACES = triangulation.Places(
 
 
 def floor_views(count=5, seed=0):
-    """Cameras on an arc that see nothing but a textured floor at z = 0, painted by intersecting their rays with it."""
+    """Cameras on an arc that see only a textured floor at z = 0, painted by intersecting their rays with it."""
     texture = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=(160, 160, 3)), (1.8, 1.8, 0))
     texture = np.clip(0.5 + 0.9 * texture / np.abs(texture).max(), 0, 1)
     seen = []
@@ -46,7 +46,7 @@ def floor():
 
 
 def constant_views():
-    """Cameras on an arc that see nothing but one colour."""
+    """Cameras on an arc that see only one colour."""
     image = np.tile(np.array([120, 160, 220], np.uint8), (36, 48, 1))
     return [
         train_views.TrainView(f"v{k}", scenes.orbit_camera(0.4 * k, 48, 36), 0.0, image, None, None) for k in range(5)
@@ -151,7 +151,7 @@ def test_no_plane_carries_scattered_points():
     assert initialize.supporting_plane(scattered[:10], NO_PLACES, eyes, rng) is None
 
 
-def test_the_support_is_what_its_points_outline():
+def test_the_supporting_area_is_outlined_by_its_points():
     rng = np.random.default_rng(1)
     normal = np.array([0.2, -0.3, 1.0]) / np.linalg.norm([0.2, -0.3, 1.0])
     axes = np.linalg.svd(normal[None])[2][1:]
@@ -171,7 +171,7 @@ def test_too_few_points_support_nothing():
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 8])
-def test_a_background_image_is_the_median_of_the_free_pixels_however_it_is_cut_into_bands(monkeypatch, count):
+def test_a_background_image_is_the_median_of_the_free_pixels_for_any_number_of_bands(monkeypatch, count):
     rng = np.random.default_rng(count)
     images = rng.integers(0, 256, (count, 11, 7, 3)).astype(np.uint8)
     free = rng.random((count, 11, 7)) < 0.6
@@ -184,7 +184,7 @@ def test_a_background_image_is_the_median_of_the_free_pixels_however_it_is_cut_i
     assert (background_images._median(list(images), free) == found).all()
 
 
-def test_depths_are_found_the_same_however_rays_are_cut_into_bands(floor, monkeypatch):
+def test_depths_do_not_depend_on_the_number_of_bands(floor, monkeypatch):
     whole = plane_sweep.Sweep(background_images.compute(floor), 150, 48)
     monkeypatch.setattr(plane_sweep, "COST_VALUES", 1)
     cut = plane_sweep.Sweep(background_images.compute(floor), 150, 48)
@@ -193,7 +193,7 @@ def test_depths_are_found_the_same_however_rays_are_cut_into_bands(floor, monkey
         assert (ours.depths == theirs.depths).mean() > 0.99
 
 
-def test_images_of_another_size_have_a_background_image_of_their_own(floor):
+def test_images_of_another_size_have_their_own_background_image(floor):
     view = floor[0]
     cut = dataclasses.replace(view, camera=dataclasses.replace(view.camera, height=20), image=view.image[:20])
     found = background_images.compute([view, cut, view])

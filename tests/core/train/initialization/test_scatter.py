@@ -1,4 +1,4 @@
-"""Points at random where cameras look."""
+"""Random points in the view of the cameras."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ def test_every_point_is_seen_by_two_cameras(tiny):
     assert seen.min() >= 2
 
 
-def test_a_run_may_start_from_points_at_random_without_the_masks_help(tiny):
+def test_a_run_may_start_from_random_points_without_masks(tiny):
     trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings(*RANDOM))
     assert len(trainer.gaussians) == 300 and (trainer.gaussians.motion_ids == 0).all()
     while not trainer.done:
         trainer.step()
 
 
-def test_tracks_do_not_start_from_points_at_random():
+def test_tracks_do_not_start_from_random_points():
     with pytest.raises(ConfigError, match="init.placement"):
         config.load(None, ["init.placement='random'"])
 
 
-def test_points_of_a_reconstruction_become_background_where_no_object_is(tiny):
+def test_points_of_a_reconstruction_outside_objects_become_background(tiny):
     trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings("train.iterations=4"))
     rng = np.random.default_rng(0)
     floor = np.concatenate([rng.uniform(-0.2, 0.2, (50, 2)) + [1.4, 1.4], np.zeros((50, 1))], 1)

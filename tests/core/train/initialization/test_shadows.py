@@ -1,4 +1,4 @@
-"""The light's direction is read from where the support darkens."""
+"""The light's direction is estimated from the darkening of the supporting plane."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ TIMES = np.linspace(0, 1, 7)
 
 
 def shadowed_views(light, darkness=0.4, radius=0.25):
-    """A plain floor on which the shadow of one body falls that moves above it, and the places of the body."""
+    """A plain floor with the shadow of a body that moves above it, and the positions of the body."""
     path = np.stack([np.linspace(-0.8, 0.8, 7), 0.3 * np.sin(4 * TIMES), 0.5 + 0.4 * np.cos(3 * TIMES)], -1)
     seen = []
     for k in range(4):
@@ -44,7 +44,7 @@ def test_the_direction_of_the_light_is_found():
         assert found.darkening > 0.1
 
 
-def test_without_shadows_light_is_taken_to_fall_straight_down():
+def test_without_shadows_the_light_is_assumed_vertical():
     found = find(*shadowed_views(np.array([0.0, 0.6, -0.8]), darkness=0.0))
     assert found.darkening == 0 and np.array_equal(found.direction, [0, 0, -1])
 

@@ -19,7 +19,7 @@ def gradient(directions):
     return np.array([0.8, 0.7, 0.6]) * (1 - 0.5 * height**2) + np.array([-0.1, 0.0, 0.2]) * height
 
 
-def test_a_gradient_sky_is_fitted_and_what_stands_before_it_is_not_sky():
+def test_a_gradient_sky_is_fitted_and_objects_in_front_are_not_sky():
     directions = rays()
     colors = gradient(directions)
     house = (directions[:, 0] > 0.6) & (directions[:, 2] < 0.5)

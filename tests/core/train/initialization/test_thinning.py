@@ -1,4 +1,4 @@
-"""A cap below what was placed leaves the same share of every group and covers the same surface."""
+"""A cap below the number of initial points keeps the same share of every group and covers the same surface."""
 
 import math
 
@@ -16,7 +16,7 @@ from tests.support import tiny_datasets
 
 
 def gaussians(counts):
-    """Gaussians of as many groups as there are counts; the first coordinate of a mean is its row."""
+    """Gaussians of one group per count; the first coordinate of a mean is its row."""
     n = sum(counts)
     params = {
         "means": torch.arange(n).float()[:, None].repeat(1, 3),
@@ -57,7 +57,7 @@ def test_thinning_does_not_enlarge_wide_gaussians():
     assert torch.equal(after.log_scales, before.log_scales[:10])
 
 
-def test_few_enough_are_left_alone_and_use_up_no_draw():
+def test_few_gaussians_are_not_thinned_and_use_no_random_numbers():
     few, rng = gaussians([3, 4]), np.random.default_rng(1)
     assert thinning.thin(few, 7, rng) is few
     assert rng.random() == np.random.default_rng(1).random()

@@ -1,4 +1,4 @@
-"""Objects are where their masks say, as far as masks can say it."""
+"""Positions of objects from the rays of their masks."""
 
 import dataclasses
 
@@ -42,7 +42,7 @@ def test_centres_of_moving_balls_are_found_to_a_fraction_of_a_percent():
     np.testing.assert_allclose(places.radii, [0.3, 0.2], rtol=0.15)
 
 
-def test_objects_of_the_tiny_set_are_found_from_drawn_masks(tiny):
+def test_objects_of_the_tiny_data_set_are_found_from_its_masks(tiny):
     dataset = datasets.read(tiny.root)
     norm = normalization.from_cameras([v.camera for v in dataset.train])
     places = triangulation.locate(train_views.load(dataset, norm, None), tiny_datasets.OBSERVED, 5e-4)
@@ -56,7 +56,7 @@ def test_objects_of_the_tiny_set_are_found_from_drawn_masks(tiny):
         assert np.linalg.norm(moved - truly, axis=-1).max() < 0.01 * distance
 
 
-def test_a_mask_that_something_hides_in_part_is_outvoted():
+def test_a_partly_hidden_mask_is_outvoted():
     center = np.array([0.2, 0.1, 0.3])
     seen = [disc_view(c, 0.0, [(1, center, 0.4)]) for c in ring(7)]
     hidden = seen[0].mask.copy()
@@ -111,7 +111,7 @@ def largest_error(places, truth, where=slice(None)):
     return np.linalg.norm(places.centers[0] - truth, axis=-1)[where].max()
 
 
-def test_one_camera_per_time_suffices_where_cameras_take_turns():
+def test_one_camera_per_time_suffices_if_cameras_alternate():
     times = np.linspace(0, 1, 15)
     looking = ring(5)
     seen = [disc_view(looking[2 * s % 5], t, [(1, throw(t), 0.3)]) for s, t in enumerate(times)]
@@ -120,7 +120,7 @@ def test_one_camera_per_time_suffices_where_cameras_take_turns():
     assert largest_error(places, throw(times)) < 0.05
 
 
-def test_a_path_goes_on_smoothly_while_the_object_is_hidden():
+def test_a_path_continues_smoothly_while_the_object_is_hidden():
     times = np.linspace(0, 1, 12)
     hidden = slice(4, 8)
     seen = [
@@ -146,7 +146,7 @@ def test_before_the_first_mask_and_after_the_last_one_the_velocity_is_kept():
     assert largest_error(places, path) < 0.04
 
 
-def test_an_object_that_enters_the_frame_is_not_where_its_first_sliver_shows():
+def test_an_object_that_enters_the_frame_is_not_placed_at_its_first_visible_sliver():
     times = np.linspace(0, 1, 9)
     looking = [scenes.orbit_camera(a) for a in (0.0, 0.25, -0.25)]
     path = np.array([0.0, -2.2, 0.3]) + times[:, None] * np.array([0.0, 1.9, 0.0])
@@ -184,14 +184,14 @@ def test_masks_with_ragged_borders_leave_the_centre_where_it_is(pixels):
     assert places.measured.all() and largest_error(places, throw(times)) < 0.02
 
 
-def test_equal_cameras_give_no_depth_but_no_failure_either():
+def test_equal_cameras_give_no_depth_and_no_error():
     seen = [disc_view(ring()[0], t, [(1, [0, 0, 0.3], 0.3)]) for t in TIMES for _ in range(2)]
     places = triangulation.locate(seen, TIMES, 5e-4)
     assert np.isfinite(places.centers).all() and np.isfinite(places.radii).all()
 
 
 @pytest.mark.parametrize("mask", [None, np.zeros((72, 96), np.int32), np.full((72, 96), -1, np.int32)])
-def test_without_masked_objects_there_are_no_places(mask):
+def test_without_masked_objects_there_are_no_positions(mask):
     seen = [dataclasses.replace(disc_view(c, 0.0, []), mask=mask) for c in ring()]
     places = triangulation.locate(seen, TIMES[:1], 5e-4)
     assert places.centers.shape == (0, 1, 3) and places.visibility.shape == (0, 1) and len(places.radii) == 0

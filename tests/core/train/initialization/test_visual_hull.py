@@ -1,4 +1,4 @@
-"""Points carved from masks lie in every mask, and something comes back even where nothing can be carved."""
+"""Points carved from masks lie in every mask, and a small ball replaces an empty hull."""
 
 import dataclasses
 
@@ -70,7 +70,7 @@ def test_views_that_lack_the_objects_id_do_not_outvote_those_that_have_it(tiny, 
     assert (colors.max(1) > 0.05).all()
 
 
-def test_a_ball_that_nothing_agrees_on_has_the_objects_mean_colour(posed):
+def test_a_fallback_ball_has_the_mean_colour_of_the_object(posed):
     seen, _, _ = posed
     painted = [
         dataclasses.replace(v, image=np.full_like(v.image, [90, 150, 30]), mask=np.where(v.mask == 1, 5, 0))
@@ -80,7 +80,7 @@ def test_a_ball_that_nothing_agrees_on_has_the_objects_mean_colour(posed):
     np.testing.assert_allclose(colors, np.tile([90, 150, 30], (40, 1)) / 255, atol=1e-6)
 
 
-def test_without_any_agreement_a_small_ball_is_the_start(posed):
+def test_without_any_agreement_the_object_starts_as_a_small_ball(posed):
     seen, _, _ = posed
     points, colors = carve(seen, 9, np.array([0.1, 0.2, 0.3]), count=50)
     assert points.shape == (50, 3) and np.isfinite(colors).all()

@@ -33,7 +33,7 @@ FIELD = (
 )
 
 
-# Motion is hardly fitted before the first image: for what holds however well it fits.
+# Motion is hardly fitted before the first image: for properties that do not depend on the quality of the fit.
 UNFITTED = ("field.place_steps=3", "field.trd_steps=3")
 
 
@@ -62,7 +62,7 @@ def scene(made, tiny):
     return bake.bake(tiny_datasets.as_trained(made), datasets.read(tiny.root))
 
 
-def test_times_in_the_unit_interval_are_used_as_they_are_and_others_brought_there():
+def test_times_are_normalised_to_the_unit_interval_unless_they_are_in_it():
     assert Clock.of(np.linspace(0, 0.75, 5))(0.3) == 0.3
     seconds = Clock.of(np.array([12.0, 15.0, 20.0]))
     assert seconds(12.0) == 0 and seconds(20.0) == 1
@@ -89,7 +89,7 @@ def test_gaussians_without_object_stay_still_to_the_bit(tiny):
     assert len(everything.motion.movers(everything.gaussians)) == len(everything.gaussians)
 
 
-def test_places_of_the_masks_are_learned_before_the_first_image(tiny):
+def test_positions_from_masks_are_learned_before_the_first_image(tiny):
     trainer = make(tiny, "field.place_steps=120")
     motion = trainer.motion
     motion.begin(trainer.gaussians, trainer.generator)
@@ -102,7 +102,7 @@ def test_places_of_the_masks_are_learned_before_the_first_image(tiny):
     np.testing.assert_allclose(moved.numpy(), expected, atol=0.12)
 
 
-def test_only_the_true_twist_carries_the_other_gaussians_of_a_body_too():
+def test_only_the_true_twist_also_moves_the_other_gaussians_of_a_body():
     """Velocities of a spinning body can be put into translations that depend on the place; the cross loss sees that."""
     draw = torch.Generator().manual_seed(0)
     motion = field._motion_of(np.linspace(0, 0.75, 6), tiny_datasets.settings(*FIELD))
@@ -142,7 +142,7 @@ def test_a_resumed_field_ends_with_the_same_numbers(tiny, tmp_path, overrides):
             assert torch.equal(tensor, expected.tensors[name]), (k, name)
 
 
-def test_a_field_may_start_from_tracks_and_moves_as_they_did(tiny):
+def test_a_field_that_starts_from_tracks_has_their_motion(tiny):
     trainer = make(
         tiny, "field.tracks_share=0.98", "field.distill_steps=200", "train.iterations=61", "densify.start=1000"
     )
@@ -181,7 +181,7 @@ def test_the_baked_scene_is_valid_and_renders_like_the_trained_state(made, scene
         assert np.abs(shown.clip(0, 1) - expected.clip(0, 1)).mean() < 2e-3
 
 
-def test_mode_standard_goes_on_as_the_trained_dynamics_do(made, scene):
+def test_mode_standard_follows_the_trained_dynamics(made, scene):
     trainer = Trainer(datasets.read(made.dataset_root), made.config)
     trainer.restore(checkpoint.load(made.folder))
     for t in (0.75, 0.9):
@@ -208,7 +208,7 @@ def test_without_masks_the_networks_move_everything_at_first(tmp_path):
     ("off", "still"),
     [("losses.rigid=0", "rigid"), ("identity.spatial=0.0", "spatial"), ("identity.majority=0.0", "majority")],
 )
-def test_each_loss_of_the_paper_changes_the_run_that_has_it(tiny, off, still):
+def test_each_loss_of_the_paper_changes_the_run(tiny, off, still):
     paper = (
         "field.variant='r5dgs_extra'",
         "identity.training='joint'",
@@ -361,7 +361,7 @@ def test_disabled_motion_does_not_return_as_residuals(made, tiny):
 
 
 def test_baking_a_field_regroups_gaussians_by_motion_and_stores_their_number(made, scene, tiny):
-    """A third of the brick was made for the ball; nobody but their motion says what they belong to."""
+    """A third of the brick was created for the ball; only motion shows where these Gaussians belong."""
     data, state = datasets.read(tiny.root), checkpoint.load(made.folder)
     ids = state.tensors["gaussians.motion_ids"]
     wrong = (ids == tiny_datasets.BRICK).nonzero()[::3, 0]

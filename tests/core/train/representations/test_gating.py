@@ -1,4 +1,4 @@
-"""Gaussians that a field is found not to move are set still exactly, where they are."""
+"""Gaussians that the field does not move become exactly static at their mean state."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def some_gaussians(n: int, size: float = 0.05) -> Gaussians:
     return Gaussians(params, torch.full((n,), 3))
 
 
-def test_only_what_leaves_its_place_goes_on_moving():
+def test_only_gaussians_that_move_stay_in_the_networks():
     gaussians = some_gaussians(7)
     shift, turn, stretch = torch.zeros(3, 7)
     shift[1], shift[2] = 0.001, 1.0
@@ -83,7 +83,7 @@ def make(data, *overrides) -> Trainer:
     return Trainer(datasets.read(data.root), tiny_datasets.settings(*SHORT, *overrides))
 
 
-def test_the_picture_does_not_jump_and_what_rests_is_never_evaluated_again(unmasked):
+def test_the_picture_does_not_jump_and_resting_gaussians_are_never_evaluated_again(unmasked):
     trainer = make(unmasked, "field.still=0.0")
     while not trainer.done:
         trainer.step()
@@ -107,7 +107,7 @@ def test_the_picture_does_not_jump_and_what_rests_is_never_evaluated_again(unmas
     assert (trainer.gaussians.motion_ids[-3:] == 0).all()
 
 
-def test_the_gate_closes_once_every_time_takes_part_and_a_resumed_run_goes_through_it_alike(unmasked, tmp_path):
+def test_the_gate_closes_once_every_time_takes_part_and_a_resumed_run_does_the_same(unmasked, tmp_path):
     overrides = ("field.still=0.0027", "field.gate=0.5", "field.calm=0.0")
     trainer = make(unmasked, *overrides)
     states = {}

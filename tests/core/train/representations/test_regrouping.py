@@ -1,4 +1,4 @@
-"""Gaussians go with the group that explains their motion; what none explains is counted, and shadows follow."""
+"""Gaussians move to the group that explains their motion, unexplained ones are counted, and shadows follow."""
 
 import numpy as np
 import pytest
@@ -123,7 +123,7 @@ def test_neither_size_nor_place_of_the_world_matters(scale):
     assert one[2] == other[2] and one[2].moved > 20
 
 
-def test_once_tidied_nothing_moves_any_more():
+def test_regrouping_twice_changes_nothing():
     path, ids, opacities = scene()
     draw = np.random.default_rng(3)
     start = np.where(draw.random(len(ids)) < 0.15, draw.integers(0, 4, len(ids)), ids)
@@ -133,7 +133,7 @@ def test_once_tidied_nothing_moves_any_more():
     assert moves.moved > 0 and still.moved == 0
 
 
-def test_blocks_change_nothing(monkeypatch):
+def test_the_number_of_blocks_has_no_effect(monkeypatch):
     path, ids, opacities = scene()
     start = np.roll(ids, 17)
     expected = tidy(path, start, opacities)
@@ -143,7 +143,7 @@ def test_blocks_change_nothing(monkeypatch):
     assert found[2] == expected[2]
 
 
-def test_groups_without_members_take_and_give_nothing():
+def test_groups_without_members_are_ignored():
     path, ids, opacities = scene()
     keep = ids != RIGHT
     found, groups, moves = tidy(path[keep], ids[keep], opacities[keep])
@@ -153,7 +153,7 @@ def test_groups_without_members_take_and_give_nothing():
     assert len(nobody[0]) == 0 and nobody[2].moving == 0
 
 
-def test_a_shadow_follows_its_caster_unless_it_stayed_behind_at_the_end():
+def test_a_shadow_follows_its_caster_unless_it_rests_at_the_end():
     path, ids, opacities = scene()
     mine = ids == SHADOW
     assert field_to_groups.follows(
@@ -168,7 +168,7 @@ def test_a_shadow_follows_its_caster_unless_it_stayed_behind_at_the_end():
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.9])
-def test_the_floor_imitates_a_shadow_where_it_moves_as_the_light_would_have_it(turn):
+def test_floor_gaussians_imitate_a_shadow_if_they_move_like_one(turn):
     path, ids, opacities = scene()
     floor = carried(np.random.default_rng(4).uniform([-3, -3, 0], [3, 3, 0], (50, 3)), 0)
     path, opacities = np.concatenate([path, floor]), np.append(opacities, np.full(50, 0.9))

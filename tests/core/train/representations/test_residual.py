@@ -1,4 +1,4 @@
-"""Objects that bend or breathe are found by trying, keep residuals that play, and others are left without a trace."""
+"""A trial finds objects that bend; these get residuals that play, and other objects do not change."""
 
 import json
 import shutil
@@ -106,7 +106,7 @@ def test_rigid_gaussians_follow_their_track():
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-4, 0.4, 2.0])
-def test_the_turn_of_a_rotation_is_that_rotation(angle):
+def test_a_rotation_matrix_gives_back_its_quaternion(angle):
     quat = rotations.rotvecs_to_quats(torch.tensor([[0.6, -0.64, 0.48]], dtype=torch.float64) * angle)
     found = residual_field._turn(rotations.quats_to_rotmats(quat))
     torch.testing.assert_close(found, quat, atol=1e-12, rtol=0)
@@ -136,7 +136,7 @@ def test_nodes_spread_over_each_body_and_strays_carry_none():
     assert field_on(means, ids, weights, (1, 9)).bodies == [1]
 
 
-def test_a_field_of_no_body_changes_nothing():
+def test_a_field_without_bodies_changes_nothing():
     means, quats, weights, ids = random_state()
     field = field_on(means, ids, weights).only([])
     assert field.bodies == [] and len(field.change(means, quats, weights, ids, {0: 1.0}).rows) == 0
@@ -195,7 +195,7 @@ def test_bodies_are_tried_once_all_times_take_part():
     assert residual_trial.decision_step(settings, 1000) is None
 
 
-def test_values_that_no_run_can_use_are_refused():
+def test_unusable_values_are_refused():
     with pytest.raises(ConfigError, match=r"residual\.start: expected 0 to 1"):
         config.load(None, ["residual.start=1.5"])
 
@@ -225,7 +225,7 @@ def test_a_trial_that_finds_nothing_leaves_no_trace(tiny):
     assert (tried.queue, tried.running_loss, tried.entered) == (plain.queue, plain.running_loss, plain.entered)
 
 
-def test_a_trial_that_fails_leaves_the_run_alone(tiny, monkeypatch):
+def test_a_failed_trial_does_not_change_the_run(tiny, monkeypatch):
     trainer = advance(make(tiny, "train.iterations=60"), 23)
     step = type(trainer).step
 
@@ -240,7 +240,7 @@ def test_a_trial_that_fails_leaves_the_run_alone(tiny, monkeypatch):
     assert trainer.state().tensors["residual.gains"].isnan().all()
 
 
-def test_nothing_is_tried_where_one_time_alone_was_observed(tiny, tmp_path):
+def test_nothing_is_tried_with_a_single_observed_time(tiny, tmp_path):
     shutil.copytree(tiny.root, tmp_path / "still")
     path = tmp_path / "still" / "transforms_train.json"
     content = json.loads(path.read_text())
@@ -296,7 +296,7 @@ def error_on_the_ball(trainer, data):
     return total
 
 
-def test_residuals_bring_the_images_of_what_breathes_closer(breathing):
+def test_residuals_improve_the_images_of_a_breathing_object(breathing):
     data, done, _ = breathing
     bent = make(data, *SETTINGS)
     bent.restore(checkpoint.load(done.folder))
@@ -304,7 +304,7 @@ def test_residuals_bring_the_images_of_what_breathes_closer(breathing):
     assert error_on_the_ball(bent, data) < 0.7 * error_on_the_ball(rigid, data)
 
 
-def test_the_ball_grows_and_shrinks_as_it_did(breathing):
+def test_the_ball_grows_and_shrinks_as_in_the_data(breathing):
     data, _, scene = breathing
     rows = scene.residuals.rows
     arms = scene.gaussians.means[rows] - scene.groups[BALL].pivot
@@ -365,7 +365,7 @@ def states(breathing, request):
 
 
 @pytest.mark.parametrize("k", [0, 1])
-def test_a_run_with_residuals_goes_on_to_the_same_bits(breathing, states, tmp_path, k):
+def test_a_run_with_residuals_resumes_to_the_same_bits(breathing, states, tmp_path, k):
     settings, found = states
     checkpoint.save(tmp_path, found[k])
     trainer = make(breathing[0], *settings)

@@ -1,4 +1,4 @@
-"""Rigid motions of objects are free, everything else costs; representatives do not depend on chance."""
+"""Rigid motions of objects have no loss, all other changes do; representatives are deterministic."""
 
 import pytest
 import torch
@@ -88,7 +88,7 @@ def test_growth_costs_the_mean_power_of_the_change_of_distance(form, power):
 
 
 @FORMS
-def test_slopes_are_those_of_the_value_and_reach_only_the_later_state(form):
+def test_gradients_match_the_loss_and_reach_only_the_later_state(form):
     means, labels, opacities = cloud(14, classes=3)
     anchors = rigidity.anchors(means, labels, opacities)
     assert len(set(anchors.tolist())) == 3
@@ -102,7 +102,7 @@ def test_slopes_are_those_of_the_value_and_reach_only_the_later_state(form):
 @FORMS
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("collapsed", ["before", "after", "both"])
-def test_members_on_their_representative_have_finite_slopes(dtype, collapsed, form):
+def test_members_on_their_representative_have_finite_gradients(dtype, collapsed, form):
     means, labels, opacities = cloud(12, classes=3)
     anchors = rigidity.anchors(means, labels, opacities)
     points = torch.zeros(12, 3, dtype=dtype)
@@ -114,7 +114,7 @@ def test_members_on_their_representative_have_finite_slopes(dtype, collapsed, fo
 
 
 @FORMS
-def test_without_members_there_is_no_loss_and_no_slope(form):
+def test_without_members_there_is_no_loss_and_no_gradient(form):
     for anchors in (torch.full((5,), -1), torch.arange(5), torch.zeros(0, dtype=torch.int64)):
         after = torch.randn(len(anchors), 3, requires_grad=True)
         loss = rigidity.rigidity(after.detach() + 1, after, anchors, form)
@@ -123,7 +123,7 @@ def test_without_members_there_is_no_loss_and_no_slope(form):
 
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])
-def test_the_loss_holds_an_object_together_that_something_else_pulls_apart(weight):
+def test_the_loss_holds_together_an_object_that_is_pulled_apart(weight):
     means, labels, opacities = cloud(40, classes=2)
     anchors = rigidity.anchors(means, labels, opacities)
     target = rigid_motion(means, labels) + 0.3 * cloud(40, seed=7)[0]

@@ -1,4 +1,4 @@
-"""Colours that turn with their body in fixed light."""
+"""Colours of bodies that rotate in fixed light."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from r5dgs_core.motion import rotations
 from r5dgs_core.train.representations import shading
 
 
-def test_a_new_state_keeps_every_colour_also_of_what_is_unlit_in_it():
+def test_a_new_bind_state_keeps_every_colour_including_unlit_ones():
     draws = np.random.default_rng(4)
     n, light = 60, np.array([0.3, -0.5, 0.8])
     sh, vectors = draws.normal(size=(n, 4, 3)), 1.5 * draws.normal(size=(n, 3))
@@ -28,7 +28,7 @@ def test_a_new_state_keeps_every_colour_also_of_what_is_unlit_in_it():
         np.testing.assert_allclose(bands[1] * after[:, None, None], bands[0] * before[:, None, None], atol=1e-9)
 
 
-def test_one_rotation_for_each_is_that_rotation_for_all_where_they_are_equal():
+def test_equal_rotations_per_gaussian_equal_one_rotation_for_all():
     draws = np.random.default_rng(5)
     sh, vectors, light = draws.normal(size=(6, 1, 3)), 0.1 * draws.normal(size=(6, 3)), np.array([0.2, 0.1, 1.0])
     turn = rotations.normalize(draws.normal(size=4))

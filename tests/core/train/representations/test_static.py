@@ -84,7 +84,7 @@ def test_small_motion_is_detected(still, tiny):
     assert not static.nothing_moves([*at_rest[:-1], dataclasses.replace(at_rest[-1], image=changed)])
 
 
-def test_cameras_that_show_one_time_each_leave_it_open(still):
+def test_cameras_that_show_one_time_each_leave_motion_undecided(still):
     seen = train_views(still)
     one_each = [next(v for v in seen if v.camera is not None and v.t == t) for t in sorted({v.t for v in seen})]
     turned = [

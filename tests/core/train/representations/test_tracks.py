@@ -1,4 +1,4 @@
-"""Tracks in training: how knots start, what absent bodies show, and motion while masks are missing."""
+"""Tracks in training: start of knots, absent bodies, and motion while masks are missing."""
 
 from types import SimpleNamespace
 
@@ -91,7 +91,7 @@ def test_velocity_continues_without_masks_and_follows_masks_if_absent():
         np.testing.assert_allclose(motion.tracks.params["translations"][1, 6].detach().numpy(), expected, atol=1e-5)
 
 
-def test_absent_bodies_and_their_shadows_are_not_drawn_and_learn_nothing_then():
+def test_absent_bodies_and_their_shadows_are_neither_drawn_nor_trained():
     motion = make([1] * 7, [1, 1, 0, 0, 0, 0, 0])
     params = {
         "means": torch.zeros(3, 3),
@@ -112,7 +112,7 @@ def test_absent_bodies_and_their_shadows_are_not_drawn_and_learn_nothing_then():
     assert gaussians.params["opacity_logits"].grad.tolist() == [0.25, 0, 0]
 
 
-def test_a_restored_run_goes_on_with_the_same_knots():
+def test_a_restored_run_continues_with_the_same_knots():
     motion, other = make([1] * 7), make([1] * 7)
     grow(motion, 3, 3)
     other.restore(motion.tensors())
@@ -144,7 +144,7 @@ def train(data, *overrides):
     return trainer
 
 
-def test_an_object_whose_masks_come_late_is_followed_through_the_images_before(tmp_path):
+def test_an_object_with_late_masks_is_tracked_in_earlier_images(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path)
     erase(data, tiny_datasets.BALL, 0.4)
     trainer = train(data)
@@ -153,7 +153,7 @@ def test_an_object_whose_masks_come_late_is_followed_through_the_images_before(t
     assert path_error(trainer, data, tiny_datasets.BALL, 0.0) < 0.2  # 0.9 away from where it is first marked
 
 
-def test_an_object_that_comes_late_is_as_solid_as_one_that_was_always_there(tmp_path):
+def test_an_object_that_appears_late_is_as_opaque_as_one_that_is_always_present(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path, ball_from=0.6)
     trainer = train(data)
     assert trainer.motion._absent[1].tolist() == [True] * 4 + [False] * 2
