@@ -1,5 +1,6 @@
 """Search for a Python that can run the worker: candidate paths, and a check for the required packages."""
 
+import importlib.machinery
 import logging
 import os
 import shutil
@@ -7,12 +8,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from .process_group import ProcessGroup
 
-NEEDED = ("numpy", "torch", "numba")
+NEEDED = ("numpy", "numba")  # for pictures
+WANTED = ("torch",)  # for text encoders and GPUs
 OLDEST = (3, 11)
 TIMEOUT_S = 20.0
 LOOK_S = 0.05  # polling interval of the stop callback
@@ -21,7 +23,7 @@ CHECK = f"""
 import importlib.util, sys
 if sys.version_info < {OLDEST}:
     sys.exit("Python {OLDEST[0]}.{OLDEST[1]} or newer is needed")
-missing = [name for name in {NEEDED} if importlib.util.find_spec(name) is None]
+missing = [name for name in sys.argv[1:] if importlib.util.find_spec(name) is None]
 sys.exit("lacks " + ", ".join(missing) if missing else 0)
 """
 FOLDERS = (".venv", "venv", "env")
@@ -31,12 +33,28 @@ CONDAS = ("miniconda3", "anaconda3", "miniforge3", "mambaforge", "micromamba")
 log = logging.getLogger(__name__)
 
 
-def environment() -> dict[str, str]:
-    """Environment for another Python: this process's, without the variables that Blender sets for its own."""
+def environment(python: str = "") -> dict[str, str]:
+    """Environment for a Python: this process's, without the variables that Blender sets for its own.
+
+    Blender's own Python gets the folder of numba as ``PYTHONPATH``, because Blender adds the packages of extensions to
+    its search path only while it runs.
+
+    Args:
+        python: Path of the executable.
+    """
     result = dict(os.environ)
     for name in ("PYTHONHOME", "__PYVENV_LAUNCHER__"):
         result.pop(name, None)
+    spec = importlib.machinery.PathFinder.find_spec("numba") if is_own(python) else None
+    if spec is not None and spec.origin:
+        known = result.get("PYTHONPATH", "")
+        result["PYTHONPATH"] = str(Path(spec.origin).parents[1]) + (os.pathsep + known if known else "")
     return result
+
+
+def is_own(python: str) -> bool:
+    """Return True for the path of Blender's own Python."""
+    return bool(python and sys.executable) and Path(python) == Path(sys.executable)
 
 
 def candidates(beside: list[Path], home: Path | None = None) -> Iterator[str]:
@@ -60,30 +78,39 @@ def candidates(beside: list[Path], home: Path | None = None) -> Iterator[str]:
 
 
 def find(beside: list[Path], home: Path | None = None, stopped: Callable[[], bool] = lambda: False) -> str | None:
-    """Return the first of `candidates` that has the required packages, or None.
+    """Return the first of `candidates` that also has the packages for encoders, or else one that can draw, or None.
 
     Args:
         beside: As for `candidates`.
         home: As for `candidates`.
         stopped: Callback that returns True to abort the search; polled repeatedly.
     """
+    able = None
     for python in candidates(beside, home):
-        reason = lacking(python, stopped)
+        reason = lacking(python, (*NEEDED, *WANTED), stopped)
         if reason is None:
             return python
         log.info("worker: %s is passed over: %s", python, reason)
+        if able is None and lacking(python, NEEDED, stopped) is None:
+            able = python
         if stopped():
             break
-    return None
+    return able
 
 
-def lacking(python: str, stopped: Callable[[], bool] = lambda: False) -> str | None:
-    """Return a short reason why a Python cannot run the worker, or None if it can."""
+def lacking(python: str, packages: Sequence[str] = NEEDED, stopped: Callable[[], bool] = lambda: False) -> str | None:
+    """Return a short reason why a Python cannot run the worker, or None if it can.
+
+    Args:
+        python: Path of the executable.
+        packages: Required packages.
+        stopped: As for `find`.
+    """
     with tempfile.TemporaryFile() as said:  # a file, because child processes of a wrapper script would keep a pipe open
         try:
             group = ProcessGroup(
-                [python, "-c", CHECK],
-                env=environment(),
+                [python, "-c", CHECK, *packages],
+                env=environment(python),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=said,

@@ -43,8 +43,8 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
 
     worker_python: StringProperty(
         name="Worker Python",
-        description="Python with torch and numba that runs the worker; if empty, the one of 'r5dgs config --user' or "
-        "the first suitable one in the usual places",
+        description="Python with numba that runs the worker, and with torch for text encoders; if empty, the one of "
+        "'r5dgs config --user' or the first suitable one in the usual places, Blender's own included",
         subtype="FILE_PATH",
         update=_remember,
     )
@@ -111,6 +111,7 @@ class Choice:
         beside: Folders of the extension, beside which environments are searched.
         timeout_s: Seconds to wait for a response from the worker.
         trusted: Folders from which any .blend may load scene files.
+        kernels: Folder for the kernels that Blender's own Python compiles; "" outside an installed extension.
     """
 
     chosen: str
@@ -118,6 +119,7 @@ class Choice:
     beside: tuple[Path, ...]
     timeout_s: float
     trusted: tuple[str, ...] = ()
+    kernels: str = ""
 
     def known(self) -> str | None:
         """Return the Python if no search is needed, otherwise None."""
@@ -163,8 +165,17 @@ def choice() -> Choice:
         beside=tuple(_beside()),
         timeout_s=float(preferences.worker_timeout) if preferences is not None else 120.0,
         trusted=_trusted(preferences),
+        kernels=_kernels(),
     )
     return _chosen
+
+
+def _kernels() -> str:
+    """Folder in the extension's user folder, which Blender removes with the extension."""
+    try:
+        return bpy.utils.extension_path_user(base_package, path="kernels")
+    except ValueError:  # the package is not installed as an extension
+        return ""
 
 
 def _of_user_settings() -> str:

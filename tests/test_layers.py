@@ -173,6 +173,8 @@ ADDON_ALLOWED = {
     "capture": {"ui", "export"},
 }
 LIGHT = GROUND | {"motion", "scene", "color", "formats", "playback", "editing", "search", "protocol", "user_settings"}
+# The extension holds these rooms only: those of Blender itself, and those of the worker.
+PICTURE = LIGHT | {"data", "raster", "render", "language", "worker"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}
 HEAVY = {
     *("torch", "numba", "scipy", "OpenImageIO", "trimesh", "matplotlib", "rich", "gsplat", "transformers"),

@@ -36,8 +36,9 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = preferences.ENVIRONMENT
 STDERR_LINES = 12
+COMPILE_PATIENCE = 10  # timeouts to wait while kernels are compiled, which takes minutes on a busy machine
 LAST_WORDS_S = 0.5  # time to read the rest of the pipes after a worker's death
-REMEDY = f"set 'Worker Python' in the add-on's preferences, or {ENVIRONMENT}, to a Python with torch and numba"
+REMEDY = f"set 'Worker Python' in the add-on's preferences, or {ENVIRONMENT}, to a Python with numba"
 COMPILING = "preparing the rasterizer (first use, 10 to 30 s)"
 
 log = logging.getLogger(__name__)
@@ -61,7 +62,9 @@ class Worker:
         self._number = 0
         self._answers: queue.Queue = queue.Queue()
         self._stderr: collections.deque[str] = collections.deque(maxlen=STDERR_LINES)
-        environment = find_python.environment()
+        environment = find_python.environment(python)
+        if find_python.is_own(python) and (kernels := preferences.choice().kernels):
+            environment.setdefault("NUMBA_CACHE_DIR", kernels)
         known = environment.get("PYTHONPATH", "")
         # The add-on's own copy of the core comes first, so that both sides have the same version.
         environment["PYTHONPATH"] = str(ROOT) + (os.pathsep + known if known else "")
@@ -125,7 +128,7 @@ class Worker:
 
         Args:
             command: Name of the request.
-            timeout_s: Seconds to wait before the worker is stopped.
+            timeout_s: Seconds to wait before the worker is stopped; longer while it compiles kernels.
             **arguments: JSON-compatible arguments. For the command ``points``, ``points`` is a tuple of
                 `evaluated_points.Edit`; edits that the worker has cached are not sent again.
 
@@ -147,10 +150,14 @@ class Worker:
                 self._process.stdin.flush()
         except (OSError, ValueError):
             raise self._death() from None
+        waited = 0.0
         while True:
             try:
                 answer = self._answers.get(timeout=timeout_s)
             except queue.Empty:
+                waited += timeout_s
+                if self.notice and waited < COMPILE_PATIENCE * timeout_s:
+                    continue
                 self.close()
                 raise errors.BackendError(
                     f"worker: no answer to '{command}' within {timeout_s:g} s, so it was stopped; try again, or raise "

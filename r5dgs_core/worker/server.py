@@ -47,7 +47,7 @@ from ..scene.scene import Scene
 from . import edited_points
 from .warming import Warming
 
-NEEDED = ("torch", "numba")
+NEEDED = ("numba",)
 
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
 
@@ -229,7 +229,8 @@ class Server:
 
         found = speed_test.run()
         versions = {"Python": platform.python_version(), "R5DGS": __version__}
-        versions |= {name: importlib.metadata.version(name) for name in NEEDED}
+        there = [name for name in ("torch", *NEEDED) if importlib.util.find_spec(name) is not None]
+        versions |= {name: importlib.metadata.version(name) for name in there}
         return {**warm, "versions": versions, **dataclasses.asdict(found)}, {}
 
     def _query(self, request: dict[str, Any]) -> Answer:

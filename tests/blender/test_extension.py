@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from r5dgs_core.scene import scene_file
+from tests import test_layers
 from tests.support import scenes
 
 bpy = pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -109,9 +110,12 @@ def test_the_archive_validates_and_holds_the_extension_only(archive):
         "blender_manifest.toml", "__init__.py", "LICENSE", "README.md", "CHANGELOG.md",
         "operators", "r5dgs_addon", "r5dgs_core",
     }  # fmt: skip
-    rooms = ("operators", "r5dgs_addon", "r5dgs_core")
-    modules = {path.relative_to(ROOT).as_posix() for room in rooms for path in (ROOT / room).rglob("*.py")}
-    assert modules <= set(names)
+    rooms = ("operators", "r5dgs_addon", *(f"r5dgs_core/{room}" for room in test_layers.PICTURE))
+    needed = {path.relative_to(ROOT).as_posix() for room in rooms for path in (ROOT / room).rglob("*.py")}
+    needed |= {f"r5dgs_core/{name}.py" for name in test_layers.PICTURE if (ROOT / f"r5dgs_core/{name}.py").exists()}
+    assert needed <= set(names)
+    core = {name.split("/")[1].removesuffix(".py") for name in names if name.startswith("r5dgs_core/")}
+    assert core - test_layers.PICTURE == {"__init__"}
     assert not [name for name in names if name.endswith((".pyc", ".r5dgs", ".png", ".nbi", ".nbc"))]
     assert archive.stat().st_size < 2_000_000
 

@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import os
+import queue
 import re
 import signal
 import stat
@@ -454,3 +455,27 @@ def test_waiting_for_kernel_compilation_shows_a_notice(
     job.answer()
     assert worker.notice() == "" and job.doing == "rendering"
     worker.stop()
+
+
+@pytest.mark.parametrize("timeouts, outcome", [(10, "answer"), (3, "error")])
+def test_compilation_extends_the_timeout_and_not_forever(blender, monkeypatch, tmp_path, timeouts, outcome):
+    process = importlib.import_module("r5dgs.r5dgs_addon.worker.process")
+    monkeypatch.setattr(process, "COMPILE_PATIENCE", timeouts)
+    running = process.Worker(fake_python(tmp_path / "python", COMPILES))
+    try:
+        running.greet(120.0)
+        running.notice, answers, late = process.COMPILING, running._answers, iter(range(5))
+
+        def get(timeout):
+            if next(late, None) is not None:
+                raise queue.Empty
+            return answers.get(timeout=120.0)
+
+        monkeypatch.setattr(running, "_answers", types.SimpleNamespace(get=get, put=answers.put))
+        if outcome == "answer":
+            assert running.request("hello", 0.1) == ({"missing": []}, {})
+        else:
+            with pytest.raises(errors.BackendError, match="no answer to 'hello'"):
+                running.request("hello", 0.1)
+    finally:
+        running.close()

@@ -175,12 +175,40 @@ def test_pythons_are_searched_beside_the_extension_at_home_and_on_the_path(pytho
     assert list(pythons.candidates([own], home)) == expected
 
 
-def test_the_first_python_with_the_required_packages_is_used(pythons, elsewhere):
+def test_a_python_with_torch_is_preferred_to_an_earlier_one_that_can_only_draw(pythons, elsewhere):
     own, home = elsewhere / "own", elsewhere / "home"
-    lacking = fake_python(own / ".venv" / "bin" / "python", "lacks torch")
-    assert pythons.lacking(lacking) == "lacks torch" and pythons.find([own], home) is None
-    able = fake_python(home / "r5dgs" / "bin" / "python")
-    assert pythons.find([own], home) == able
+    lacking = fake_python(own / "venv" / "bin" / "python", "lacks numba")
+    assert pythons.lacking(lacking) == "lacks numba" and pythons.find([own], home) is None
+    drawing = Path(fake_python(home / "r5dgs" / ".venv" / "bin" / "python"))
+    drawing.write_text(f"#!{PYTHON}\nimport sys\nraise SystemExit('lacks torch' if 'torch' in sys.argv else 0)\n")
+    assert pythons.find([own], home) == str(drawing)
+    complete = fake_python(elsewhere / "path" / "python3")
+    assert pythons.find([own], home) == complete
+
+
+def test_blenders_own_python_is_given_the_folder_of_the_bundled_numba(pythons, monkeypatch, tmp_path):
+    (tmp_path / "bundled" / "numba").mkdir(parents=True)
+    (tmp_path / "bundled" / "numba" / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path / "bundled")
+    monkeypatch.setenv("PYTHONPATH", "known")
+    assert pythons.environment(sys.executable)["PYTHONPATH"] == f"{tmp_path / 'bundled'}{os.pathsep}known"
+    assert pythons.environment("/other/python")["PYTHONPATH"] == pythons.environment()["PYTHONPATH"] == "known"
+
+
+def test_blenders_own_python_compiles_kernels_into_the_folder_of_the_extension(worker, preferences, monkeypatch):
+    process, begun = importlib.import_module("r5dgs.r5dgs_addon.worker.process"), []
+    monkeypatch.setattr(preferences, "choice", lambda: preferences.Choice("", "", (), 1.0, kernels="/kernels"))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+
+    def begin(command, env, **_):
+        begun.append(env.get("NUMBA_CACHE_DIR"))
+        raise OSError("not started")
+
+    monkeypatch.setattr(process, "ProcessGroup", begin)
+    for python in (sys.executable, "/other/python"):
+        with pytest.raises(errors.BackendError, match="not started"):
+            process.Worker(python)
+    assert begun == ["/kernels", None]
 
 
 def test_unsuitable_pythons_are_rejected_with_the_reason(pythons, tmp_path):
@@ -278,7 +306,7 @@ def test_the_search_for_a_python_does_not_block_and_can_be_cancelled(worker, onl
     only_python(f"echo $$ > {told}.new; /bin/mv {told}.new {told}; exec /bin/sleep 600\n")
     job = worker.submit("view", HELLO)
     patience.wait_until(told.exists)
-    assert not job.done and job.doing == worker.SEARCHING == "looking for a Python with torch"
+    assert not job.done and job.doing == worker.SEARCHING == "looking for a Python with numba"
     job.cancel()
     assert job.done and not worker.busy()
     with pytest.raises(ProcessLookupError):
