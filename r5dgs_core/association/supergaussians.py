@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-APART = 0.1  # maximum change of the distance of two neighbours in a patch, as a share of their travel
+APART = 0.1  # maximum growth of the distance of two neighbours beyond its minimum, as a share of their travel
 ROUNDS = 12  # maximum number of seeding rounds
 
 
