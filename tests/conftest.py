@@ -31,14 +31,14 @@ hypothesis.settings.load_profile("r5dgs")
 
 @pytest.fixture(autouse=True)
 def no_user_settings(monkeypatch, tmp_path_factory):
-    """Settings of the user who runs the tests are not read or changed: every test has an empty folder for them."""
+    """Give every test an empty folder of user settings, so that those of the tester are neither read nor changed."""
     folder = tmp_path_factory.mktemp("settings")
     for variable in ("XDG_CONFIG_HOME", "APPDATA"):
         monkeypatch.setenv(variable, str(folder))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Counts of what tests draw at random."""
+    """Add options for `--quick` and for the number of random draws."""
     group = parser.getgroup("r5dgs")
     group.addoption("--bit-flips", type=int, default=200, metavar="N", help="flipped bits of each checkpoint")
     group.addoption("--kills", type=int, default=30, metavar="N", help="killed runs of the slow test")
@@ -81,7 +81,7 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """End at once where the bpy module is loaded and pytest is the program.
+    """End the process at once if the bpy module is loaded and pytest is the program.
 
     The module frees Blender when the last reference to it goes; where one is left when Python has ended, 4.2 crashes,
     and that would be the exit status instead of what pytest found. Two things leave one in a test run: pytest's

@@ -73,7 +73,7 @@ def places(source: str) -> list[tuple[ast.AST, range]]:
 
 
 def apply(source: str, node: ast.AST) -> tuple[str, str]:
-    """The mutated source, and the change in words."""
+    """The mutated source, and a description of the change."""
     new = ast.unparse(mutated(node))
     lines = source.encode().splitlines(keepends=True)
     start = sum(map(len, lines[: node.lineno - 1])) + node.col_offset

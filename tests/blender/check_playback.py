@@ -2,7 +2,7 @@
 
     blender -b --python-exit-code 1 --python tests/blender/check_playback.py -- SCENE.r5dgs
 
-runs it in a Blender, ``python tests/blender/check_playback.py SCENE.r5dgs`` in the bpy module; ``--worker PYTHON`` and
+runs it in Blender, ``python tests/blender/check_playback.py SCENE.r5dgs`` in the bpy module; ``--worker PYTHON`` and
 ``--no-preview`` are options. Where the extension is not enabled, the one that this file lies in is registered. The
 core's own pictures come from the worker's Python, in a process of its own, straight from the scene file. Ends with exit
 code 1 where anything differs by more than it may.
@@ -41,7 +41,7 @@ np.save(out, np.stack(images))
 
 
 def extension_package() -> str:
-    """Name of the extension's package; registered from this repository where it is not enabled."""
+    """Name of the extension's package, which is registered from this repository if it is not enabled."""
     for name in list(sys.modules):
         if name.endswith(".r5dgs_addon") and "r5dgs_core" not in name:
             return name.removesuffix(".r5dgs_addon")
@@ -54,7 +54,7 @@ def extension_package() -> str:
 
 
 def times_to_check(scene) -> list[float]:
-    """Knots, between knots, just beside t_max, and past it: on frames and between them."""
+    """Times at knots, between knots, next to t_max, and past it, on frames and between them."""
     first, last = float(scene.tracks.times[0]), float(scene.t_max)
     span = max(last - first, 1e-3)
     frame = 1.0 / scene.frames_per_unit
@@ -76,7 +76,7 @@ def set_time(collection, t: float) -> None:
 def position_error(collection, scene, modules, t: float) -> float:
     """Largest distance between a point as Blender evaluates it and playback, as a fraction of the scene's size."""
     set_time(collection, t)
-    # Anchors carry the rigid part of the motion; what bends beside it is not played in Blender yet.
+    # Anchors have only the rigid part of the motion; residuals need Exact Mode, which is off here.
     rigid = dataclasses.replace(scene, residuals=None)
     expected = modules["scene_player"].frame(rigid, t).means.astype(np.float64)
     world = modules["cameras"].WORLD_TO_BLENDER[scene.world_convention]

@@ -20,7 +20,7 @@ from window import STEP_S, run, service, wait  # noqa: E402
 
 
 def full_picture():
-    """The picture of full size that the one viewport shows, or None."""
+    """The full-size picture of the only viewport, or None."""
     ports = [port for port in service("engine.viewport")._ports if port._shown is not None and port.next() is None]
     return ports[0]._shown if ports else None
 

@@ -1,4 +1,4 @@
-"""Check in Blender's window what a user does with keys and mouse: load, undo, type, click, and stop long work by Esc.
+"""Check actions of a user with keys and mouse in Blender's window: load, undo, type, click, stop long work by Esc.
 
     xvfb-run -a -s "-screen 0 1280x800x24 +extension GLX" blender --factory-startup --window-geometry 0 0 1280 800 \\
         --python tests/blender/check_window.py -- SCENE.r5dgs [CHECK ...]
@@ -32,7 +32,7 @@ def loaded():
 
 
 def load(path: Path) -> None:
-    """Load the scene where none is loaded."""
+    """Load the scene if none is loaded."""
     if not loaded():
         with w.inside():
             bpy.ops.r5dgs.load_scene(filepath=str(path))
@@ -58,7 +58,7 @@ def choose(folder: Path, name: str = ""):
 
 
 def browsing(path: Path, folder: Path):
-    """The file browser and a drop load a scene; Ctrl+Z takes it back, Ctrl+Shift+Z brings it again."""
+    """The file browser and a drop load a scene; Ctrl+Z removes it, Ctrl+Shift+Z restores it."""
     with w.inside():
         bpy.ops.r5dgs.load_scene("INVOKE_DEFAULT")
     yield from choose(path.parent, path.name)
@@ -70,14 +70,14 @@ def browsing(path: Path, folder: Path):
     yield from w.press("ctrl+shift+z")
     assert len(loaded()) == 1, "Ctrl+Shift+Z did not bring the scene back"
     yield from w.press("ctrl+z")
-    with w.inside():  # what Blender calls where a file is dropped
+    with w.inside():  # the call that Blender makes for a dropped file
         bpy.ops.wm.drop_import_file("INVOKE_DEFAULT", directory=str(path.parent), files=[{"name": path.name}])
     yield 1.0
     assert len(loaded()) == 1, "a drop loaded nothing"
 
 
 def typing(path: Path, folder: Path):
-    """A prompt that is typed into the sidebar's field is asked on Enter."""
+    """Enter searches a prompt that was typed into the sidebar's field."""
     area = w.area_of("VIEW_3D")
     area.spaces.active.show_region_ui = True
     yield 0.5
@@ -120,7 +120,7 @@ def clicking(path: Path, folder: Path):
         pixel = view3d_utils.location_3d_to_region_2d(region, view, middle)
         yield from w.hover(region, *pixel)
         yield from w.click()
-        yield 0.0  # timers run before those who hear of changes
+        yield 0.0  # timers run before the subscribers of changes
         active = bpy.context.view_layer.objects.active
         assert active.r5dgs.role != "CLOUD", f"{active.name}: not its anchor"
         hits[cloud.r5dgs.object_id] = active == cloud.parent
@@ -129,7 +129,7 @@ def clicking(path: Path, folder: Path):
 
 
 def rendering(path: Path, folder: Path):
-    """Esc stops F12 in mid-render, and the next F12 is whole."""
+    """Esc stops F12 during a render, and the next F12 is complete."""
     scene = w.main_window().scene
     with w.inside():
         bpy.ops.r5dgs.use_engine()
@@ -160,7 +160,7 @@ def rendering(path: Path, folder: Path):
 
 
 def previewing(path: Path, folder: Path):
-    """Esc stops a preview while the worker draws, and the next one comes."""
+    """Esc stops a preview while the worker draws, and the next one works."""
     render, worker = w.main_window().scene.render, w.service("worker.jobs")
     for size in (320, 6000, 320):
         render.resolution_x, render.resolution_y, render.resolution_percentage = size, size * 3 // 4, 100
@@ -220,7 +220,7 @@ def processes_of(group: int) -> list[str]:
 
 
 def looking(path: Path, folder: Path):
-    """A border that is drawn with Ctrl+B cuts F12 and not the Rendered viewport; the eyes of a stereo render differ."""
+    """A border drawn with Ctrl+B crops F12 but not the Rendered viewport; the eyes of a stereo render differ."""
     scene, area = w.main_window().scene, w.area_of("VIEW_3D")
     region, space, render = w.region_of(area), area.spaces[0], scene.render
     with w.inside():
@@ -268,7 +268,7 @@ def saved_pictures(scene: bpy.types.Scene, stem: Path) -> list[np.ndarray]:
 
 
 def exporting(path: Path, folder: Path):
-    """Esc stops exports: what was finished stays, nothing else, and the frame is as before."""
+    """Esc stops exports: only finished files are kept, and the frame is restored."""
     scene = w.main_window().scene
     scene.render.resolution_x, scene.render.resolution_y = 320, 240
     scene.frame_set(7)
@@ -304,7 +304,7 @@ def exporting(path: Path, folder: Path):
 
 
 def capturing(path: Path, folder: Path):
-    """Esc stops a capture and leaves nothing; one that is left alone is whole."""
+    """Esc stops a capture and leaves nothing; an undisturbed capture is complete."""
     scene = w.main_window().scene
     engine = scene.render.engine
     few = {"resolution_x": 64, "resolution_y": 48, "samples": 1, "denoise": False, "rig": "ARC"}
@@ -318,7 +318,7 @@ def capturing(path: Path, folder: Path):
     (folder / "whole").mkdir()
     with w.inside():
         bpy.ops.r5dgs.capture_dataset("INVOKE_DEFAULT", **few, frame_end=2, rig_observed=2, rig_novel=1)
-    yield from choose(folder / "whole")  # it asks again, though a folder was given before
+    yield from choose(folder / "whole")  # the file browser opens again, although a folder was chosen before
     yield from w.wait(lambda: (folder / "whole" / "objects.json").exists() and nothing_runs(), "capture")
     assert scene.render.engine == engine
 
@@ -342,7 +342,7 @@ def merging(path: Path, folder: Path):
         seen = picture.shown(bpy.context.evaluated_depsgraph_get())
         _, arrays = picture.render(seen, ("depth", "alpha"))
     solid = arrays["alpha"] > 0.6
-    wall = float(np.median(arrays["depth"][solid]))  # in the midst of what is seen
+    wall = float(np.median(arrays["depth"][solid]))  # in the middle of the view
     mesh = bpy.data.meshes.new("wall")
     mesh.from_pydata([(x, y, -wall) for x, y in ((-99, -99), (99, -99), (99, 99), (-99, 99))], [], [(0, 1, 2, 3)])
     plane = bpy.data.objects.new("wall", mesh)
@@ -372,7 +372,7 @@ def merging(path: Path, folder: Path):
 
 
 def combine_by_depth(first: bpy.types.Scene, second: bpy.types.Scene) -> None:
-    """Let the first scene's compositor show the nearer of both."""
+    """Set up the first scene's compositor to show the nearer of both."""
     if "compositing_node_group" in first.bl_rna.properties:  # Blender 5
         tree = first.compositing_node_group = bpy.data.node_groups.new("merge", "CompositorNodeTree")
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")

@@ -22,8 +22,8 @@ import bpy
 from mathutils import Vector
 
 ROOT = Path(__file__).resolve().parents[2]
-CROPS = {"nothing": "225x330+830+66"}  # of 1280 pixels of width: where one panel is all there is to see
-SETTLE_S = 2.5  # for the window to draw what was set up
+CROPS = {"nothing": "225x330+830+66"}  # of 1280 pixels of width, if only one panel is shown
+SETTLE_S = 2.5  # until the window has been redrawn
 SIDEBAR = "R5DGS"
 
 
@@ -72,7 +72,7 @@ def collection():
 
 
 def load(path: Path, window: Window) -> None:
-    """A scene in an otherwise empty file, seen by a camera of its data set."""
+    """Load a scene into an empty file, seen by a camera of its data set."""
     for obj in list(bpy.data.objects):
         bpy.data.objects.remove(obj)
     bpy.ops.wm.save_as_mainfile(filepath=str(path.with_suffix(".blend")))  # the sidebar shows paths from here
@@ -118,19 +118,19 @@ def loaded(window: Window):
 
 
 def prompt(window: Window):
-    """Answers to a prompt, and the selection that they make."""
+    """Matches of a prompt, and their selection."""
     with window.inside():
         bpy.ops.r5dgs.select_by_prompt(text="mug and the apple")
 
 
 def nothing(window: Window):
-    """A prompt that finds nothing, and what it suggests."""
+    """A prompt without matches, and its suggestions."""
     with window.inside():
         bpy.ops.r5dgs.select_by_prompt(text="muk up")
 
 
 def physics(window: Window):
-    """The motion of one object as physics, and where all go, as thick as it is unsure."""
+    """The physics of one object, and the predicted paths with their uncertainty."""
     window.area("VIEW_3D").spaces.active.shading.type = "SOLID"
     window.area("VIEW_3D").spaces.active.shading.color_type = "OBJECT"
     with window.inside():
@@ -141,7 +141,7 @@ def physics(window: Window):
 
 
 def ellipsoids(window: Window):
-    """The other display of viewports."""
+    """Display as ellipsoids."""
     window.area("VIEW_3D").spaces.active.shading.type = "MATERIAL"
     with window.inside():
         bpy.ops.object.select_all(action="DESELECT")
@@ -195,7 +195,7 @@ def merge(window: Window):
     meshes.cycles.samples, meshes.cycles.use_denoising = 32, False
     meshes.view_layers[0].use_pass_z = True
     meshes.view_settings.view_transform = "Standard"
-    meshes.render.film_transparent = True  # else its world would hide the sky, as far away as it is
+    meshes.render.film_transparent = True  # otherwise its world would hide the sky
     for scene in (gaussians, meshes):
         scene.render.resolution_percentage = 60
     for name in ("resolution_x", "resolution_y"):

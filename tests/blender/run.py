@@ -1,4 +1,4 @@
-"""All that can be shown of the extension without a window: figures, then its tests.
+"""Measurements and tests of the extension that need no window.
 
     blender -b --factory-startup --python-exit-code 1 --python tests/blender/run.py -- [--scene FILE.r5dgs]
 
@@ -40,13 +40,13 @@ BODIES = 12
 
 
 class Table:
-    """Rows of what was measured, printed as they come."""
+    """Measured rows, printed one by one."""
 
     def __init__(self):
         self.rows: list[dict] = []
 
     def add(self, what: str, value: float, text: str, wanted: str, good: bool) -> None:
-        """Take a figure and whether it is as wanted."""
+        """Add a value and True if it is within its limit."""
         self.rows.append({"what": what, "value": value, "wanted": wanted, "good": good})
         print(f"  {what:<52} {text:>14}   {wanted:<24} {'ok' if good else 'FAILED'}", flush=True)
 
@@ -133,7 +133,7 @@ def measure_playing(table: Table, path: Path) -> None:
     load(path)
     blender = bpy.context.scene
     order = [*range(blender.frame_start, blender.frame_end + 1), *range(blender.frame_end, blender.frame_start - 1, -1)]
-    for frame in order:  # as it is after the first round
+    for frame in order:  # warm, after the first round
         blender.frame_set(frame)
     best = 0.0
     for _ in range(5):
@@ -147,7 +147,7 @@ def measure_playing(table: Table, path: Path) -> None:
 
 
 def figures(path: Path | None) -> Table:
-    """Measure everything with the extension registered, and take it away again."""
+    """Measure everything with the extension registered, then unregister it."""
     package = check_playback.extension_package()
     modules = {
         name: importlib.import_module(f"{package}.r5dgs_core.{room}.{name}")
@@ -202,7 +202,7 @@ def _without_torch(pytest, left_out: list[str]):
 
 
 def tests(arguments: list[str]) -> str:
-    """Run the extension's tests in this very process; what came of it, beginning with "FAILED" where they failed."""
+    """Run the extension's tests in this process. Returns a summary, which begins with "FAILED" if tests failed."""
     if importlib.util.find_spec("pytest") is None:
         return "not run: pytest is not installed in this Python"
     if any(name.endswith(".r5dgs_addon") for name in sys.modules):
@@ -218,7 +218,7 @@ def tests(arguments: list[str]) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Measure and test; returns the exit code."""
+    """Measure and test. Returns the exit code."""
     parser = argparse.ArgumentParser(description="Figures and tests of the extension in this Blender.")
     parser.add_argument("--scene", type=Path, help="positions and keys of this scene, too")
     parser.add_argument("--json", type=Path, help="write the figures there")

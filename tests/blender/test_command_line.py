@@ -1,4 +1,4 @@
-"""The extension by Blender's own command line: built, installed, used, removed. Needs a program called `blender`."""
+"""Build, install, use and remove the extension with Blender's own command line. Needs a program named `blender`."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""`run.py` says what failed, in its words, its file and its exit code."""
+"""`run.py` reports failures in its output, its file and its exit code."""
 
 import json
 import subprocess

@@ -32,7 +32,7 @@ def python_of(version: str) -> str:
 
 
 def environment(bpy: str, folder: Path, torch: bool) -> Path:
-    """The Python of an environment with a version of bpy, made where it is not there yet."""
+    """The Python of an environment with a version of bpy, which is created if missing."""
     place = folder / bpy
     python = place / "bin" / "python"
     done = place / "installed"

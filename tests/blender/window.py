@@ -1,4 +1,4 @@
-"""Blender's window for checks that run inside it: the extension, waiting, and keys and mouse as a user has them.
+"""Helpers of checks that run inside Blender's window: the extension, waiting, and simulated keys and mouse.
 
 Keys and mouse are X's own, by ``xdotool``; without a window manager they go to the window that the mouse is in.
 """
@@ -18,7 +18,7 @@ import bpy
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 240.0  # the first picture may have to compile the rasterizer
 STEP_S = 0.02
-KEY_S = 0.3  # for Blender to take in what a user does
+KEY_S = 0.3  # until Blender has processed an action of the user
 
 
 def register() -> None:
@@ -36,7 +36,7 @@ def service(name: str):
 
 
 def wait(condition: Callable[[], object], what: str) -> Iterator[float]:
-    """Let Blender go on until a condition holds."""
+    """Let Blender run until a condition holds."""
     end = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < end, f"{what}: nothing within {PATIENCE_S:g} s"

@@ -90,7 +90,7 @@ def run(reader: Reader, indices: range, seed: int, save: Path | None = None) -> 
         reader: The reader.
         indices: Numbers of the inputs.
         seed: Of the random numbers.
-        save: Folder for inputs that went wrong, one folder each with the traceback; None keeps none.
+        save: Folder for failing inputs, one folder each with the traceback; None keeps none.
     """
     importlib.import_module("torch._dynamo")  # torch imports it late, which takes longer than an input may
     tally = Tally(reader.name)
@@ -161,7 +161,7 @@ def _limited() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence warnings, logs and what libraries of C write to standard error."""
+    """Silence warnings, logs and the standard error of C libraries."""
     level, kept = logging.root.manager.disable, os.dup(2)
     logging.disable(logging.CRITICAL)
     try:

@@ -227,7 +227,7 @@ def _changed(random: Random, array: np.ndarray, kind: int) -> np.ndarray:
 
 
 def archive(random: Random, members: dict[str, bytes], *, text_member: str) -> bytes:
-    """A zip of members of which one is changed, or the zip itself."""
+    """Change one member of a zip, or the zip itself."""
     members, kind = dict(members), random.randrange(20)
     compression, extra = zipfile.ZIP_STORED if random.random() < 0.7 else zipfile.ZIP_DEFLATED, None
     name = random.choice(list(members))
@@ -312,7 +312,7 @@ def png(random: Random, content: bytes) -> bytes:
 
 
 def by_name(name: str) -> Callable[[Random, bytes], bytes]:
-    """The mutation that fits a file's name."""
+    """Choose a mutation by the name of a file."""
     for suffix, change in {".json": tree, ".png": png, ".txt": text, ".toml": text, "cfg_args": text}.items():
         if name.endswith(suffix):
             return change

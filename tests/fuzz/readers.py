@@ -1,4 +1,4 @@
-"""Every reader of files: how its inputs are made, and how what it accepts is used."""
+"""All readers of files, with the creation of their inputs and the use of accepted ones."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def scene_reader() -> Reader:
 
 
 def use_scene(scene: Scene, path: Path) -> None:
-    """Play, draw, search and write a scene; whatever that raises is a defect of the check that accepted it."""
+    """Play, draw, search and write a scene. Any exception is a defect of the check that accepted it."""
     with as_defects():
         first, last = float(scene.tracks.times[0]), scene.t_max
         later = last + max(0.3 * (last - first), 1 / scene.frames_per_unit)
@@ -164,7 +164,7 @@ def use_scene(scene: Scene, path: Path) -> None:
 
 @contextlib.contextmanager
 def as_defects():
-    """Turn a refusal into a defect: what was accepted has to work."""
+    """Turn a refusal into a defect, because accepted input must work."""
     try:
         yield
     except errors.R5dgsError as error:
@@ -222,7 +222,7 @@ def write_pictures(folder: Path, names: list[str]) -> None:
 
 
 def write_flat(folder: Path, nested: bool = False) -> None:
-    """A data set in D-NeRF's layout, or in NVFi's."""
+    """Write a data set in D-NeRF's or NVFi's layout."""
     names = [f"train/r_{i}" for i in range(3)]
     write_pictures(folder, [*names, "val/r_0"])
     pose = cameras.cam_world_to_opengl(scenes.orbit_camera(0.3).T_cam_world).tolist()
@@ -262,7 +262,7 @@ def write_flat(folder: Path, nested: bool = False) -> None:
 
 
 def use_dataset(folder: Path) -> None:
-    """Read a data set and what its views consist of."""
+    """Read a data set and the files of its views."""
     found = dataset.read(folder)
     for view in (*found.train[:2], *found.val[:1]):
         with as_defects():
@@ -416,7 +416,7 @@ def config_reader() -> Reader:
 
 
 def odd_tensors(random: Random, tensors: dict[str, Any]) -> dict[str, Any]:
-    """A dictionary of tensors of which one is no plain tensor of its shape any more."""
+    """Dictionary of tensors, one of which is replaced by another kind or shape."""
     result = dict(tensors)
     name = random.choice([name for name, value in result.items() if isinstance(value, torch.Tensor)])
     value = result[name].float()
@@ -472,7 +472,9 @@ def saved(content: Any) -> bytes:
 def changed_weights(random: Random, tensors: dict[str, Any]) -> bytes:
     """Saved tensors, changed as tensors, as a zip or as bytes."""
     if random.random() < 0.75:
-        with contextlib.suppress(RuntimeError, NotImplementedError, TypeError):  # what cannot be made or saved
+        with contextlib.suppress(
+            RuntimeError, NotImplementedError, TypeError
+        ):  # tensors that cannot be created or saved
             return saved(odd_tensors(random, tensors))
     content = saved(tensors)
     if random.random() < 0.3:
@@ -541,7 +543,7 @@ def import_reader() -> Reader:
 
 
 def knots_reader() -> Reader:
-    """``cfg_args`` of others, whose times decide how often a deformation is sampled."""
+    """``cfg_args`` of other projects, whose times determine the number of samples of a deformation."""
     files = made_in(
         lambda folder: foreign_runs.write_common(folder, foreign_runs.cloud(), 7, "max_time=0.7, is_blender=True")
     )
@@ -595,7 +597,7 @@ def checkpoint_reader() -> Reader:
 
 
 def notes_reader() -> Reader:
-    """JSON that stands beside other files: of encoders, and what evaluation says of a scene."""
+    """JSON beside other files: configurations of encoders, and the evaluation of a scene."""
     scene = scenes.make_scene(n=COUNT)
     result = {"scene": scene.name, "splits": {"val": {"rigid": {"psnr": 31.5}}}, "train": {"gaussians": COUNT}}
     base = {
@@ -628,7 +630,7 @@ READERS: dict[str, Callable[[], Reader]] = {
     "checkpoint": checkpoint_reader,
     "notes": notes_reader,
 }
-# How many of all inputs each reader gets.
+# Share of the inputs of each reader.
 SHARES = {
     "scene": 40,
     "ply": 8,

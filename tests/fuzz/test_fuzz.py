@@ -1,4 +1,4 @@
-"""A thousand mutated inputs per run, and proof that the campaign sees what it looks for."""
+"""A thousand mutated inputs per run, and tests that the campaign detects defects."""
 
 import mmap
 import time
