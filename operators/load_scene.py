@@ -32,6 +32,7 @@ OPTIONS = (
     "key_tolerance",
     "fit_timeline",
     "frame_views",
+    "cameras",
     "sh_degree",
     "display",
 )
@@ -76,6 +77,11 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
     frame_views: BoolProperty(
         name="Frame Views", description="Look at the scene from a captured camera in all 3D views", default=True
     )
+    cameras: BoolProperty(
+        name="Captured Cameras",
+        description="Create the data set's cameras, and use the best one unless this file uses a camera of its own",
+        default=True,
+    )
     display: EnumProperty(
         name="Display",
         description="Representation of Gaussians in viewports",
@@ -112,6 +118,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             fit_timeline=self.fit_timeline,
             sh_degree=3 if self.sh_degree == "ALL" else int(self.sh_degree),
             frame_views=self.frame_views,
+            cameras=self.cameras,
             display=self.display,
         )
         try:

@@ -19,7 +19,16 @@ from ..r5dgs_core.scene import cameras
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
 from . import compat
 from .motion import event_markers, keyframes, physics
-from .scene import first_view, loaded_scenes, object_names, point_clouds, relink, timeline, viewport_display
+from .scene import (
+    captured_cameras,
+    first_view,
+    loaded_scenes,
+    object_names,
+    point_clouds,
+    relink,
+    timeline,
+    viewport_display,
+)
 
 SMALLEST = 1e-4  # minimum extent of a scene (units); Blender's F-curves ignore changes below 1.2e-7
 
@@ -36,6 +45,7 @@ class Options:
         fit_timeline: True to set the frame range, and markers at t_max and at the observed events.
         sh_degree: Highest spherical-harmonics degree stored on the points.
         frame_views: True to look at the scene in all 3D views.
+        cameras: True to create the captured cameras.
         display: Key of `viewport_display.ITEMS`.
     """
 
@@ -46,6 +56,7 @@ class Options:
     fit_timeline: bool = True
     sh_degree: int = 3
     frame_views: bool = True
+    cameras: bool = True
     display: str = viewport_display.SPLATS
 
 
@@ -116,6 +127,8 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         anchors = _objects(collection, root, scene, options.sh_degree)
         viewport_display.show(collection, options.display)
         first_view.remember(collection, scene)
+        if options.cameras:
+            captured_cameras.build(context, collection, root, scene)
         reaches = keyframes.reaches(scene)
         for (_, motion_id), anchor in anchors.items():
             keyframes.animate(anchor, scene, motion_id, times, options.key_tolerance, float(reaches[motion_id]))

@@ -15,15 +15,29 @@ DEFAULT_CLIP = (0.01, 1000.0)  # Blender's own, which is only widened
 
 def remember(collection: bpy.types.Collection, scene: Scene) -> None:
     """Store the pose of the best captured camera and the distance to the objects; nothing if there are no cameras."""
+    if scene.cameras:
+        camera = scene.cameras[best(scene)]
+        pose = cameras.cam_world_to_opengl(camera.T_cam_world)
+        collection[loaded_scenes.VIEW] = [*pose.ravel().tolist(), distance(scene, camera)]
+
+
+def best(scene: Scene) -> int:
+    """Index of the captured camera that sees the objects best. The scene has cameras."""
     points = _points(scene)
-    shots = [(_score(camera, points), camera) for camera in scene.cameras]
-    if not shots:
-        return
-    _, camera = max(shots, key=lambda shot: shot[0])
-    depths = (points - camera.center) @ camera.forward
-    distance = float(np.median(depths[depths > 0])) if (depths > 0).any() else scene.extent
-    pose = cameras.cam_world_to_opengl(camera.T_cam_world)
-    collection[loaded_scenes.VIEW] = [*pose.ravel().tolist(), distance]
+    scores = [_score(camera, points) for camera in scene.cameras]
+    return scores.index(max(scores))
+
+
+def distance(scene: Scene, camera: cameras.Camera) -> float:
+    """Median depth of the objects in front of a camera, or the scene's extent if there are none."""
+    depths = (_points(scene) - camera.center) @ camera.forward
+    return float(np.median(depths[depths > 0])) if (depths > 0).any() else scene.extent
+
+
+def clip_range(distance: float) -> tuple[float, float]:
+    """Clip range for objects at a distance, at least Blender's own."""
+    start = min(max(NEAREST * distance, 1e-6), DEFAULT_CLIP[0])
+    return start, max(FARTHEST * distance, DEFAULT_CLIP[1])
 
 
 def show(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
@@ -41,7 +55,7 @@ def show(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
     pose, target = found[:16].reshape(4, 4), np.eye(4)[3]
     target[:3] = pose[:3, 3] - found[16] * pose[:3, 2]
     eye, target, up = (root @ pose[:, 3])[:3], (root @ target)[:3], root[:3, :3] @ pose[:3, 1]
-    axes, distance = _looking(eye, target, up), float(np.linalg.norm(target - eye))
+    axes, length = _looking(eye, target, up), float(np.linalg.norm(target - eye))
     if axes is None:
         return 0
     rotation = Matrix(axes.tolist()).to_quaternion()
@@ -52,9 +66,9 @@ def show(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
             view = space.region_3d
             if view.view_perspective == "CAMERA" or view.lock_rotation or space.region_quadviews:
                 continue
-            view.view_rotation, view.view_location, view.view_distance = rotation, target, distance
-            space.clip_start = min(space.clip_start, max(NEAREST * distance, 1e-6), DEFAULT_CLIP[0])
-            space.clip_end = max(space.clip_end, FARTHEST * distance, DEFAULT_CLIP[1])
+            view.view_rotation, view.view_location, view.view_distance = rotation, target, length
+            start, end = clip_range(length)
+            space.clip_start, space.clip_end = min(space.clip_start, start), max(space.clip_end, end)
             changed += 1
     return changed
 

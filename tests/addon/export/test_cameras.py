@@ -7,7 +7,7 @@ import pytest
 
 from r5dgs_core.data import colmap_model, transforms
 from r5dgs_core.scene import cameras, scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -32,8 +32,8 @@ def view(blender):
 @pytest.fixture
 def loaded(blender, tmp_path):
     made = scenes.make_scene(n=100, world_convention="colmap")
-    blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(made, tmp_path / "scene.r5dgs")), fit_timeline=False)
-    return next(c for c in blender.data.collections if c.r5dgs.is_scene)
+    path = scene_file.write(made, tmp_path / "scene.r5dgs")
+    return motions.load(blender, path, fit_timeline=False, cameras=False)
 
 
 def pixel(camera, point):

@@ -92,7 +92,7 @@ def test_the_collection_tree_is_the_table(blender, scene_path):
     scene = scene_file.read(scene_path)
     collection = motions.load(blender, scene_path)
     assert collection.name == "R5DGS synthetic"
-    assert {child.name for child in collection.children} == {item.name for item in scene.objects}
+    assert {child.name for child in collection.children} == {"Cameras", *(item.name for item in scene.objects)}
     for item in scene.objects:
         inside = list(collection.children[item.name].objects)
         cloud = next(obj for obj in inside if obj.name == item.name)

@@ -1,0 +1,61 @@
+"""Captured cameras of a loaded scene as Blender cameras."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.scene import cameras, scene_file
+from tests.support import motions, scenes
+
+
+@pytest.fixture
+def captured():
+    """Three cameras with other lenses, sizes and principal points; the second sees the objects best."""
+    made = scenes.make_scene(n=200, objects=2)
+    base = scenes.orbit_camera(0.3, 96, 72)
+    away = np.diag([-1.0, 1, -1, 1]) @ base.T_cam_world
+    k = np.array([[110.0, 0, 45], [0, 110.0, 40], [0, 0, 1]])
+    found = (
+        dataclasses.replace(base, T_cam_world=away, name="away"),
+        dataclasses.replace(base, intrinsics=k, name=""),
+        cameras.Camera(60, 90, np.array([[70.0, 0, 30], [0, 70.0, 45], [0, 0, 1]]), away, "upright"),
+    )
+    return dataclasses.replace(made, cameras=found)
+
+
+@pytest.mark.parametrize("convention", ["blender", "colmap"])
+def test_blender_sees_what_the_cameras_saw(blender, captured, tmp_path, convention):
+    captured = dataclasses.replace(captured, world_convention=convention)
+    collection = motions.load(blender, scene_file.write(captured, tmp_path / "scene.r5dgs"))
+    home, scene = collection.children["Cameras"], blender.context.scene
+    assert {one.name for one in home.objects} == {"away", "camera 2", "upright"}
+    assert not any(camera.visible_get() for camera in home.objects)
+    module, view_cameras = motions.addon("scene.captured_cameras"), motions.addon("engine.view_cameras")
+    world = np.eye(4)
+    world[:3, :3] = cameras.WORLD_TO_BLENDER[convention]
+    for name, camera in zip(("away", "camera 2", "upright"), captured.cameras, strict=True):
+        module.use(scene, home.objects[name], camera)
+        blender.context.view_layer.update()
+        seen = view_cameras.of_camera(blender.context.evaluated_depsgraph_get(), lambda: np.zeros((0, 3))).camera
+        assert (seen.width, seen.height) == (camera.width, camera.height)
+        np.testing.assert_allclose(seen.intrinsics, camera.intrinsics, atol=1e-3)
+        np.testing.assert_allclose(seen.T_cam_world @ world, camera.T_cam_world, atol=1e-5)
+
+
+def test_the_best_camera_is_used_unless_the_file_uses_one_of_its_own(blender, captured, tmp_path):
+    path, scene = scene_file.write(captured, tmp_path / "scene.r5dgs"), blender.context.scene
+    motions.load(blender, path)
+    assert scene.camera.name == "camera 2" and (scene.render.resolution_x, scene.render.resolution_y) == (96, 72)
+    blender.ops.wm.read_homefile(app_template="")
+    scene = blender.context.scene
+    scene.camera.location.x += 1
+    own, size = scene.camera, scene.render.resolution_x
+    motions.load(blender, path)
+    assert scene.camera == own and scene.render.resolution_x == size
+
+
+def test_cameras_are_left_out_on_demand(blender, captured, tmp_path):
+    before = len(blender.data.cameras)
+    collection = motions.load(blender, scene_file.write(captured, tmp_path / "scene.r5dgs"), cameras=False)
+    assert "Cameras" not in collection.children and len(blender.data.cameras) == before
