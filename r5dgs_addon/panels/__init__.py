@@ -4,7 +4,7 @@ import bpy
 
 from . import capture, export, motion, objects, observed_motion, preview, prompt, render, scene
 
-MODULES = (scene, prompt, objects, motion, observed_motion, preview, export, capture, render)
+MODULES = (scene, objects, prompt, motion, observed_motion, preview, export, capture, render)
 
 
 def register():

@@ -25,15 +25,41 @@ class R5DGS_PT_motion(sidebar.WithScene, bpy.types.Panel):
             layout.label(text="Select an object to see its motion", icon="INFO")
         else:
             _physics(layout, anchor)
-            column = layout.column(align=True)
-            column.operator("r5dgs.re_extrapolate", icon="TRACKING_FORWARDS")
-            column.operator("r5dgs.reset_motion", icon="LOOP_BACK")
-            column.operator("r5dgs.simplify_keys", icon="IPO_BEZIER")
-            column = layout.column(align=True)
-            column.operator("r5dgs.replace_motion", icon="PASTEDOWN")
-            column.operator("r5dgs.duplicate_object", icon="DUPLICATE")
-            column.operator("r5dgs.delete_object", icon="TRASH")
-        _scene(layout, loaded_scenes.active_collection(context))
+            layout.operator("r5dgs.re_extrapolate", icon="TRACKING_FORWARDS")
+
+
+class R5DGS_PT_change_motion(sidebar.Sidebar, bpy.types.Panel):
+    """Keys, motion and copies of the active object."""
+
+    bl_idname = "R5DGS_PT_change_motion"
+    bl_parent_id = R5DGS_PT_motion.bl_idname
+    bl_label = "Keys and Copies"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context):
+        return duplicate_delete.active_anchor(context) is not None
+
+    def draw(self, context):
+        column = self.layout.column(align=True)
+        column.operator("r5dgs.reset_motion", icon="LOOP_BACK")
+        column.operator("r5dgs.simplify_keys", icon="IPO_BEZIER")
+        column = self.layout.column(align=True)
+        column.operator("r5dgs.replace_motion", icon="PASTEDOWN")
+        column.operator("r5dgs.duplicate_object", icon="DUPLICATE")
+        column.operator("r5dgs.delete_object", icon="TRASH")
+
+
+class R5DGS_PT_all_motions(sidebar.WithScene, bpy.types.Panel):
+    """Motion of the whole scene."""
+
+    bl_idname = "R5DGS_PT_all_motions"
+    bl_parent_id = R5DGS_PT_motion.bl_idname
+    bl_label = "Whole Scene"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context):
+        _scene(self.layout, loaded_scenes.active_collection(context))
 
 
 def _physics(layout, anchor) -> None:
@@ -100,4 +126,4 @@ def _scene(layout, collection) -> None:
         status_bar.wrapped(layout, bpy.context, exact.problem, "ERROR")
 
 
-CLASSES = (R5DGS_PT_motion,)
+CLASSES = (R5DGS_PT_motion, R5DGS_PT_change_motion, R5DGS_PT_all_motions)

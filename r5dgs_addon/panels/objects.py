@@ -61,10 +61,25 @@ class R5DGS_PT_objects(sidebar.WithScene, bpy.types.Panel):
         row = layout.row(align=True)
         for idname, text, icon in OTHERS:
             row.operator(idname, text=text, icon=icon)
-        layout.prop(context.scene.r5dgs_words, "click_selects_anchor")
-        index = state.row
-        if 0 <= index < len(state.table):
-            _draw_active(layout.box(), collection, state.table[index])
+
+
+class R5DGS_PT_object(sidebar.WithScene, bpy.types.Panel):
+    """Name, tint and aliases of the active object."""
+
+    bl_idname = "R5DGS_PT_object"
+    bl_parent_id = R5DGS_PT_objects.bl_idname
+    bl_label = "Active Object"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context):
+        collection = loaded_scenes.active_collection(context)
+        return collection is not None and 0 <= collection.r5dgs.row < len(collection.r5dgs.table)
+
+    def draw(self, context):
+        collection = loaded_scenes.active_collection(context)
+        self.layout.prop(context.scene.r5dgs_words, "click_selects_anchor")
+        _draw_active(self.layout, collection, collection.r5dgs.table[collection.r5dgs.row])
 
 
 def _draw_active(box, collection, entry):
@@ -99,4 +114,4 @@ def _motion(own) -> str:
     return ""
 
 
-CLASSES = (R5DGS_UL_objects, R5DGS_PT_objects)
+CLASSES = (R5DGS_UL_objects, R5DGS_PT_objects, R5DGS_PT_object)

@@ -26,6 +26,7 @@ class R5DGS_PT_prompt(sidebar.WithScene, bpy.types.Panel):
 
     bl_idname = "R5DGS_PT_prompt"
     bl_label = "Select by Prompt"
+    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context):
         layout = self.layout

@@ -170,3 +170,15 @@ def test_each_operator_has_a_file_of_its_own(extension):
     for module in operators.modules():
         idnames = [cls.bl_idname for cls in module.CLASSES if cls.bl_idname.startswith("r5dgs.")]
         assert idnames == [f"r5dgs.{module.__name__.rpartition('.')[2]}"]
+
+
+def test_panels_are_in_the_order_of_tasks_and_only_the_first_ones_are_open(extension):
+    panels = importlib.import_module("r5dgs.r5dgs_addon.panels")
+    classes = [panel for module in panels.MODULES for panel in module.CLASSES if hasattr(panel, "bl_label")]
+    sidebar = [one for one in classes if getattr(one, "bl_region_type", "") == "UI"]
+    assert [one.bl_label for one in sidebar if not hasattr(one, "bl_parent_id")] == [
+        *("Scene", "Objects", "Select by Prompt", "Motion", "Preview", "Export", "Capture")
+    ]
+    closed = {one for one in sidebar if "DEFAULT_CLOSED" in getattr(one, "bl_options", ())}
+    assert {one for one in sidebar if hasattr(one, "bl_parent_id")} <= closed
+    assert [one.bl_label for one in sidebar if one not in closed] == ["Scene", "Objects", "Motion"]
