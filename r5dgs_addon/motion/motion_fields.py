@@ -14,7 +14,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import models
 
-VECTORS = {**models.RATES, **models.EXTRA_RATES}
+VECTORS = {name: unit for name, unit in models.FIELDS.items() if unit.size == 3}
 _re_extrapolate: Callable[[list[bpy.types.Object]], object] | None = None  # set by `extrapolate`
 
 
@@ -55,7 +55,7 @@ def _vector(name: str):
 
 def _scalar(name: str, unit: float = 1.0, most: float = math.inf):
     """Property options with getter and setter of a number >= 0 in Blender's units, in multiples of ``unit``."""
-    power = models.SCALARS[name]
+    power = models.SCALARS[name].per_time
 
     def read(state):
         return getattr(state, f"stored_{name}") * units_per_second(state) ** power / unit
@@ -68,10 +68,6 @@ def _scalar(name: str, unit: float = 1.0, most: float = math.inf):
         setattr(state, f"stored_{name}", used * unit / units_per_second(state) ** power)
 
     return {"get": read, "set": write, "update": write_at_once, "options": set()}
-
-
-def _stored(**options):
-    return FloatVectorProperty(size=3, options={"HIDDEN"}, **options)
 
 
 class R5DGS_PG_motion(bpy.types.PropertyGroup):
@@ -100,27 +96,11 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     kind: EnumProperty(
         name="Motion",
         description="Type of motion past the last observed time",
-        items=[(name, kind.label, kind.tooltip) for name, kind in models.KINDS.items()],
+        items=[(name, kind.label, kind.tooltip, models.MENU_NUMBERS[name]) for name, kind in models.KINDS.items()],
         update=write_at_once,
         options=set(),
     )
-    stored_velocity: _stored()
-    stored_acceleration: _stored()
-    stored_angular_velocity: _stored()
-    stored_angular_acceleration: _stored()
-    stored_center_offset: _stored()
-    stored_precession: _stored()
-    stored_second_velocity: _stored()
-    stored_second_acceleration: _stored()
-    stored_second_angular_velocity: _stored()
-    stored_second_angular_acceleration: _stored()
-    stored_frequency: FloatProperty(options={"HIDDEN"})
-    stored_second_frequency: FloatProperty(options={"HIDDEN"})
-    stored_damping: FloatProperty(options={"HIDDEN"})
-    stored_stop_time: FloatProperty(options={"HIDDEN"})
-    stored_bounce_time: FloatProperty(options={"HIDDEN"})
-    stored_restitution: FloatProperty(options={"HIDDEN"})
-    stored_pivot: _stored()  # point chosen on an axis, relative to the anchor
+    stored_pivot: FloatVectorProperty(size=3, options={"HIDDEN"})  # point chosen on an axis, relative to the anchor
     velocity: FloatVectorProperty(
         name="Velocity",
         description="Velocity at the last observed time, per second, along the axes of the parent",
@@ -238,6 +218,20 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
         poll=lambda state, obj: obj.r5dgs.role == "ANCHOR" and obj != state.id_data,
         options=set(),
     )
+
+
+def _add_rates() -> None:
+    """Add the stored value of each rate, and a plain field for a rate that has none above."""
+    properties = R5DGS_PG_motion.__annotations__
+    for name in models.FIELDS:
+        kind, options, access = FloatProperty, {}, _scalar
+        if name in VECTORS:
+            kind, options, access = FloatVectorProperty, {"size": 3}, _vector
+        properties[f"stored_{name}"] = kind(options={"HIDDEN"}, **options)
+        properties.setdefault(name, kind(name=name.replace("_", " ").title(), **access(name)))
+
+
+_add_rates()
 
 
 def register():

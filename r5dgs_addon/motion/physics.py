@@ -24,7 +24,6 @@ from ..ui import plural
 from . import curve_place, fcurves, motion_fields
 
 RATES = tuple(motion_fields.VECTORS)
-FIELDS = (*RATES, *models.SCALARS)
 _LEAST_MOMENT = 1e-3  # minimum moment of inertia of flat or thin bodies, as a fraction of the largest
 _parsed = functools.lru_cache(maxsize=1024)(json.loads)  # for panels; callers must not change the result
 
@@ -117,7 +116,7 @@ def has_motion(anchor: bpy.types.Object) -> bool:
 def show(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
     """Set the fields of an anchor to a motion."""
     state.kind = model.kind
-    for name in FIELDS:
+    for name in models.FIELDS:
         setattr(state, f"stored_{name}", getattr(model, name))
     state.stored_pivot = (0.0, 0.0, 0.0)
 
@@ -137,7 +136,7 @@ def take(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -
         base = replace(base, inertia=back @ base.inertia @ back.T)
     taker.taken = json.dumps(base.to_dict())
     taker.kind, taker.leader = giver.kind, None
-    for name in (*FIELDS, "pivot"):
+    for name in (*models.FIELDS, "pivot"):
         setattr(taker, f"stored_{name}", getattr(giver, f"stored_{name}"))
 
 

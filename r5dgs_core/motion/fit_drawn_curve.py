@@ -60,8 +60,7 @@ def _solve(
 ) -> MotionModel:
     """Fit the free rates by least squares, starting from `_rates`."""
     span = float(taus[-1])
-    units = {"velocity": radius / span, "acceleration": radius / span**2, "center_offset": radius}
-    units |= {"angular_velocity": 1 / span, "angular_acceleration": 1 / span**2}
+    units = {name: (radius if unit.is_length else 1) / span**unit.per_time for name, unit in models.VECTORS.items()}
     first = _rates(taus, quats, displacements)
     start = np.concatenate([first.get(name, np.zeros(3)) / units[name] for name in free])
 
@@ -71,7 +70,7 @@ def _solve(
 
     def errors(batch: np.ndarray) -> np.ndarray:
         found, zero = values(batch[:, None]), np.zeros(3)
-        rates = models.Rates(*(found.get(name, zero) for name in models.RATES))
+        rates = models.Rates(**{models.VECTORS[name].symbol: value for name, value in found.items()})
         poses = models.KINDS[kind].fitted(rates, zero, zero, taus, None)
         return se3.differences(poses, (quats, displacements), radius, 1.0)
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from ..motion import models, rotations
 from ..motion.history import Event, Segment
-from ..motion.models import base
 from .candidates import Candidate, Solution
 from .evidence import Evidence
 
@@ -58,14 +57,10 @@ def _fields(law: Candidate, theta: np.ndarray, radius: float, span: float) -> di
     """Fields of the model in world units and units of time. [..., P] -> [..., 3] or [..., 1] each"""
     rates, parts = law.rates(theta), law.parts(theta)
     found = {"offset_rotvec": parts["r"], "offset_displacement": parts["e"] * radius}
-    for name, value in zip(base.FIELDS, rates, strict=True):
-        if name in models.SCALARS:
-            scale = span ** -models.SCALARS[name]
-        else:
-            unit = models.VECTORS[name]
-            scale = (radius if unit.is_length else 1.0) / span**unit.per_time
-        size = 1 if name in models.SCALARS else 3
-        found[name] = np.broadcast_to(value * scale, (*theta.shape[:-1], size))
+    for (name, unit), value in zip(models.FIELDS.items(), rates, strict=True):
+        length = radius if unit.is_length else 1.0
+        scale = length / span**unit.per_time if unit.size == 3 else span**-unit.per_time
+        found[name] = np.broadcast_to(value * scale, (*theta.shape[:-1], unit.size))
     return found
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors, findings
+from ..motion import models
 from . import array_shapes, cameras
 from .lookup_table import Table
 from .row_runs import runs
@@ -53,27 +54,17 @@ _LIMITS: dict[str, float | np.ndarray] = {
     "light_direction": _LARGE,
     "origin": cameras.FARTHEST,
 }
-_MODEL_LIMITS = {
-    "velocity": cameras.FARTHEST,
-    "acceleration": cameras.FARTHEST,
-    "angular_velocity": _SPIN,
-    "angular_acceleration": _SPIN,
-    "center_offset": cameras.FARTHEST,
-    "offset_rotvec": _SPIN,
-    "offset_displacement": cameras.FARTHEST,
-    "fade_time": MOST_TIME,
-    "radius": cameras.FARTHEST,
-    "frequency": _SPIN,
-    "damping": _SPIN,
-    "stop_time": MOST_TIME,
-    "bounce_time": MOST_TIME,
-    "precession": _SPIN,
-    "second_velocity": cameras.FARTHEST,
-    "second_acceleration": cameras.FARTHEST,
-    "second_angular_velocity": _SPIN,
-    "second_angular_acceleration": _SPIN,
-    "second_frequency": _SPIN,
-}
+
+
+def _limit(unit: models.Unit) -> float:
+    """Largest number of a rate."""
+    if unit.per_time < 0:
+        return MOST_TIME
+    return cameras.FARTHEST if unit.is_length else _SPIN
+
+
+_MODEL_LIMITS = {name: _limit(unit) for name, unit in {**models.VECTORS, **models.SCALARS}.items()}
+_MODEL_LIMITS |= {"fade_time": MOST_TIME, "radius": cameras.FARTHEST}
 _MOST_ID = np.iinfo(np.int32).max
 _CONVERTED = ("background_sh", "identities", *EMBEDDINGS)  # any float dtype in memory; converted on writing
 _DTYPES = {name: dtype for name, dtype in DTYPES.items() if name not in _CONVERTED} | {"origin": np.float64}

@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from r5dgs_core.formats import registry
 from r5dgs_core.scene import scene_file
-from tests.support import layouts, scenes
+from tests.support import layouts, motions, scenes
 
 
 @pytest.fixture
@@ -91,8 +92,9 @@ def test_texts_fit_a_sidebar_of_normal_width(blender, sidebar, scene_path, monke
 
 
 def test_import_menu_export_menu_and_drag_and_drop_lead_to_the_operators(blender, extension):
-    exports = [f"r5dgs.{name}" for name in ("export_ply", "export_cameras", "export_scene", "export_masks")]
-    exports.append("r5dgs.capture_dataset")
+    own = motions.addon("panels.export").FORMATS
+    exports = [own[name][0] if name in own else "r5dgs.export_format" for name in registry.MODULES]
+    exports += [f"r5dgs.{name}" for name in ("export_scene", "export_masks", "capture_dataset")]
     for menu, operators in (("import", ["r5dgs.load_scene"]), ("export", exports)):
         functions = getattr(blender.types, f"TOPBAR_MT_file_{menu}").draw._draw_funcs
         ours = [function for function in functions if function.__module__.startswith("r5dgs.")]

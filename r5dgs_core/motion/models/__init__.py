@@ -4,29 +4,33 @@ import importlib
 
 from .base import BLOCKS, Block, MotionKind, Rates, clocks
 from .evaluation import Stack, curve, evaluate, evaluate_all, evaluate_with_rates, kinks, steps_needed
-from .motion_model import EXTRA_RATES, KINDS, RATES, SCALARS, VECTORS, MotionModel
+from .motion_model import FIELDS, KINDS, RATES, SCALARS, VECTORS, MotionModel, Unit
 
-# Each kind is the module of its name. Append new ones: .blend files store the position in Blender's menu.
-_NAMES = (
-    "static",
-    "translation",
-    "ballistic_spin",
-    "constant_twist",
-    "world_twist",
-    "free_top",
-    "drag",
-    "friction",
-    "precession",
-    "bounce",
-    "two_oscillations",
-)
-KINDS.update({name: importlib.import_module(f"{__name__}.{name}").KIND for name in _NAMES})
+MENU_NUMBERS = {
+    "static": 0,
+    "translation": 1,
+    "ballistic_spin": 2,
+    "constant_twist": 3,
+    "world_twist": 4,
+    "free_top": 5,
+    "drag": 6,
+    "friction": 7,
+    "precession": 8,
+    "bounce": 9,
+    "two_oscillations": 10,
+}
+"""Kinds in the order of Blender's menu, each the module of its name.
+
+.blend files store the numbers: do not change one.
+"""
+KINDS.update({name: importlib.import_module(f"{__name__}.{name}").KIND for name in MENU_NUMBERS})
 STATIC = MotionModel()
 
 __all__ = [
-    "EXTRA_RATES",
     "BLOCKS",
+    "FIELDS",
     "KINDS",
+    "MENU_NUMBERS",
     "RATES",
     "SCALARS",
     "STATIC",
@@ -36,6 +40,7 @@ __all__ = [
     "MotionModel",
     "Rates",
     "Stack",
+    "Unit",
     "clocks",
     "curve",
     "evaluate",

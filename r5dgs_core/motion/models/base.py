@@ -17,6 +17,7 @@ derivatives up to the second are zero.
 
 from __future__ import annotations
 
+from collections import namedtuple
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -26,12 +27,12 @@ import numpy as np
 from .. import rotations, se3
 from ..pose_track import PoseTrack, Window
 from . import first_guesses
-from .motion_model import EXTRA_RATES, RATES, SCALARS, MotionModel
+from .motion_model import FIELDS, RATES, VECTORS, MotionModel
 
 Curve = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Quaternions [..., 4], displacements [..., 3], angular velocities in the world frame [..., 3], velocities [..., 3]."""
-_ZEROS, _NONE = np.zeros(3), np.zeros(1)
 _MOST_EXPONENT = 600.0  # maximum exponent of a decay backwards in time
+_AT_REST = [np.zeros(unit.size) for unit in FIELDS.values()]
 
 
 class Block(NamedTuple):
@@ -60,36 +61,12 @@ BLOCKS = {
 LOGARITHMS = (-6.0, 4.0)  # limits of the logarithms of decay rates per span
 
 
-class Rates(NamedTuple):
+class Rates(namedtuple("Rates", [unit.symbol for unit in FIELDS.values()], defaults=_AT_REST)):
     """Rates of one or many motions, as arrays that broadcast against times [..., 1].
 
-    Attributes:
-        v: Velocity. [..., 3]
-        a: Acceleration. [..., 3]
-        w: Angular velocity. [..., 3]
-        eps: Angular acceleration. [..., 3]
-        u: Centre of rotation relative to the pivot. [..., 3]
-        p: Precession. [..., 3]
-        v2, a2, w2, eps2: The same of a second oscillation. [..., 3]
-        frequency, frequency2, damping, stop_time, bounce_time, restitution: [..., 1]
+    The attributes are the symbols of the rates that `MotionModel` declares: v, a, w, eps and further vectors [..., 3],
+    frequency, damping and further numbers [..., 1]. All are zero by default.
     """
-
-    v: np.ndarray = _ZEROS
-    a: np.ndarray = _ZEROS
-    w: np.ndarray = _ZEROS
-    eps: np.ndarray = _ZEROS
-    u: np.ndarray = _ZEROS
-    p: np.ndarray = _ZEROS
-    v2: np.ndarray = _ZEROS
-    a2: np.ndarray = _ZEROS
-    w2: np.ndarray = _ZEROS
-    eps2: np.ndarray = _ZEROS
-    frequency: np.ndarray = _NONE
-    frequency2: np.ndarray = _NONE
-    damping: np.ndarray = _NONE
-    stop_time: np.ndarray = _NONE
-    bounce_time: np.ndarray = _NONE
-    restitution: np.ndarray = _NONE
 
     @classmethod
     def of(cls, models: Sequence[MotionModel]) -> Rates:
@@ -108,11 +85,6 @@ class Rates(NamedTuple):
     def clock_slopes(self, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of `clocks` by time."""
         return clock_slopes(self.frequency, span, self.damping)
-
-
-FIELDS = (*RATES, *EXTRA_RATES, "frequency", "second_frequency", "damping", "stop_time", "bounce_time", "restitution")
-"""Fields of `MotionModel` in the order of `Rates`."""
-assert set(FIELDS) == {*RATES, *EXTRA_RATES, *SCALARS}
 
 
 class MotionKind:
@@ -238,7 +210,8 @@ class MotionKind:
 
     def moves(self, model: MotionModel) -> bool:
         """True if the curve is not the identity at all times."""
-        return any(getattr(model, name).any() for name in RATES if name != "center_offset")
+        names = ({*RATES, *self.fields} & set(VECTORS)) - {"center_offset"}
+        return any(getattr(model, name).any() for name in names)
 
     def spins(self, model: MotionModel) -> bool:
         """True if the curve has a rotation at any time."""

@@ -13,44 +13,33 @@ KINDS: dict[str, Any] = {}
 
 
 class Unit(NamedTuple):
-    """Unit of a rate: a vector that scales with the scene, or one of angles; per unit of time to a power."""
+    """Unit of a rate: a length or an angle, per unit of time to a power.
 
+    Attributes:
+        symbol: Name of the rate in `base.Rates`.
+        size: 3 for a vector, 1 for a number >= 0.
+        is_length: True if the rate scales with the scene.
+        per_time: Power of the inverse unit of time.
+    """
+
+    symbol: str
+    size: int
     is_length: bool
     per_time: int
 
 
-RATES = {
-    "velocity": Unit(True, 1),
-    "acceleration": Unit(True, 2),
-    "angular_velocity": Unit(False, 1),
-    "angular_acceleration": Unit(False, 2),
-    "center_offset": Unit(True, 0),
-}
-"""Vectors that users edit in Blender."""
-EXTRA_RATES = {
-    "precession": Unit(False, 1),
-    "second_velocity": Unit(True, 1),
-    "second_acceleration": Unit(True, 2),
-    "second_angular_velocity": Unit(False, 1),
-    "second_angular_acceleration": Unit(False, 2),
-}
-"""Vectors of single kinds that users edit; stored only if they are not zero."""
-SCALARS = {
-    "frequency": 1,
-    "second_frequency": 1,
-    "damping": 1,
-    "stop_time": -1,
-    "bounce_time": -1,
-    "restitution": 0,
-}
-"""Numbers >= 0, with the power of their unit per time; stored only if they are not zero."""
-VECTORS = {**RATES, "offset_rotvec": Unit(False, 0), "offset_displacement": Unit(True, 0), **EXTRA_RATES}
 _BASIC_KINDS = ("static", "translation", "ballistic_spin", "constant_twist", "world_twist", "free_top")
-_RATE_NAMES = (*(f"{name}.{axis}" for name in VECTORS for axis in "xyz"), *SCALARS)
+_NEWER = "if a later release wrote the motion, update R5DGS"
 
 
-def _zeros() -> np.ndarray:
-    return np.zeros(3)
+def _vector(symbol: str, is_length: bool, per_time: int) -> Any:
+    """Field of a vector rate; the arguments are those of `Unit`."""
+    return field(default_factory=lambda: np.zeros(3), metadata={"unit": Unit(symbol, 3, is_length, per_time)})
+
+
+def _number(symbol: str, per_time: int) -> Any:
+    """Field of a rate that is a number >= 0; it must not be a length."""
+    return field(default=0.0, metadata={"unit": Unit(symbol, 1, False, per_time)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,33 +71,33 @@ class MotionModel:
     """
 
     kind: str = "static"
-    velocity: np.ndarray = field(default_factory=_zeros)
-    acceleration: np.ndarray = field(default_factory=_zeros)
-    angular_velocity: np.ndarray = field(default_factory=_zeros)
-    angular_acceleration: np.ndarray = field(default_factory=_zeros)
-    center_offset: np.ndarray = field(default_factory=_zeros)
-    offset_rotvec: np.ndarray = field(default_factory=_zeros)
-    offset_displacement: np.ndarray = field(default_factory=_zeros)
+    velocity: np.ndarray = _vector("v", True, 1)
+    acceleration: np.ndarray = _vector("a", True, 2)
+    angular_velocity: np.ndarray = _vector("w", False, 1)
+    angular_acceleration: np.ndarray = _vector("eps", False, 2)
+    center_offset: np.ndarray = _vector("u", True, 0)
+    offset_rotvec: np.ndarray = _vector("r", False, 0)
+    offset_displacement: np.ndarray = _vector("e", True, 0)
     fade_time: float = 0.1
     radius: float = 1.0
-    frequency: float = 0.0
-    damping: float = 0.0
-    precession: np.ndarray = field(default_factory=_zeros)
-    stop_time: float = 0.0
-    bounce_time: float = 0.0
-    restitution: float = 0.0
-    second_velocity: np.ndarray = field(default_factory=_zeros)
-    second_acceleration: np.ndarray = field(default_factory=_zeros)
-    second_angular_velocity: np.ndarray = field(default_factory=_zeros)
-    second_angular_acceleration: np.ndarray = field(default_factory=_zeros)
-    second_frequency: float = 0.0
+    frequency: float = _number("frequency", 1)
+    second_frequency: float = _number("frequency2", 1)
+    damping: float = _number("damping", 1)
+    precession: np.ndarray = _vector("p", False, 1)
+    stop_time: float = _number("stop_time", -1)
+    bounce_time: float = _number("bounce_time", -1)
+    restitution: float = _number("restitution", 0)
+    second_velocity: np.ndarray = _vector("v2", True, 1)
+    second_acceleration: np.ndarray = _vector("a2", True, 2)
+    second_angular_velocity: np.ndarray = _vector("w2", False, 1)
+    second_angular_acceleration: np.ndarray = _vector("eps2", False, 2)
     inertia: np.ndarray | None = None
     covariance: np.ndarray | None = None
     covariance_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {self.kind!r}")
+            raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {self.kind!r}; {_NEWER}")
         for name in VECTORS:
             value = getattr(self, name)
             try:
@@ -184,7 +173,7 @@ class MotionModel:
         known = {f.name for f in fields(MotionModel)}
         unknown = sorted(set(data) - known)
         if unknown:
-            raise ValueError(f"{unknown[0]}: unknown key of a motion model")
+            raise ValueError(f"{unknown[0]}: unknown key of a motion model; {_NEWER}")
         try:
             return MotionModel(**data)
         except TypeError as error:
@@ -223,6 +212,21 @@ class MotionModel:
             change = _change(self.covariance_names, maps)
             values["covariance"] = change @ self.covariance @ change.T
         return replace(self, radius=abs(scale) * self.radius, **values)
+
+
+_UNITS: dict[str, Unit] = {f.name: f.metadata["unit"] for f in fields(MotionModel) if "unit" in f.metadata}
+_BASIC_RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "center_offset")
+VECTORS = {name: unit for name, unit in _UNITS.items() if unit.size == 3}
+"""Vectors of a model, the offsets included."""
+RATES = {name: VECTORS[name] for name in _BASIC_RATES}
+"""Vectors that are always stored."""
+EXTRA_RATES = {name: unit for name, unit in VECTORS.items() if name not in RATES and not name.startswith("offset_")}
+"""Vectors of single kinds; stored only if they are not zero."""
+SCALARS = {name: unit for name, unit in _UNITS.items() if unit.size == 1}
+"""Numbers >= 0; stored only if they are not zero."""
+FIELDS = {**RATES, **EXTRA_RATES, **SCALARS}
+"""Rates that users edit, in the order of `base.Rates`."""
+_RATE_NAMES = (*(f"{name}.{axis}" for name in VECTORS for axis in "xyz"), *SCALARS)
 
 
 def _change(names: tuple[str, ...], maps: dict[str, np.ndarray]) -> np.ndarray:

@@ -183,7 +183,7 @@ def test_an_edited_motion_of_any_kind_plays_in_the_new_file_as_in_blender(blende
     state.acceleration = state.angular_acceleration = state.angular_velocity = (0, 0, 0)
     for name, value in EDITS[kind].items():
         vector = name in units.VECTORS
-        power = units.VECTORS[name].per_time if vector else models.SCALARS[name]
+        power = models.FIELDS[name].per_time
         factor = units.units_per_second(state) ** power
         turns = 2 * np.pi if name.endswith("frequency") else 1.0
         setattr(state, name, np.array(value) * factor if vector else value * factor / turns)

@@ -419,3 +419,18 @@ def test_static_and_turning_models_are_distinguished():
     assert MotionModel("ballistic_spin", frequency=3.0).is_static
     assert not MotionModel("ballistic_spin", angular_acceleration=[0, 0, 1], frequency=3.0).is_static
     assert problems.TUMBLING.turns
+
+
+def test_the_numbers_that_blend_files_store_stay():
+    released = (
+        *("static", "translation", "ballistic_spin", "constant_twist", "world_twist", "free_top"),
+        *("drag", "friction", "precession", "bounce", "two_oscillations"),
+    )
+    assert [models.MENU_NUMBERS[name] for name in released] == list(range(len(released)))
+    assert len(set(models.MENU_NUMBERS.values())) == len(models.MENU_NUMBERS)
+
+
+@pytest.mark.parametrize("data", [{"kind": "teleport"}, {"kind": "static", "jump": [1, 0, 0]}])
+def test_motions_of_later_releases_are_refused_with_a_remedy(data):
+    with pytest.raises(ValueError, match=r"(teleport|jump).*update R5DGS"):
+        models.MotionModel.from_dict(data)
