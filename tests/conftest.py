@@ -46,17 +46,29 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--quick", action="store_true", help=left_out)
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Let pytest-xdist hand out files in the order of collection, not by their number of tests."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect long tests with ``--quick``. Tests with the fixture `blender` count as marked."""
-    if not config.getoption("--quick"):
-        return
-    left_out = [
+    """Deselect long tests with ``--quick``, and begin with the longest files if several processes share them.
+
+    Tests with the fixture `blender` count as marked.
+    """
+    long = [
         item
         for item in items
         if any(item.get_closest_marker(name) for name in NOT_QUICK) or "blender" in getattr(item, "fixturenames", ())
     ]
-    config.hook.pytest_deselected(items=left_out)
-    items[:] = [item for item in items if item not in set(left_out)]
+    if config.getoption("--quick"):
+        config.hook.pytest_deselected(items=long)
+        items[:] = [item for item in items if item not in set(long)]
+    elif hasattr(config, "workerinput"):
+        heavy = {item.path for item in items if item.get_closest_marker("heavy")}
+        longer = {item.path for item in long}
+        items.sort(key=lambda item: (item.path not in heavy, item.path not in longer))
 
 
 def pytest_report_header(config: pytest.Config) -> str:

@@ -38,6 +38,7 @@ PROGRAMS = {
 }
 LONG = (  # more than five seconds each
     "association.synthetic",
+    "extrapolation.appearance",
     "extrapolation.modes",
     "raster.first_frame",
     "training.curve",

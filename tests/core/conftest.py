@@ -1,13 +1,19 @@
 """Shared fixtures: the tiny data set, one training of it, a synthetic scene and a data set of its pictures."""
 
+import copy
+import dataclasses
+import hashlib
+import pickle
 import shutil
 
 import pytest
 
 from r5dgs_core.bake import bake, image_evidence
 from r5dgs_core.bench import playback_speed
+from r5dgs_core.config.config import Config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.train import learning_curves, run
+from r5dgs_core.train.initialization import initialize
 from tests.support import pictures, scenes, tiny_datasets
 
 
@@ -34,6 +40,32 @@ def short_playback():
     """Measure the playback speed over a dozen frames."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(playback_speed, "LEAST_FRAMES", 12)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_starts():
+    """Place the Gaussians of equal runs once and give trainers copies.
+
+    Views without masks or motion are placed anew, as that warns. Settings that the start does not depend on have their
+    defaults.
+    """
+    start, made = initialize.start, {}
+
+    def shared(views, config, motion, find_sky, rng, cloud=None):
+        if any(view.mask is None for view in views) or len({view.t for view in views}) == 1:
+            return start(views, config, motion, find_sky, rng, cloud)
+        settings = {f"train.{name}": getattr(config.train, name) for name in ("sh_degree", "shadows")}
+        config = dataclasses.replace(Config(), init=config.init, curriculum=config.curriculum).replace(**settings)
+        given = (views, config, motion.name, find_sky, rng.bit_generator.state, cloud)
+        key = hashlib.sha1(pickle.dumps(given)).digest()
+        if key not in made:
+            made[key] = start(views, config, motion, find_sky, rng, cloud), rng.bit_generator.state
+        found, rng.bit_generator.state = copy.deepcopy(made[key])
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(initialize, "start", shared)
         yield
 
 
@@ -66,6 +98,12 @@ def trained(tiny, tmp_path_factory):
 def baked(trained, tiny):
     """The scene of that run."""
     return bake.bake(trained, datasets.read(tiny.root))
+
+
+@pytest.fixture(scope="session")
+def kept(trained, tiny):
+    """The scene of that run with its motion as it was trained."""
+    return bake.bake(tiny_datasets.as_trained(trained), datasets.read(tiny.root))
 
 
 @pytest.fixture(scope="session")

@@ -32,6 +32,11 @@ def exchanged(ids):
     return np.select([ids == 1, ids == 2], [2, 1], ids)
 
 
+@pytest.fixture(scope="module")
+def scene_path(baked, tmp_path_factory):
+    return scene_file.write(baked, tmp_path_factory.mktemp("baked") / "scene.r5dgs")
+
+
 @pytest.fixture
 def switched(tiny, tmp_path):
     """Right masks but for one image, whose two objects have each other's id, and a patch of nothing known."""
@@ -47,7 +52,7 @@ def switched(tiny, tmp_path):
     return tmp_path / "switched"
 
 
-def test_a_numbering_per_video_becomes_one(trained, tiny, tmp_path):
+def test_a_numbering_per_video_becomes_one(scene_path, tiny, tmp_path):
     folder, out = tmp_path / "videos", tmp_path / "out"
     names = sorted({view.camera.name for view in datasets.read(tiny.root).train})
     data = rewrite(
@@ -59,7 +64,7 @@ def test_a_numbering_per_video_becomes_one(trained, tiny, tmp_path):
     with pytest.raises(errors.DatasetError, match="r5dgs associate RUN"):
         datasets.read(tiny.root, str(folder)).require_one_numbering()
 
-    cli_associate.run_associate(trained.folder, tiny.root, masks=folder, out=out)
+    cli_associate.run_associate(scene_path, tiny.root, masks=folder, out=out)
 
     repaired = datasets.read(tiny.root, str(out))
     repaired.require_one_numbering()
@@ -100,12 +105,12 @@ def test_a_single_switch_is_found_and_named(trained, tiny, switched, tmp_path, c
     assert summary["agreement"] > summary["agreement_before"]
 
 
-def test_an_object_that_was_missed_gets_its_pixels_back(trained, tiny, tmp_path, capsys):
+def test_an_object_that_was_missed_gets_its_pixels_back(scene_path, tiny, tmp_path, capsys):
     folder, out = tmp_path / "missed", tmp_path / "out"
     data = rewrite(
         tiny.root, folder, lambda view, ids: np.where(ids == 1, 0, ids) if view.name == "train/r_008" else ids
     )
-    cli_associate.run_associate(trained.folder, tiny.root, masks=folder, out=out)
+    cli_associate.run_associate(scene_path, tiny.root, masks=folder, out=out)
     for view, true in zip(datasets.read(tiny.root, str(out)).train, data.train, strict=True):
         new, ids = datasets.load_mask(view), datasets.load_mask(true)
         if view.name == "train/r_008":
@@ -117,20 +122,17 @@ def test_an_object_that_was_missed_gets_its_pixels_back(trained, tiny, tmp_path,
     assert json.loads((out / mask_repair.SUMMARY).read_text())["mended"] == 1
 
 
-def test_a_scene_file_does_as_well_as_its_run(baked, trained, tiny, switched, tmp_path):
-    scene_file.write(baked, tmp_path / "scene.r5dgs")
-    one = cli_associate.run_associate(
-        tmp_path / "scene.r5dgs", tiny.root, masks=switched, out=tmp_path / "one", progress_kind="json"
-    )
+def test_a_scene_file_does_as_well_as_its_run(scene_path, trained, tiny, switched, tmp_path):
+    one = cli_associate.run_associate(scene_path, tiny.root, masks=switched, out=tmp_path / "one", progress_kind="json")
     two = cli_associate.run_associate(trained.folder, masks=switched, out=tmp_path / "two")
     for path in one.rglob("*.png"):
         assert path.read_bytes() == (two / path.relative_to(one)).read_bytes()
 
 
-def test_masks_that_are_read_are_not_written_over(trained, switched):
+def test_masks_that_are_read_are_not_written_over(scene_path, tiny, switched):
     before = {path: path.read_bytes() for path in switched.rglob("*.png")}
     with pytest.raises(errors.ConfigError, match="holds the incoming masks; name another folder"):
-        cli_associate.run_associate(trained.folder, masks=switched, out=switched)
+        cli_associate.run_associate(scene_path, tiny.root, masks=switched, out=switched)
     assert before == {path: path.read_bytes() for path in switched.rglob("*.png")}
 
 
@@ -153,11 +155,11 @@ def split_into_videos(root, folder):
     return data, tiny_datasets.number_by_camera(root, folder, (1, 2)).videos
 
 
-def test_ids_of_videos_that_stay_are_not_called_those_of_the_scene(trained, tiny, tmp_path, capsys, monkeypatch):
+def test_ids_of_videos_that_stay_are_not_called_those_of_the_scene(scene_path, tiny, tmp_path, capsys, monkeypatch):
     """They would be trained with, an object of one video as that of another."""
     data, videos = split_into_videos(tiny.root, tmp_path / "videos")
     monkeypatch.setattr(associate, "GAIN", 1e9)
-    out = cli_associate.run_associate(trained.folder, masks=tmp_path / "videos", out=tmp_path / "out")
+    out = cli_associate.run_associate(scene_path, tiny.root, masks=tmp_path / "videos", out=tmp_path / "out")
     said = capsys.readouterr().out
     assert "the incoming ids are kept" in said and "within single videos" in said and "r5dgs train" not in said
     assert mask_notes.read(out).videos == videos
@@ -174,27 +176,27 @@ def test_images_that_were_numbered_apart_are_so_in_bags(baked, tiny, tmp_path):
     assert [bag.view for bag in bags] == [0, 0, 0, 1, 1, 1]
 
 
-def test_masks_of_others_are_not_written_over_and_own_ones_leave_nothing_behind(trained, tiny, switched, tmp_path):
+def test_masks_of_others_are_not_written_over_and_own_ones_leave_nothing_behind(scene_path, tiny, switched, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(tiny.root / "object_mask", out)
     before = {path: path.read_bytes() for path in out.rglob("*.png")}
     with pytest.raises(errors.DatasetError, match="holds 36 masks that r5dgs associate did not write.*--out"):
-        cli_associate.run_associate(trained.folder, masks=switched, out=out)
+        cli_associate.run_associate(scene_path, tiny.root, masks=switched, out=out)
     assert before == {path: path.read_bytes() for path in out.rglob("*.png")}
     shutil.rmtree(out)
     split_into_videos(tiny.root, tmp_path / "videos")
-    cli_associate.run_associate(trained.folder, masks=tmp_path / "videos", out=out)
+    cli_associate.run_associate(scene_path, tiny.root, masks=tmp_path / "videos", out=out)
     (switched / "train" / "r_004.png").unlink()
-    cli_associate.run_associate(trained.folder, masks=switched, out=out)
+    cli_associate.run_associate(scene_path, tiny.root, masks=switched, out=out)
     made = datasets.read(tiny.root, str(out))
     assert [view.name for view in made.train if view.mask_path is None] == ["train/r_004"]
     assert made.object_names == datasets.read(tiny.root).object_names and made.ground_truth is not None
 
 
-def test_a_stop_leaves_no_masks_of_two_numberings(trained, tiny, switched, tmp_path, monkeypatch):
+def test_a_stop_leaves_no_masks_of_two_numberings(scene_path, tiny, switched, tmp_path, monkeypatch):
     out = tmp_path / "out"
     split_into_videos(tiny.root, tmp_path / "videos")
-    cli_associate.run_associate(trained.folder, masks=tmp_path / "videos", out=out)
+    cli_associate.run_associate(scene_path, tiny.root, masks=tmp_path / "videos", out=out)
     written = []
 
     def stopped(path, ids):
@@ -206,7 +208,7 @@ def test_a_stop_leaves_no_masks_of_two_numberings(trained, tiny, switched, tmp_p
     write = masks.write
     monkeypatch.setattr(masks, "write", stopped)
     with pytest.raises(KeyboardInterrupt):
-        cli_associate.run_associate(trained.folder, masks=switched, out=out)
+        cli_associate.run_associate(scene_path, tiny.root, masks=switched, out=out)
     assert sorted(out.rglob("*.png")) == sorted(written) and not mask_notes.read(out).finished
 
 

@@ -85,19 +85,18 @@ def test_unfinished_runs_with_other_options_bake_to_their_current_state(tiny, tm
     assert_shows_what_was_trained(made, scene)
 
 
-def test_poses_at_the_knots_are_the_trained_ones_in_the_world(trained):
-    scene = bake.bake(tiny_datasets.as_trained(trained))
+def test_poses_at_the_knots_are_the_trained_ones_in_the_world(trained, kept):
     state = checkpoint.load(trained.folder)
     tracks = track_state.tracks_of(state.tensors)
     norm = normalization.Normalization(np.array(state.origin), state.scale)
     draws = np.random.default_rng(0)
     points = draws.normal(size=(20, 3)) * 0.5  # canonical, training coordinates
     for t in tracks.times:
-        quats, displacements = scene_player.group_poses(scene, float(t))
+        quats, displacements = scene_player.group_poses(kept, float(t))
         with torch.no_grad():
             now, last = tracks.poses(float(t)), tracks.poses(float(tracks.times[-1]))
             centers = tracks.group_centers()
-        for group in scene.groups:
+        for group in kept.groups:
             g = group.id
             moved = [
                 norm.points_to_world(
@@ -108,7 +107,7 @@ def test_poses_at_the_knots_are_the_trained_ones_in_the_world(trained):
                 for pose in (now, last)
             ]
             played = rotations.rotate(quats[g], moved[1] - group.pivot) + group.pivot + displacements[g]
-            assert (np.linalg.norm(played - moved[0], axis=1) <= 1e-5 * scene.extent).all()
+            assert (np.linalg.norm(played - moved[0], axis=1) <= 1e-5 * kept.extent).all()
 
 
 def test_at_t_max_nothing_moves(baked):
