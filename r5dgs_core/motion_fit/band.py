@@ -14,39 +14,34 @@ import numpy as np
 
 from ..motion import rotations, se3
 from ..motion.history import MOST_KNOTS, Band
-from ..motion.pose_track import PoseTrack
 from . import rolling
 from .candidates import Noise, Solution
 from .evidence import Evidence
 from .fitted_motion import FADE_PER_SPAN
+from .search import Selected
 
 LEVEL = 0.95
-WIDE = 0.4  # half width above which a motion is not predictable, in radii
-_MULTIPLE = 1.65  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
+WIDE = 0.7  # half width above which a motion is not predictable, in radii
+_MULTIPLE = 1.4  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
 _DRIFT = 5.0  # drift of a track over its span, in units of the lower bound of its noise
 _SOFT = 4.0  # difference of scores that reduces a candidate's weight by e
 _FARTHEST = 8.0  # maximum counted distance of another candidate, in radii
 _MOST_SCALE = 36.0  # maximum factor on the covariance from the errors of earlier predictions
 
 
-def of(
-    chosen: Solution,
-    all_solutions: Sequence[Solution],
-    evidence: Evidence,
-    track: PoseTrack,
-    noise: Noise,
-    least: Noise,
-) -> Widths:
-    """Band of a chosen solution, up to one observed span past t_max.
+def of(selected: Selected, variance: float, least: Noise) -> Widths:
+    """Band of the chosen solution, up to one observed span past t_max.
 
-    A lower bound ``least`` of the noise indicates a slow drift of the track, proportional to it.
+    A lower bound ``least`` of the noise indicates a slow drift of the track, proportional to it. ``variance`` is the
+    factor of the parameters' covariance, from `evidence.variance`.
     """
     tau = np.linspace(0.0, 1.0, MOST_KNOTS)
-    place, turn = _variance(chosen, evidence, tau)
-    place2, turn2 = _spread(chosen, all_solutions, evidence, tau)
+    chosen, evidence, noise = selected.chosen, selected.evidence, selected.noise
+    place, turn = _variance(chosen, variance, tau)
+    place2, turn2 = _spread(chosen, selected.solutions, evidence, tau)
     fading = np.exp(-2 * tau / FADE_PER_SPAN)  # of the bind state, which is a noisy pose
     last = evidence.level * fading
-    scale = min(max(rolling.misses(chosen, track, noise, evidence), 1.0), _MOST_SCALE)
+    scale = min(max(rolling.misses(chosen, selected.track, noise, variance), 1.0), _MOST_SCALE)
     drift = 3 * (_DRIFT * (0.5 + tau)) ** 2
     turn = scale * turn + turn2 + 3 * noise.turn**2 * last + drift * least.turn**2
     place = scale * place + place2 + 3 * noise.place**2 * last + drift * least.place**2
@@ -94,7 +89,7 @@ def _poses(solution: Solution, tau: np.ndarray) -> se3.Pose:
     return solution.candidate.law.path(solution.law_theta, tau)
 
 
-def _variance(solution: Solution, evidence: Evidence, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _variance(solution: Solution, variance: float, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Variance of the position and of the rotation vector, summed over components, from the covariance. [H]"""
     law, theta = solution.candidate.law, solution.law_theta
     quats, d = law.path(theta, tau)
@@ -103,7 +98,7 @@ def _variance(solution: Solution, evidence: Evidence, tau: np.ndarray) -> tuple[
     turns = rotations.quats_to_rotvecs(rotations.multiply(moved_quats, rotations.conjugate(quats)))
     slopes = np.concatenate([moved - d, turns], axis=-1) / step  # [P', H, 6]
     covariance = solution.law_slopes @ solution.inverse @ solution.law_slopes.T
-    spread = evidence.variance * np.einsum("phc,pq,qhc->hc", slopes, covariance, slopes)
+    spread = variance * np.einsum("phc,pq,qhc->hc", slopes, covariance, slopes)
     return np.maximum(spread[:, :3].sum(-1), 0.0), np.clip(spread[:, 3:].sum(-1), 0.0, math.pi**2)
 
 

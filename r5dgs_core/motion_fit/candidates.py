@@ -208,6 +208,16 @@ def residuals(candidate: Candidate, theta: np.ndarray, track: PoseTrack, noise: 
     return se3.differences((track.quats, track.displacements), poses, noise.place, noise.turn)
 
 
+def linearized(
+    candidate: Candidate, theta: np.ndarray, track: PoseTrack, noise: Noise
+) -> tuple[np.ndarray, np.ndarray]:
+    """`residuals` [S, 6] and their derivatives by the parameters [P, S, 6]. theta [P]"""
+    step = 1e-6
+    nearby = theta + step * np.eye(len(theta) + 1, len(theta), -1)
+    found = residuals(candidate, nearby, track, noise)
+    return found[0], (found[1:] - found[0]) / step
+
+
 def solve(
     candidate: Candidate,
     track: PoseTrack,

@@ -13,12 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .candidates import Solution
+from ..motion.pose_track import PoseTrack
+from . import candidates as families
+from .candidates import Noise, Solution
 
 STRONG = 10.0  # minimum difference of scores for a break
 NEAR = 6.0  # maximum difference of scores within which the simplest law is chosen
 _LEAST_LEVEL = 0.05
 _MOST_LAG = 0.8
+_RHOS = np.linspace(0.0, 0.9, 19)  # correlations of neighbouring poses that are weighed
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,42 @@ class Evidence:
         """Score B from a loss, the number of parameters and the number of choices of a pose."""
         penalty = parameters * math.log(6 * self.count / self.inflation)
         return loss / self.variance + penalty + 2 * placed * math.log(self.count)
+
+
+def variance(solution: Solution, track: PoseTrack, noise: Noise, evidence: Evidence) -> float:
+    """Factor of the parameters' covariance, at least that of the evidence, for noise of an unknown correlation.
+
+    The mean of s2 (1 + rho) / (1 - rho) over the restricted likelihood of rho, the correlation of neighbouring poses.
+    Unlike that of `_inflation`, this rho is not reduced by the part of slow noise that the fit follows.
+
+    Args:
+        solution: The chosen solution, fitted to the track.
+        track: Its poses.
+        noise: Their noise.
+        evidence: Noise level of the track.
+    """
+    misses, slopes = families.linearized(solution.candidate, solution.theta, track, noise)
+    weights = np.sqrt(solution.robust * solution.weights)[:, None]
+    free = misses.size - len(slopes)
+    if free <= 0:
+        return evidence.variance
+    steps = np.diff(track.tau) / np.median(np.diff(track.tau))
+    likelihoods, variances = [], []
+    for rho in _RHOS:
+        phi = (rho**steps)[:, None]
+        rest = np.sqrt(1 - phi**2)
+        white, columns = (
+            np.concatenate([x[..., :1, :], (x[..., 1:, :] - phi * x[..., :-1, :]) / rest], axis=-2)
+            for x in (weights * misses, weights * slopes)
+        )
+        normal = np.einsum("psc,qsc->pq", columns, columns) + np.diag(solution.candidate.precision**2)
+        pull = np.einsum("psc,sc->p", columns, white)
+        loss = max(float((white**2).sum() - pull @ np.linalg.pinv(normal, hermitian=True) @ pull), _LEAST_LEVEL**2)
+        logs = 12 * np.log(rest).sum() + np.linalg.slogdet(normal)[1] + free * math.log(loss)
+        likelihoods.append(-0.5 * float(logs))
+        variances.append(loss / free * (1 + rho) / (1 - rho))
+    shares = np.exp(np.array(likelihoods) - max(likelihoods))
+    return max(evidence.variance, float(shares @ np.array(variances) / shares.sum()))
 
 
 def _inflation(parts: Sequence[Solution], count: int, parameters: int) -> float:

@@ -13,14 +13,13 @@ import numpy as np
 from ..motion import models, rotations
 from ..motion.history import Event, Segment
 from .candidates import Candidate, Solution
-from .evidence import Evidence
 
 FADE_PER_SPAN = 0.1 / 0.75
 _RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration")
 
 
-def to_model(solution: Solution, evidence: Evidence, radius: float, span: float) -> models.MotionModel:
-    """Motion model in world units and units of time, with the covariance of its rates."""
+def to_model(solution: Solution, variance: float, radius: float, span: float) -> models.MotionModel:
+    """Motion model in world units and units of time; ``variance`` is the factor of the parameters' covariance."""
     law, theta = solution.candidate.law, solution.law_theta
     fields = _fields(law, theta, radius, span)
     step = 1e-6
@@ -32,7 +31,7 @@ def to_model(solution: Solution, evidence: Evidence, radius: float, span: float)
         turn = rotations.quats_to_rotmats(rotations.rotvecs_to_quats(fields["offset_rotvec"]))
         inertia = turn @ law.inertia @ turn.T
     slopes = slopes @ solution.law_slopes
-    spread = evidence.variance * slopes @ solution.inverse @ slopes.T
+    spread = variance * slopes @ solution.inverse @ slopes.T
     values: dict[str, Any] = {
         name: float(value[0]) if name in models.SCALARS else value for name, value in fields.items()
     }
@@ -64,7 +63,7 @@ def _fields(law: Candidate, theta: np.ndarray, radius: float, span: float) -> di
     return found
 
 
-def events(solution: Solution, evidence: Evidence, t_max: float, span: float) -> tuple[Event, ...]:
+def events(solution: Solution, variance: float, t_max: float, span: float) -> tuple[Event, ...]:
     """Events of a solution in the observed window, in order; of those within a gap between poses, the first."""
     gap = -solution.candidate.window.first / len(solution.weights)
     found: list[tuple[str, np.ndarray]] = []
@@ -80,10 +79,10 @@ def events(solution: Solution, evidence: Evidence, t_max: float, span: float) ->
         for i, row in enumerate(rows):
             if row < len(moved):
                 slopes[i, k] = (float(moved[row][1][0]) - float(found[i][1][0])) / step
-    variances = evidence.variance * np.einsum("ip,pq,iq->i", slopes, solution.inverse, slopes)
+    variances = variance * np.einsum("ip,pq,iq->i", slopes, solution.inverse, slopes)
     return tuple(
-        Event(t_max + span * float(time[0]), kind, span * float(np.sqrt(max(variance, 0.0))))
-        for (kind, time), variance in zip(found, variances, strict=True)
+        Event(t_max + span * float(time[0]), kind, span * float(np.sqrt(max(square, 0.0))))
+        for (kind, time), square in zip(found, variances, strict=True)
     )
 
 

@@ -19,6 +19,7 @@ from ..motion.history import NONE, History
 from ..motion.pose_track import PoseTrack
 from . import band as bands
 from . import candidates as families
+from . import evidence as evidences
 from . import fitted_motion, noise, search
 from .candidates import Candidate, Noise
 from .search import Selected
@@ -127,13 +128,15 @@ def _result(
 ) -> Fit:
     """Fit in world units."""
     chosen, evidence, level = selected.chosen, selected.evidence, selected.noise
-    model = fitted_motion.to_model(chosen, evidence, radius, span)
-    parts = [(part, fitted_motion.events(part, evidence, t_max, span)) for part in (*selected.earlier, chosen)]
+    variance = evidences.variance(chosen, selected.track, level, evidence)
+    model = fitted_motion.to_model(chosen, variance, radius, span)
+    parts = [(part, fitted_motion.events(part, evidence.variance, t_max, span)) for part in selected.earlier]
+    parts.append((chosen, fitted_motion.events(chosen, variance, t_max, span)))
     found = tuple(event for _, own in parts for event in own)
     owners = [part for part, own in parts for _ in own]
     first = t_max + span * selected.first
     segments = fitted_motion.segments([*owners, chosen], found, first, t_max, radius, span)
-    band = bands.of(chosen, selected.solutions, evidence, selected.track, level, least).scaled(t_max, radius, span)
+    band = bands.of(selected, variance, least).scaled(t_max, radius, span)
     name = chosen.candidate.law.name
     rests = bool(found) and found[-1].kind == "stop"
     by_name = {s.candidate.name: s for s in selected.solutions}

@@ -9,18 +9,17 @@ import numpy as np
 from ..motion.pose_track import PoseTrack
 from . import candidates as families
 from .candidates import Noise, Solution
-from .evidence import Evidence
 
 HELD_OUT = 0.2  # share of the last poses that are predicted
 _FEWEST = 8  # minimum number of poses of a track for this test
 _MOST_SQUARE = 600.0  # maximum squared prediction error, in variances
 
 
-def misses(chosen: Solution, track: PoseTrack, noise: Noise, evidence: Evidence) -> float:
+def misses(chosen: Solution, track: PoseTrack, noise: Noise, variance: float) -> float:
     """Mean squared error, relative to its expectation, of predictions by the law refitted to earlier poses.
 
-    The expected squared error is the variance of the noise plus that of the refitted prediction. Returns 1 for short
-    tracks.
+    The expected squared error is the variance of the noise plus that of the refitted prediction, both in units of
+    ``variance``. Returns 1 for short tracks.
     """
     count = len(track)
     if count < _FEWEST:
@@ -33,11 +32,9 @@ def misses(chosen: Solution, track: PoseTrack, noise: Noise, evidence: Evidence)
         earlier = families.solve(chosen.candidate, track.rows(slice(0, count - held)), noise, [chosen.theta], steps=8)
         if earlier is None:
             return _MOST_SQUARE
-        step = 1e-6
-        nearby = earlier.theta + step * np.eye(len(earlier.theta) + 1, len(earlier.theta), -1)
-        late = families.residuals(chosen.candidate, nearby, track.rows(slice(count - held, None)), noise)
-        slopes = (late[1:] - late[0]) / step  # [P, H, 6]
+        later = track.rows(slice(count - held, None))
+        late, slopes = families.linearized(chosen.candidate, earlier.theta, later, noise)
         expected = 6 + np.einsum("phc,pq,qhc->h", slopes, earlier.inverse, slopes)
-        squares = np.minimum((late[0] ** 2).sum(-1), _MOST_SQUARE * evidence.variance)
-        shares.append(squares / np.maximum(expected, 6.0) / evidence.variance)
+        squares = np.minimum((late**2).sum(-1), _MOST_SQUARE * variance)
+        shares.append(squares / np.maximum(expected, 6.0) / variance)
     return float(np.concatenate(shares).mean()) if shares else 1.0

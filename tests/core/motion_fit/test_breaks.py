@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import models, pose_track, rotations
-from r5dgs_core.motion_fit import candidates, evidence, fitted_motion, kinks, model_selection, search
+from r5dgs_core.motion_fit import candidates, fitted_motion, kinks, model_selection, search
 from tests.support import problems
 from tests.support.problems import RADIUS, SIZE, T_MAX
 
@@ -196,7 +196,7 @@ def test_bounces_that_no_pose_separates_are_one_event():
     theta = ball.pack(parts)
     solution = candidates.Solution(ball, theta, np.eye(len(theta)), np.zeros((15, 6)), np.ones(15))
     assert len(ball.events(theta)) > 10
-    found = fitted_motion.events(solution, evidence.Evidence(15, 1.0, 1.0), T_MAX, T_MAX)
+    found = fitted_motion.events(solution, 1.0, T_MAX, T_MAX)
     assert len(found) > 1
     assert min(np.diff([event.time for event in found])) > T_MAX / 15
 
