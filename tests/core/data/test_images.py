@@ -120,7 +120,7 @@ def test_a_full_disk_is_an_error_and_leaves_the_old_image(tmp_path):
         "except errors.DatasetError as error: print(error)"
     )
     shown = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True).stdout
-    assert f"{path}: cannot write the image" in shown and "room" in shown
+    assert f"{path}: cannot write the image" in shown and "check the free disk space" in shown
     assert (images.read_raw(path) == old).all() and [p.name for p in tmp_path.iterdir()] == ["picture.png"]
 
 

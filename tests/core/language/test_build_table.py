@@ -372,7 +372,7 @@ def test_an_id_is_not_taken_as_the_name_of_another_object(file):
         (["query", "FILE", "mug", "--threshold", "2"], "--threshold 2.0: expected a number from 0 to 1"),
         (["lookup", "FILE", "--encoder", "plain", "--captions", "no.json"], "no.json: the file is missing"),
         (["lookup", "FILE", "--encoder", "plain", "--out", "no.zip"], "expected a name that ends in .r5dgs"),
-        (["lookup", "FILE", "--encoder", "plain", "--words", "no.txt"], "--words no.txt: expected text"),
+        (["lookup", "FILE", "--encoder", "plain", "--words", "no.txt"], "--words no.txt: cannot be read as text"),
     ],
 )
 def test_mistakes_are_errors_of_one_line_and_keep_the_file(file, capsys, arguments, message):
