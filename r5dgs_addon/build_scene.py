@@ -15,8 +15,9 @@ from mathutils import Matrix, Vector
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.color import srgb
-from ..r5dgs_core.scene import cameras
+from ..r5dgs_core.scene import cameras, spherical_harmonics
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
+from ..r5dgs_core.scene.splats import to_opacities
 from . import compat
 from .motion import event_markers, keyframes, physics
 from .scene import (
@@ -268,7 +269,7 @@ def _cloud(
     data.name = name = object_names.fit(_part_name(scene, part, largest))
     cloud = bpy.data.objects.new(name, data)
     collection.objects.link(cloud)
-    color = srgb.to_linear(np.minimum(_color(scene, part.object_id), 1.0))
+    color = srgb.to_linear(_color(scene, part.object_id))
     cloud.color = (*color, 1.0)
     cloud.parent = anchor
     pivot = Vector(anchor.r5dgs.pivot)
@@ -279,11 +280,11 @@ def _cloud(
     return cloud
 
 
-def _color(scene: Scene, object_id: int) -> tuple[float, float, float]:
-    try:
-        return scene.object(object_id).color
-    except KeyError:
-        return (0.5, 0.5, 0.5)
+def _color(scene: Scene, object_id: int) -> np.ndarray:
+    """Mean display-referred color of an object's Gaussians, weighted by opacity. [3]"""
+    rows = scene.gaussians.object_ids == object_id
+    shown = 0.5 + spherical_harmonics.C0 * scene.gaussians.sh[rows, 0].astype(np.float64)
+    return np.average(np.clip(shown, 0, 1), axis=0, weights=to_opacities(scene.gaussians.opacity_logits[rows]) + 1e-6)
 
 
 def _describe(

@@ -24,12 +24,15 @@ def set_label(entry: bpy.types.PropertyGroup, name: str) -> None:
 
 
 def color(entry: bpy.types.PropertyGroup) -> tuple[float, float, float]:
-    """Display-referred viewport colour of the object: its tint if tinted, otherwise the table's colour."""
+    """Display-referred mean color of the object, times its tint."""
     own = object_names.clouds(entry.id_data, entry.object_id)
-    return tuple(srgb.from_linear(np.minimum(own[0].color[:3], 1)).tolist()) if own else GREY
+    if not own:
+        return GREY
+    plain = own[0].r5dgs_look.plain if own[0].r5dgs_look.shown else own[0].color
+    return tuple(np.minimum(srgb.from_linear(np.minimum(plain[:3], 1)) * object_tint.tint(own[0]), 1).tolist())
 
 
-def set_color(entry: bpy.types.PropertyGroup, value) -> None:
+def set_tint(entry: bpy.types.PropertyGroup, value) -> None:
     """Tint the object."""
     object_tint.recolor(object_names.clouds(entry.id_data, entry.object_id), value)
 

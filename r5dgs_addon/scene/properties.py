@@ -56,13 +56,12 @@ class R5DGS_PG_entry(bpy.types.PropertyGroup):
     )
     color: FloatVectorProperty(
         name="Color",
-        description="Color in viewports; changing it tints the object",
+        description="Average color of the object, with its tint",
         subtype="COLOR_GAMMA",
         size=3,
         min=0.0,
         max=1.0,
         get=object_list.color,
-        set=object_list.set_color,
     )
     tint: FloatVectorProperty(
         name="Tint",
@@ -73,7 +72,7 @@ class R5DGS_PG_entry(bpy.types.PropertyGroup):
         soft_max=1.0,
         max=8.0,
         get=object_list.tint,
-        set=object_list.set_color,
+        set=object_list.set_tint,
     )
     hidden: BoolProperty(
         name="Hide in Viewport",

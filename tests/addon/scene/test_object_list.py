@@ -75,17 +75,19 @@ def test_eyes_hide_the_clouds_of_an_object_and_nothing_else(blender, loaded):
     assert {obj.name: (obj.hide_get(), obj.hide_render) for obj in blender.context.scene.objects} == before
 
 
-def test_colours_of_rows_are_the_viewports_and_choosing_one_tints(blender, loaded):
+def test_colours_of_rows_are_the_mean_of_the_object_times_its_tint(blender, loaded):
     scene = scenes.make_scene(n=300)
-    entry = row_of(loaded, "mug")
-    np.testing.assert_allclose(entry.color, scene.object(1).color, atol=1e-5)
-    entry.color = TINT
-    cloud = blender.data.objects["mug"]
-    np.testing.assert_allclose(cloud.r5dgs_look.tint, TINT, atol=1e-6)
-    np.testing.assert_allclose(entry.color, TINT, atol=1e-5)
+    entry, rows = row_of(loaded, "mug"), scene.gaussians.object_ids == 1
+    shown = np.clip(0.5 + 0.28209479177387814 * scene.gaussians.sh[rows, 0], 0, 1)
+    weights = 1 / (1 + np.exp(-scene.gaussians.opacity_logits[rows]))
+    mean = (weights[:, None] * shown).sum(0) / weights.sum()
+    np.testing.assert_allclose(entry.color, mean, atol=1e-3)
+    entry.tint = TINT
+    np.testing.assert_allclose(blender.data.objects["mug"].r5dgs_look.tint, TINT, atol=1e-6)
+    np.testing.assert_allclose(entry.color, mean * TINT, atol=1e-3)
     np.testing.assert_allclose(entry.tint, TINT, atol=1e-6)
     entry.tint = (1.0, 1.0, 1.0)
-    np.testing.assert_allclose(entry.color, scene.object(1).color, atol=1e-5)
+    np.testing.assert_allclose(entry.color, mean, atol=1e-3)
 
 
 def test_recolouring_takes_all_clouds_of_the_selected_objects(blender, loaded):
@@ -142,7 +144,7 @@ def test_in_a_linked_scene_only_local_properties_change(blender, loaded, tmp_pat
     with pytest.raises(RuntimeError, match="linked"):
         blender.ops.r5dgs.rename_object(new_name="beaker")
     row_of(linked, "mug").label = "beaker"
-    row_of(linked, "mug").color = TINT
+    row_of(linked, "mug").tint = TINT
     row_of(linked, "mug").hidden_in_renders = True
     mug = linked.all_objects["mug"]
     assert tuple(mug.r5dgs_look.tint) == (1, 1, 1) and not mug.hide_render
