@@ -8,6 +8,7 @@ import functools
 import graphlib
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -329,6 +330,41 @@ def test_no_room_of_the_core_imports_upward(own):
         if room(module) == own:
             problems += [f"{path.relative_to(ROOT)}: {text}" for text in core_problems(path.read_text(), package, own)]
     assert not problems, "\n".join(problems)
+
+
+def test_the_rooms_of_the_core_use_all_their_permissions():
+    used: dict[str, set[str]] = {name: set() for name in ALLOWED}
+    for importer, imported, _ in project_imports(project_sources()):
+        own, other = (room(name.removeprefix("r5dgs.")) for name in (importer, imported))
+        if own and other and other not in GROUND | {own}:
+            used[own].add(other)
+    assert used == ALLOWED
+
+
+def reached(arrows: Mapping[str, set[str]], start: str) -> set[str]:
+    """Names that the arrows reach from a name, itself included."""
+    found, rest = set(), [start]
+    while rest:
+        if (name := rest.pop()) not in found:
+            found.add(name)
+            rest += arrows.get(name, ())
+    return found
+
+
+def test_the_picture_of_the_rooms_shows_the_allowed_imports():
+    page = (ROOT / "docs/developer/architecture.md").read_text()
+    picture: dict[str, set[str]] = {}
+    for start, ends in re.findall(r"^ +(\w+)(?:\[.*\])? --> (.+)$", page, re.MULTILINE):
+        picture.setdefault(start, set()).update(ends.split(" & "))
+    shown = set(picture).union(*picture.values())
+    arrows = dict(ALLOWED, addon=set(), operators={"addon"})
+    for importer, imported, item in project_imports(project_sources()):
+        own = {"r5dgs_addon": "addon", "operators": "operators"}.get(importer.split(".")[1])
+        if own and not item.late:
+            arrows[own] = arrows[own] | {room(imported.removeprefix("r5dgs."))} - {None}
+    assert {"motion", "cli", "addon", "operators"} <= shown
+    for name in shown:
+        assert reached(picture, name) == reached(arrows, name) & shown, name
 
 
 def test_no_module_imports_itself_on_a_detour():
