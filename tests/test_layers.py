@@ -150,7 +150,7 @@ LATE_IMPORTS = {
     "train.representations.registry": {"train.representations.field", "train.representations.tracks"},
     "train.representations.tracks": {"train.representations.field"},
     "train.finish": {"train.object_discovery"},
-    "train.run": {"train.object_discovery", "train.residual_trial"},
+    "train.run": {"train.object_discovery", "train.pose_repair", "train.residual_trial"},
 }
 # The same of the add-on: OpenImageIO is optional there.
 LATE_ADDON_IMPORTS = {"capture.files": {"data.images"}}

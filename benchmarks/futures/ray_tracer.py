@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from r5dgs_core.scene.cameras import Camera
@@ -106,7 +106,7 @@ def plain(rng: np.random.Generator) -> Texture:
 def floor(rng: np.random.Generator) -> Texture:
     """Patches of muted colours on the plane z = 0."""
     seeds, colors = rng.uniform(-7, 7, (250, 2)), rng.uniform(0.4, 0.65, (250, 3))
-    tree = cKDTree(seeds)
+    tree = KDTree(seeds)
     return lambda p: colors[tree.query(p[:, :2])[1]]
 
 

@@ -23,6 +23,7 @@ from ..render import warm_up
 from ..time_left import Phase, Timed
 from . import checkpoint, checkpoint_content, finish, interrupt, learning_curves, probe, step_log
 from .identity import packed_masks
+from .representations.representation import TRACKS
 from .trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -198,8 +199,13 @@ def decision_step(trainer: Trainer) -> int | None:
 
 
 def take_step(trainer: Trainer, decision: int | None, progress: Progress) -> None:
-    """Take a step; if it is the step ``decision`` (see `decision_step`), try residuals after it."""
+    """Take a step; then repair poses or, after the step ``decision`` (see `decision_step`), try residuals if due."""
+    entered = trainer.curriculum.entered
     trainer.step()
+    if trainer.motion.name == TRACKS:
+        from . import pose_repair  # a scene at rest does not load the tracks
+
+        pose_repair.after_step(trainer, entered)
     if trainer.iteration == decision:
         from . import residual_trial
 

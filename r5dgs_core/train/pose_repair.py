@@ -1,0 +1,183 @@
+"""Repair of slipped poses: knots at which the track of a body fell into a neighbouring minimum of the picture error.
+
+A knot is suspicious if the picture error of the body is unusual there, or if its rotation is far from the one that
+constant spin between its neighbours gives. Such a knot is registered anew (`registration`) from its own pose and from
+the one that its neighbours predict, and if the error stays unusual, from turns of the prediction. The pose of least
+picture error is taken; among similar errors, the one nearest to the prediction. After a repair the neighbours are
+suspicious, too, so that a run of slipped knots is repaired from its ends. Knots that keep their poses keep all bits.
+
+A knot is looked at when it enters training, where a fast body is easily lost, and in some rounds over all knots.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from ..motion import rotations
+from ..motion.se3 import Pose
+from . import registration
+from .registration import Registration
+from .representations.tracks import TracksRepresentation
+from .trainer import Trainer
+
+log = logging.getLogger(__name__)
+
+ROUNDS = (0.4, 0.7)  # shares of the run after which all knots are looked at
+JUMP = np.radians(8.0)  # angle from the prediction above which a knot is suspicious
+UNUSUAL = 1.5  # picture error above which it is, in the median of the body
+CLEARLY = 0.93  # picture error of a better pose, in that of the present one
+SIMILAR = 1.03  # picture error, in the least, up to which the prediction decides
+APART = np.radians(3.0)  # angle from which two poses are different
+TURNS = np.radians((25.0, 50.0))  # of the starts about each axis
+FEWEST_VIEWS, VIEWS = 2, 3  # of a knot; one view alone does not determine a place
+REFINED, STEPS = 2, 4  # turns that are refined, and steps
+MOST = 2  # registrations of a body in a round, in knots
+
+
+def applies(trainer: Trainer) -> bool:
+    """Return True if bodies have tracks of four or more knots, and masks show them."""
+    masked = any(view.mask is not None for view in trainer.views)
+    tracked = isinstance(trainer.motion, TracksRepresentation)
+    return trainer.config.train.repair and tracked and masked and len(trainer.times) > 3
+
+
+def after_step(trainer: Trainer, entered: tuple[int, int]) -> None:
+    """Repair poses after a step if it is due.
+
+    Args:
+        trainer: A run.
+        entered: First and last knot that took part before the step.
+    """
+    if not applies(trainer):
+        return
+    first, last = trainer.curriculum.entered
+    new = [s for s in (*range(entered[0] - 1, first - 1, -1), *range(entered[1] + 1, last + 1))]
+    if new:
+        usual = registration.errors(trainer, trainer.first_time, VIEWS)
+        for s in new:
+            for row in np.flatnonzero(registration.errors(trainer, s, VIEWS) > UNUSUAL * usual):
+                knots = np.flatnonzero(trainer.places.measured[row])
+                knots = knots[(knots >= first) & (knots <= last)]
+                _repair_knot(trainer, int(row) + 1, s, knots, UNUSUAL * float(usual[row]))
+    total = trainer.config.train.iterations
+    if first == 0 and last == len(trainer.times) - 1 and trainer.iteration in {int(x * total) for x in ROUNDS}:
+        repair(trainer)
+
+
+def repair(trainer: Trainer) -> int:
+    """Look at all knots of all rigid bodies, and return the number of knots with new poses."""
+    motion = _tracks(trainer)
+    bent = set() if motion.residuals is None else set(motion.residuals.bodies)
+    count = len(trainer.times)
+    errors = np.stack([registration.errors(trainer, s, VIEWS) for s in range(count)], -1)  # [B - 1, S]
+    changed: dict[int, int] = {}
+    for body in range(1, motion.tracks.bodies):
+        seen = np.flatnonzero(np.isfinite(errors[body - 1]))
+        if body in bent:
+            continue
+        queue = suspicious(errors[body - 1], _quats(trainer, body), trainer.times).tolist()
+        limit = UNUSUAL * float(np.median(errors[body - 1, seen])) if queue else 0.0
+        found: set[int] = set()
+        for _ in range(MOST * count):
+            if not queue:
+                break
+            s = queue.pop(0)
+            if _repair_knot(trainer, body, s, seen, limit):
+                found.add(s)
+                queue += [int(n) for n in seen if abs(n - s) == 1 and n not in queue]
+        if found:
+            changed[int(trainer.object_ids[body])] = len(found)
+    if changed:
+        log.info("poses repaired: %s", ", ".join(f"{n} of object {key}" for key, n in changed.items()))
+    return sum(changed.values())
+
+
+def suspicious(errors: np.ndarray, quats: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Find the knots of a body that may have slipped.
+
+    Args:
+        errors: Mean squared error of its pixels, nan if it is not visible. [S]
+        quats: Rotations, unit wxyz. [S, 4]
+        times: Knots. [S]
+
+    Returns:
+        Indices of visible suspicious knots, the worst first.
+    """
+    seen = np.flatnonzero(np.isfinite(errors))
+    score = np.zeros(len(errors))
+    score[seen] = errors[seen] / max(float(np.median(errors[seen])), 1e-12) / UNUSUAL if len(seen) else 0.0
+    for a, s, b in zip(seen[:-2], seen[1:-1], seen[2:], strict=True):
+        expected = _between(times, quats, a, b, s)
+        score[s] = max(score[s], float(rotations.angle_between(quats[s], expected)) / JUMP)
+    found = np.flatnonzero(score > 1)
+    return found[np.argsort(-score[found], kind="stable")]
+
+
+def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit: float) -> bool:
+    """Register a knot; return True if it has a new pose.
+
+    Args:
+        trainer: The run.
+        body: Row of the body.
+        knot: The knot.
+        seen: Knots that may predict it.
+        limit: Picture error above which turns of the prediction are tried.
+    """
+    look = Registration(trainer, _tracks(trainer), body, knot, VIEWS)
+    predicted = _predictions(trainer, body, knot, seen)
+    if len(look) < FEWEST_VIEWS or not predicted:
+        return False
+    own = look.pose
+    found = [look.refined(pose, STEPS) for pose in [own, *predicted[:1]][: 1 + _apart(own, predicted[0])]]
+    if min(error for _, error in found) > limit:
+        turned = sorted(_turned(predicted[0]) + predicted[1:], key=look.error)
+        found += [look.refined(pose, STEPS) for pose in turned[:REFINED]]
+    least = min(error for _, error in found)
+    near = [pose for pose, error in found if error <= SIMILAR * least]
+    best = min(near, key=lambda pose: float(rotations.angle_between(pose[0], predicted[0][0])))
+    better = _apart(best, own) and least < CLEARLY * look.error(own)
+    if better:
+        look.put(best)
+    return better
+
+
+def _predictions(trainer: Trainer, body: int, knot: int, seen: np.ndarray) -> list[Pose]:
+    """Poses that other knots predict by constant spin: between neighbours, from before, from after; or the nearest."""
+    before, after = seen[seen < knot][::-1], seen[seen > knot]
+    pairs = [(side[0], side[1]) for side in (before, after) if len(side) > 1]
+    if len(before) and len(after):
+        pairs.insert(0, (before[0], after[0]))
+    tracks, quats = _tracks(trainer).tracks, _quats(trainer, body)
+    own = tracks.params["translations"].detach().numpy()[body, knot].astype(np.float64)
+    nearest = [quats[side[0]] for side in (before, after) if len(side)][:1]
+    return [(q, own) for q in [_between(tracks.times, quats, a, b, knot) for a, b in pairs] or nearest]
+
+
+def _tracks(trainer: Trainer) -> TracksRepresentation:
+    assert isinstance(trainer.motion, TracksRepresentation)
+    return trainer.motion
+
+
+def _quats(trainer: Trainer, body: int) -> np.ndarray:
+    return rotations.normalize(_tracks(trainer).tracks.knot_quats().detach().numpy()[body].astype(np.float64))
+
+
+def _between(times: np.ndarray, quats: np.ndarray, a: int, b: int, s: int) -> np.ndarray:
+    """Rotation at knot s by constant spin from knot a to knot b; s may lie outside. [4]"""
+    share = (times[s] - times[a]) / (times[b] - times[a])
+    turn = rotations.quats_to_rotvecs(rotations.multiply(quats[b], rotations.conjugate(quats[a])))
+    return rotations.normalize(rotations.multiply(rotations.rotvecs_to_quats(share * turn), quats[a]))
+
+
+def _turned(pose: Pose) -> list[Pose]:
+    """Turns of a pose about the axes of a cube's faces and corners."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3)
+    axes = np.concatenate([np.eye(3), -np.eye(3), corners])
+    turns = rotations.rotvecs_to_quats(np.concatenate([angle * axes for angle in TURNS]))
+    return [(rotations.normalize(rotations.multiply(turn, pose[0])), pose[1]) for turn in turns]
+
+
+def _apart(a: Pose, b: Pose) -> bool:
+    return bool(rotations.angle_between(a[0], b[0]) > APART)

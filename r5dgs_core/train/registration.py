@@ -1,0 +1,189 @@
+"""Registration of one body at one knot: the pose at which the canonical Gaussians reproduce the body's pixels.
+
+Only the pose changes; the Gaussians stay fixed. The pictures are cropped to the body's masks, only Gaussians that reach
+them are drawn, and harmonics of higher degree are left out. Notation: a change of a pose is a rotation vector about the
+body's centre in world axes, and a displacement in radii of the body; P values of pixels.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from ..model.group_poses import GroupPoses
+from ..motion import rotations
+from ..motion.se3 import Pose
+from ..raster import rasterize_splats
+from ..scene import cameras, sh_color
+from ..scene.cameras import Camera
+from . import train_views
+from .representations import fused_posing
+from .representations.fused_posing import Splats
+from .representations.tracks import TracksRepresentation
+from .trainer import Trainer
+
+MARGIN = 2  # dilation of masks, px
+FEWEST_PIXELS = 8  # of a mask that helps
+STEP = 0.02  # change of the pose for finite differences, rad or radii
+_LARGEST = 0.35  # step of the refinement, rad or radii
+_ENOUGH = 1e-2  # relative gain of a step below which the refinement ends
+_REACH = 3.0  # extent of a Gaussian, standard deviations
+_FIELDS = ("means", "quats", "scales", "opacities", "colors")
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A view of the body: the crop of its picture, and the posed Gaussians of other groups that reach it."""
+
+    camera: Camera
+    truth: np.ndarray
+    region: np.ndarray
+    others: Splats
+
+
+class Registration:
+    """Pictures of a body at a knot.
+
+    Args:
+        trainer: A run.
+        motion: Its tracks.
+        body: Row of the body.
+        knot: The knot.
+        most: Largest number of views, spread evenly over those that show the body.
+    """
+
+    def __init__(self, trainer: Trainer, motion: TracksRepresentation, body: int, knot: int, most: int):
+        self._trainer, self._motion, self._body, self._knot = trainer, motion, body, knot
+        self._radius = float(trainer.places.radii[body - 1])
+        object_id, params = int(trainer.object_ids[body]), trainer.gaussians.params
+        rows = torch.from_numpy(np.flatnonzero(trainer.gaussians.motion_ids.numpy() == body))
+        names = ("means", "quats", "log_scales", "opacity_logits", "shading")
+        self._shape = {name: params[name].detach()[rows] for name in names}
+        self._shape["colors"] = sh_color.dc_to_rgb(params["sh"].detach()[rows, 0])
+        shown = train_views.spread(
+            [v for v in views_at(trainer, knot) if (v.mask == object_id).sum() >= FEWEST_PIXELS], most
+        )
+        self._looks = [self._look(view, view.mask == object_id) for view in shown]
+
+    def __len__(self) -> int:
+        """Number of views."""
+        return len(self._looks)
+
+    def _entries(self) -> list[torch.Tensor]:
+        """Parts of the tracks that hold the pose: base rotation [4], rotation vector [3] and displacement [3]."""
+        tracks = self._motion.tracks
+        every = (tracks.base_quats, tracks.params["rotvecs"].detach(), tracks.params["translations"].detach())
+        return [x[self._body, self._knot] for x in every]
+
+    @property
+    def pose(self) -> Pose:
+        """The body's pose in the tracks: unit wxyz [4] and displacement [3], float64."""
+        base, rotvec, shift = (x.numpy().astype(np.float64) for x in self._entries())
+        return rotations.normalize(rotations.multiply(rotations.rotvecs_to_quats(rotvec), base)), shift
+
+    def put(self, pose: Pose) -> None:
+        """Write a pose into the tracks."""
+        quat, shift = (torch.from_numpy(x).float() for x in pose)
+        for entry, value in zip(self._entries(), (quat, torch.zeros(3), shift), strict=True):
+            entry.copy_(value)
+
+    def error(self, pose: Pose) -> float:
+        """Mean squared error of the body's pixels."""
+        return float((self._residuals(pose) ** 2).mean())
+
+    def refined(self, pose: Pose, steps: int) -> tuple[Pose, float]:
+        """Return the pose of least picture error near a pose, and this error, by damped Gauss-Newton steps."""
+        residuals, damping = self._residuals(pose), 1e-2
+        error = float((residuals**2).mean())
+        for _ in range(steps):
+            moved = [self._residuals(self._moved(pose, change)) for change in STEP * np.eye(6)]
+            slopes = (np.stack(moved, -1) - residuals[:, None]) / STEP  # [P, 6]
+            normal = slopes.T @ slopes
+            diagonal = np.diag(np.diag(normal) + 1e-6 * max(float(np.trace(normal)), 1e-12))
+            for _ in range(3):
+                change = -np.linalg.solve(normal + damping * diagonal, slopes.T @ residuals)
+                change *= min(1.0, _LARGEST / max(np.linalg.norm(change[:3]), np.linalg.norm(change[3:]), 1e-9))
+                there = self._moved(pose, change)
+                new = self._residuals(there)
+                gain = 1 - float((new**2).mean()) / error
+                if gain > 0:
+                    break
+                damping *= 10
+            else:
+                break
+            pose, residuals, error, damping = there, new, (1 - gain) * error, 0.3 * damping
+            if gain < _ENOUGH:
+                break
+        return pose, error
+
+    def _moved(self, pose: Pose, change: np.ndarray) -> Pose:
+        turned = rotations.multiply(rotations.rotvecs_to_quats(change[:3]), pose[0])
+        return rotations.normalize(turned), pose[1] + self._radius * change[3:]
+
+    @torch.no_grad()
+    def _residuals(self, pose: Pose) -> np.ndarray:
+        """Picture minus truth in the region of the body. [P] float64"""
+        quat, shift = (torch.from_numpy(x).float()[None] for x in pose)
+        placed = GroupPoses(quat, rotations.quats_to_rotmats(quat), shift)
+        group = torch.zeros(len(self._shape["means"]), dtype=torch.int64)
+        center, light = self._motion.tracks.centers[self._body][None], self._motion.light.detach()
+        mine = fused_posing.pose(**self._shape, light=light, motion_ids=group, group_poses=placed, centers=center)
+        found = []
+        for look in self._looks:
+            means, quats, scales, opacities, colors = (
+                torch.cat([getattr(part, name) for part in (mine, look.others)]) for name in _FIELDS
+            )
+            behind = self._trainer.background.image(look.camera)
+            drawn = rasterize_splats(means, quats, scales, opacities, colors, look.camera, behind).image
+            found.append((drawn.numpy() - look.truth)[look.region].ravel())
+        return np.concatenate(found).astype(np.float64)
+
+    @torch.no_grad()
+    def _look(self, view: train_views.TrainView, mine: np.ndarray) -> _Look:
+        region = grown(mine)
+        rows, columns = ndimage.find_objects(region.astype(np.int8))[0]
+        intrinsics = view.camera.intrinsics.copy()
+        intrinsics[:2, 2] -= columns.start, rows.start
+        size = {"width": columns.stop - columns.start, "height": rows.stop - rows.start}
+        camera = dataclasses.replace(view.camera, intrinsics=intrinsics, **size)
+        splats = self._trainer.splats(camera, view.t)
+        near = self._others_near(camera, splats)
+        others = Splats(**{name: getattr(splats, name)[near] for name in _FIELDS})
+        return _Look(camera, view.image[rows, columns].astype(np.float32) / 255, region[rows, columns], others)
+
+    def _others_near(self, camera: Camera, splats: Splats) -> torch.Tensor:
+        """Rows of the Gaussians of other groups that reach a camera's picture."""
+        pixels, depth = cameras.project(camera, splats.means.numpy().astype(np.float64))
+        reach = _REACH * splats.scales.amax(1).numpy() * camera.intrinsics[0, 0] / np.maximum(depth, 1e-6) + 1
+        outside = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1) > reach
+        other = self._trainer.gaussians.motion_ids.numpy() != self._body
+        return torch.from_numpy(np.flatnonzero(other & ~outside & (depth > 0)))
+
+
+def views_at(trainer: Trainer, knot: int) -> list[train_views.TrainView]:
+    """Return the views with masks at a knot."""
+    return [v for v in trainer.views if v.mask is not None and train_views.nearest_knot(trainer.times, v.t) == knot]
+
+
+def grown(mask: np.ndarray) -> np.ndarray:
+    """Return the region in which a body is compared: its mask with a margin. [H, W] bool"""
+    return np.asarray(ndimage.binary_dilation(mask, iterations=MARGIN), bool)
+
+
+@torch.no_grad()
+def errors(trainer: Trainer, knot: int, most: int) -> np.ndarray:
+    """Return the mean squared error of each body's pixels at a knot in the tracks; nan if no mask shows it. [B - 1]"""
+    ids = [int(i) for i in trainer.object_ids[1:]]
+    sums, pixels = np.zeros(len(ids)), np.zeros(len(ids))
+    for view in train_views.spread(views_at(trainer, knot), most):
+        squares = (trainer.render(view.camera, view.t).numpy() - view.image / 255.0) ** 2
+        for row, object_id in enumerate(ids):
+            mine = view.mask == object_id
+            if mine.sum() >= FEWEST_PIXELS:
+                sums[row] += squares[grown(mine)].sum()
+                pixels[row] += 3 * grown(mine).sum()
+    return np.where(pixels > 0, sums / np.maximum(pixels, 1), np.nan)
