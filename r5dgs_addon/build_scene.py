@@ -87,8 +87,7 @@ def homes(scene: Scene, parts: list[Range]) -> list[Range]:
     """Return the ranges whose object collections hold the anchors.
 
     Each motion group has one anchor; the pinned group 0 has one per object. The anchor of a body goes to the group's
-    own
-    object if that object has Gaussians in the group, otherwise to the object with the most Gaussians in it.
+    own object if that object has Gaussians in the group, otherwise to the object with the most Gaussians in it.
     """
     best: dict[tuple[int, int], Range] = {}
     for part in parts:

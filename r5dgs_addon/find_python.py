@@ -61,8 +61,7 @@ def candidates(beside: list[Path], home: Path | None = None) -> Iterator[str]:
     """Existing Python executables, most likely first, each once.
 
     The order is: Blender's own; active virtual environments; environments with usual names beside the extension or in
-    the
-    home folder; the Python of the ``r5dgs`` command; the system's Python.
+    the home folder; the Python of the ``r5dgs`` command; the system's Python.
 
     Args:
         beside: Folders that belong to the extension.
@@ -78,7 +77,7 @@ def candidates(beside: list[Path], home: Path | None = None) -> Iterator[str]:
 
 
 def find(beside: list[Path], home: Path | None = None, stopped: Callable[[], bool] = lambda: False) -> str | None:
-    """Return the first of `candidates` that also has the packages for encoders, or else one that can draw, or None.
+    """Return the first of `candidates` with all packages, else the first one with those for pictures, else None.
 
     Args:
         beside: As for `candidates`.

@@ -135,7 +135,7 @@ def capture(
 def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[Step]:
     """Capture image by image, so that the caller can show progress and stop in between.
 
-    Closing the iterator early restores the scene and leaves no folder behind. Its return value is the `CaptureResult`.
+    Closing the iterator early restores the scene and leaves no folder behind. The iterator returns the `CaptureResult`.
 
     Args:
         context: Context whose scene and view layer are captured.

@@ -112,13 +112,10 @@ def survey(context: bpy.types.Context, frames: tuple[float, ...], overrides: Ove
 def choose(layer: bpy.types.ViewLayer, survey: Survey, choice: str, collection: str) -> tuple[CapturedObject, ...]:
     """Group Blender objects into the objects of the data set.
 
-    Objects with a common parent form one object. Exceptions: the parent also has descendants that belong to no object
-    (it
-    is then a handle of the whole scene), or a child moves while the parent is still (they are then not rigidly
-    connected).
-    With "PASS_INDEX", equal indices form one object and give its id. Otherwise ids count from 1 in the order of names,
-    so
-    that they stay the same between captures.
+    Objects with a common parent form one object, with two exceptions: the parent also has descendants that belong to no
+    object (it is then a handle of the whole scene), or a child moves while the parent is still (they are then not
+    rigidly connected). With "PASS_INDEX", equal indices form one object and give its id. Otherwise ids count from 1 in
+    the order of names, so that they stay the same between captures.
 
     Args:
         layer: View layer with the selection.

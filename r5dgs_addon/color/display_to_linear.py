@@ -29,8 +29,7 @@ def scene_linear(
     """Convert an image to Blender's *Combined* pass, with premultiplied alpha.
 
     Without an inverse, colours above 1 stay above 1. Images are blended in display space. Therefore the straight colour
-    is
-    linearised and then premultiplied; saved with straight alpha, the image gets its original bytes back.
+    is linearised and then premultiplied; an image saved with straight alpha has its original bytes again.
 
     Args:
         color: Display-referred sRGB, >= 0, premultiplied if ``alpha`` is given. [H, W, 3]

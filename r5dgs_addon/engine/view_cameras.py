@@ -17,8 +17,7 @@ class View:
     Attributes:
         camera: Camera with OpenCV axes, in Blender's world.
         distance: Distance by which it is moved back from Blender's camera. Non-zero only for parallel projections,
-            which
-            are approximated from very far away; depths are larger by this value.
+            which are approximated from very far away; depths are larger by this value.
         near: Nearest rendered depth, or None for the scenes' own near plane.
     """
 

@@ -34,7 +34,7 @@ class Edited:
 
     Attributes:
         scene: The scene.
-        notes: What it cannot hold, as messages for the user.
+        notes: Messages for the user about edits that the scene cannot hold.
         done: Number of completed steps.
     """
 
@@ -89,7 +89,7 @@ def edited_steps(
     *,
     further: int,
 ) -> Generator[Step, None, Edited]:
-    """Apply the edits of a loaded scene. Blender's frame is as before afterwards.
+    """Apply the edits of a loaded scene. Blender's current frame is restored at the end.
 
     Args:
         context: Context with the scene's frames.
@@ -187,7 +187,7 @@ def _go_to(
 
 
 def _moving_before(members: list[_Member], before: list[list[np.ndarray]], allowed: float, extent: float) -> list[str]:
-    """Names of the point clouds whose pose before the first observed time differs from that at it."""
+    """Names of the point clouds whose pose before the first observed time differs from the pose at that time."""
     names = []
     for number, member in enumerate(members):
         changes = [np.abs(matrices[number] - member.matrices[0]) for matrices in before]

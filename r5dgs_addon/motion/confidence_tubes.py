@@ -1,8 +1,8 @@
 """Confidence tubes around extrapolated paths: 95 % bands.
 
 The radius is the half width of the stored band. If there is no band, or the motion was edited, it is two standard
-deviations of the position, computed from the covariance of the rates with edited rates as exact. The tube is a mesh
-with the anchor's parent. It is not rendered and not selectable. Its colour shows the uncertainty relative to the
+deviations of the position, computed from the covariance of the rates, in which edited rates count as exact. The tube is
+a mesh with the anchor's parent. It is not rendered and not selectable. Its colour shows the uncertainty relative to the
 object's size.
 """
 

@@ -21,8 +21,7 @@ def chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
     """Anchors of the selected objects in scene order, without duplicates; of the active object if none is selected.
 
     A point cloud that moves with another object does not select that object's anchor: deleting 'background' must keep
-    the
-    mug that some background Gaussians move with. Anchors without a learned motion are excluded.
+    the mug that some background Gaussians move with. Anchors without a learned motion are excluded.
     """
     selected = context.selected_objects or [context.view_layer.objects.active]
     found = {anchor: None for obj in selected if (anchor := anchor_of(obj)) is not None and not _strays(obj, anchor)}

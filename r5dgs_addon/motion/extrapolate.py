@@ -216,7 +216,7 @@ def check(anchors: list[bpy.types.Object], curves: bool = True) -> None:
 
     Args:
         anchors: Anchors.
-        curves: True if they keep their curves up to t_max, which must then be possible to split there.
+        curves: True if their curves up to t_max are kept; it must then be possible to split these at t_max.
     """
     for anchor in [*anchors, *followers(anchors)]:
         times, place = times_of(anchor), curve_place.find(anchor)

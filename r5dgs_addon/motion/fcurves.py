@@ -1,6 +1,7 @@
 """Reading of an anchor's F-curves, including the user's edits, and replacement of the keys after a frame.
 
-Frames are those of the action. If an NLA strip plays it at another time or speed, this applies to the new keys, too.
+Frames are those of the action. If an NLA strip plays the action at another time or speed, it plays the new keys
+likewise.
 
 Up to the given frame, a curve is unchanged: keys, handles, easing. If there is no key at the frame, the segment across
 it is split there without changing its shape.
@@ -75,7 +76,7 @@ class Points:
 def _cut(name: str, curve: bpy.types.FCurve, points: Points, k: int, frame: float) -> np.ndarray:
     """Split the segment that starts with key k at a frame; returns the one or two segments before it. [n, 4, 2]
 
-    After the last key, a segment with the curve's extrapolation.
+    If k is the last key, the returned segment follows the curve's extrapolation.
     """
     start = points.co[k].astype(np.float64)
     if k + 1 == points.count:
@@ -107,8 +108,7 @@ def replace_after(anchor: bpy.types.Object, where: Place, frame: float, tails: d
         where: Location of its curves, from `curve_place.find`.
         frame: Frame after which keys are replaced.
         tails: Keys over frames by data path; the first is at ``frame`` and continues the existing curve. Other paths
-            hold
-            their value from ``frame`` on.
+            hold their value from ``frame`` on.
     """
     curves = where.curves()
     for path, count in COMPONENTS:

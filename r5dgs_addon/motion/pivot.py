@@ -105,9 +105,8 @@ def _model(anchor: bpy.types.Object) -> MotionModel | None:
 def _offset(anchor: bpy.types.Object) -> np.ndarray | None:
     """Point that an anchor turns about, relative to the anchor. [3]
 
-    For a screw or an orbit, any point of the axis qualifies: the chosen point if it is still on the axis, otherwise the
-    one
-    nearest to the anchor.
+    A screw or an orbit turns about every point of its axis: the chosen point is returned if it is still on the axis,
+    otherwise the point nearest to the anchor.
     """
     model = _model(anchor)
     found = None if model is None else rotation_centers.center(model)

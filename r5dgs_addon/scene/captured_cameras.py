@@ -19,7 +19,8 @@ def build(
 ) -> list[bpy.types.Object]:
     """Create the captured cameras of a loaded scene. Returns them in the order of the scene file.
 
-    The collection is hidden in the viewport, where lines to the parents of many cameras cover the scene.
+    The collection is hidden in the viewport, because the lines from many cameras to their parents would cover the
+    scene.
     """
     if not scene.cameras:
         return []

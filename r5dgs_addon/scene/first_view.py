@@ -74,9 +74,9 @@ def show(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
 
 
 def _looking(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray | None:
-    """Rotation of an OpenGL camera that looks at a target, or None if there is none. [3, 3]
+    """Rotation of an OpenGL camera that looks at a target, or None if no rotation does. [3, 3]
 
-    The root may be mirrored or stretched; the view is a rotation, nevertheless.
+    The result is a rotation even if the root is mirrored or stretched.
     """
     back = eye - target
     right = np.cross(up, back)

@@ -57,8 +57,7 @@ def places(collection: bpy.types.Collection) -> list[Path]:
     """Possible paths of the file of a loaded scene, most likely first.
 
     These are the stored path, relative to the library for linked data; the same name in the folder of the open .blend,
-    as
-    both files may have moved together; and the last known location, as appended data comes from another .blend.
+    as both files may have moved together; and the last known location, as appended data comes from another .blend.
     """
     stored = Path(bpy.path.abspath(collection.r5dgs.filepath, library=_library(collection)))
     found = [stored]

@@ -9,7 +9,7 @@ import numpy as np
 
 LEVELS = 65535
 MARGIN = 1.25  # factor on both ends of the depth range, so that moving Gaussians stay inside it
-WORTHWHILE = 0.3  # share of unmoved Gaussians from which on their order is reused
+WORTHWHILE = 0.3  # minimum share of unmoved Gaussians for which their order is reused
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Keys:
 
     @classmethod
     def of(cls, depths: np.ndarray, near: float, parallel: bool) -> Keys:
-        """Return keys for depths and the motion that is likely to follow. [n]"""
+        """Return a conversion for some depths, with a margin for motion that is likely to follow. [n]"""
         low, high = float(depths.min()), float(depths.max())
         if parallel:
             margin = (MARGIN - 1) * max(high - low, 1e-6)
@@ -74,7 +74,7 @@ class _Sorted:
 
 
 class DepthOrder:
-    """Order of the Gaussians in one view. Groups that did not move keep theirs, and the others are merged into it.
+    """Order of the Gaussians in one view. Groups that did not move keep their order, and the others are merged into it.
 
     Args:
         positions: Centres in the frames of their groups. [N, 3] float32

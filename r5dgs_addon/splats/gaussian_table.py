@@ -15,7 +15,7 @@ from ..scene import point_clouds
 
 TEXELS = 4  # of each Gaussian in the table: position and group; covariance xx xy xz yy; yz zz; color and opacity
 SHADED = 1  # further texels if any cloud has shading: vector and rest factor
-BALL = 0.3  # size of points without one, as a fraction of their mean distance on a surface
+BALL = 0.3  # size of points without `scale`, as a fraction of their mean distance on a surface
 # Further texels of the coefficients by degree, three channels each, without gaps.
 HARMONICS = {degree: -(-3 * ((degree + 1) ** 2 - 1) // 4) for degree in range(4)}
 
@@ -82,7 +82,7 @@ def _values(cloud: bpy.types.PointCloud, name: str, kind: str, field: str, width
 
 
 def _ball(positions: np.ndarray) -> float:
-    """Standard deviation of points without size: less than their distance on a surface of the cloud's size."""
+    """Standard deviation of points without size: a share of their spacing on a surface as large as the cloud."""
     places = positions[np.isfinite(positions).all(1)]
     size = float(np.linalg.norm(np.ptp(places.astype(np.float64), axis=0))) if len(places) > 1 else 0.0
     return BALL * size / np.sqrt(len(places)) if size else 1.0

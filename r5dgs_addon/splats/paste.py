@@ -52,7 +52,7 @@ def paste(
 
     Args:
         buffer: The picture.
-        meshes: Depth buffer of what is solid, or None.
+        meshes: Depth buffer of the solid geometry, or None.
         view: View of the picture.
         sky: Coefficients of the sky, [K, 3] float32, or None.
         world: Map from the world of the sky to Blender's. [4, 4]

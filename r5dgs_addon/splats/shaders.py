@@ -1,4 +1,4 @@
-"""Shaders of the viewport splats: Gaussians into an own buffer, and that buffer into the viewport."""
+"""Shaders of the viewport splats: one draws Gaussians into a buffer, the other pastes that buffer into the viewport."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import gpu
 from ...r5dgs_core import errors
 
 WIDEST = 16384  # texels of a row of a texture, at most
-# Texels of each group: three rows of its matrix to the camera; tint, or with a fourth component of 1 the color itself;
+# Texels of each group: three rows of its matrix to the camera; tint (the color itself if the fourth component is 1);
 # change of the light; viewpoint.
 POSE_TEXELS = 6
 
@@ -142,8 +142,8 @@ void main()
 """
 
 _PASTE_VERTEX = "void main() { uv = corner; gl_Position = vec4(corner, 0.0, 1.0); }"
-# Blender merges its overlay with the scene by this gamma, not by the sRGB curve. Over a known color behind, the result
-# is exact; over meshes, soft edges are blended in that gamma.
+# Blender merges its overlay with the scene by this gamma, not by the sRGB curve. Over a known background color,
+# the result is exact; over meshes, soft edges are blended in that gamma.
 _PASTE_FRAGMENT = (
     _HARMONICS
     + """

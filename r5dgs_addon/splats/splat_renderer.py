@@ -32,7 +32,7 @@ class Group:
         matrix: Affine map from the group's frame to Blender's world. [4, 4]
         tint: Factors on the color.
         light_change: Change of the light's direction as seen from the group. [3]
-        holdout: True if the group cuts a hole into what is behind it.
+        holdout: True if the group cuts a hole into everything behind it.
     """
 
     number: int
@@ -114,7 +114,7 @@ class SplatBuffer:
         self._order: DepthOrder | None = None
         self._rows: np.ndarray | None = None
         self._rows_texture: gpu.types.GPUTexture | None = None
-        self._poses: list[gpu.types.GPUTexture] = []  # a texture has to live until it is drawn with
+        self._poses: list[gpu.types.GPUTexture] = []  # keeps the textures alive until the picture is drawn
 
     @property
     def texture(self) -> gpu.types.GPUTexture:
@@ -135,7 +135,7 @@ class SplatBuffer:
             table: The Gaussians.
             groups: Visible groups, each at most once.
             view: The view.
-            meshes: Depth buffer of what is solid, as large as the picture; None if nothing is.
+            meshes: Depth buffer of the solid geometry, as large as the picture; None if there is none.
         """
         groups = [group for group in groups if _is_drawable(group, view)]
         rows = self._sorted(table, groups, view)
@@ -225,7 +225,7 @@ def _slopes(p: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def _poses(groups: Sequence[Group], count: int, view: View, holes: bool = False) -> gpu.types.GPUTexture:
-    """Texture of what the shader needs of each group.
+    """Texture with the data of each group for the shader.
 
     With ``holes``, hold-outs are white and the others black; otherwise hold-outs are black.
     """

@@ -28,7 +28,7 @@ class _Picture:
 
     def __init__(self):
         self.buffer, self.key = renderer.SplatBuffer(), None
-        self.depth: np.ndarray | None = None  # of what is solid
+        self.depth: np.ndarray | None = None  # of the solid geometry
         self.meshes: gpu.types.GPUTexture | None = None  # the same
 
 
@@ -184,7 +184,7 @@ def _follow_changes(_, depsgraph=None):
 
 @persistent
 def _follow_reload(*_):
-    """Queue that everything is read again, because a file was opened or a change was undone."""
+    """Request that everything is read again, because a file was opened or a change was undone."""
     visible_splats.queue_reload()
 
 

@@ -1,7 +1,7 @@
 """Visible splats of a view layer, and their Gaussians on the graphics card.
 
-Handlers of Blender may run in a render thread, which must not touch what a viewport uses. They only queue what has
-changed; the queue is worked off when a viewport is drawn.
+Blender's handlers may run in a render thread, which must not touch the data of a viewport. They only queue the changes;
+these are applied when a viewport is drawn.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..scene import evaluated_points, loaded_scenes, viewport_display
 from . import gaussian_table
 from . import splat_renderer as renderer
 
-Slot = tuple[int, int, int]  # key of a cloud in a table: object, instancer, number among the instances by it
+Slot = tuple[int, int, int]  # key of a cloud in a table: object, instancer, index among its instances
 LayerKey = tuple[int, str]
 
 
@@ -65,12 +65,12 @@ def queue_change(uids: Iterable[int]) -> None:
 
 
 def queue_reload() -> None:
-    """Queue that all points are read again. Any thread may call this."""
+    """Request that all points are read again. Any thread may call this."""
     _changes.append(None)
 
 
 def catch_up() -> None:
-    """Work off the queue, and drop what no window or object needs any more."""
+    """Apply the queued changes, and drop the data of unused view layers and deleted objects."""
     if not _changes:
         return
     changed: set[int] = set()

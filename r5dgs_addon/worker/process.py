@@ -178,8 +178,7 @@ class Worker:
         """End the process group. A caller that waits for a response gets a BackendError.
 
         Returns within two seconds, even if a process has left the group and keeps the pipes open; that process receives
-        the
-        end of its input.
+        the end of its input.
         """
         self._group.end()
         if self._writing.acquire(blocking=False):  # else the writing thread fails and closes the pipe

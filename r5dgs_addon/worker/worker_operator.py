@@ -11,8 +11,7 @@ class Waiting:
     """Mixin for operators that submit a job and process its response.
 
     Subclasses define ``_begin(context)``, which returns the job; ``_finish(context, answer)``, which returns the
-    operator's
-    result; and ``waits_for``, the name shown in the status bar.
+    operator's result; and ``waits_for``, the name shown in the status bar.
     """
 
     waits_for = "R5DGS"

@@ -32,10 +32,10 @@ def line(start: np.ndarray, stop: np.ndarray) -> np.ndarray:
 def split(segment: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
     """Split a segment at a time without changing the curve (de Casteljau).
 
-    A part's handle can reach past that part's other key only if both handles of the whole segment span more than two
-    thirds of it and the part contains the parameter at which time advances slowest. `within` would then shorten the
-    handle, so that part is split once more there: on either side of that point the control times of the cubic lie
-    between its ends.
+    `within` would shorten a handle of a part that reaches past the part's other key. This can happen only if both
+    handles of the whole segment span more than two thirds of it, and only in the part that contains the parameter at
+    which time advances slowest. That part is therefore split once more at this parameter: on either side of it, the
+    control times of the cubic lie between its ends.
 
     Args:
         segment: Key, handle, handle, key, the keys in order of time. [4, 2]

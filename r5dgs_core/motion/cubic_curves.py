@@ -1,7 +1,8 @@
 """Curves through keys, cubic between two of them: evaluation, slopes, joining.
 
-Between two keys each component is the cubic with the given values and slopes at both ends; in Blender: BEZIER keys with
-free handles at a third of the interval. Quaternions are interpolated by component and normalised, as Blender does.
+Between two keys each component is the cubic with the given values and slopes at both ends. In Blender, BEZIER keys with
+free handles at a third of the interval give this cubic. Quaternions are interpolated by component and normalised, as
+Blender does.
 """
 
 from __future__ import annotations
@@ -108,9 +109,9 @@ def hermite(
 def join(first: Curves, second: Curves) -> Curves:
     """Join the curves of two motions, the second starting where the first ends; a kink between them is kept.
 
-    A curve of one key is constant. It is held until the second motion starts, and remains one key if that is constant
-    too. The key at the joint is dropped if it changes nothing, so a straight line at constant speed has two keys in
-    total.
+    A curve of one key is constant. It is held until the second motion starts, and remains one key if that motion is
+    constant, too. The key at the joint is dropped if it changes nothing, so a straight line at constant speed has two
+    keys in total.
     """
 
     def chain(a: Keys, b: Keys, flip: float) -> Keys:

@@ -74,8 +74,8 @@ def solve_all(
 
     Args:
         residuals: Function from parameters [L, K, P] and the starts [L] that they belong to, to residuals
-            [L, K, S, D]. Both should be of order one, residuals in units of their noise. Steps to residuals that are
-            not finite are rejected.
+            [L, K, S, D]. Parameters and residuals should be of order one, residuals in units of their noise. Steps to
+            residuals that are not finite are rejected.
         starts: Initial guesses, with finite residuals. [B, P]
         weights: Weights of the observations, > 0, or None for equal ones. [S]
         precision: Inverse standard deviations of the parameters about 0, for a Gaussian prior; None for no prior. [P]

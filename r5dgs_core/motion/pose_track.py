@@ -30,7 +30,7 @@ class Window:
 
     @property
     def middle(self) -> float:
-        """Middle of the window: the reference time of rates that are nearly uncorrelated with the others there."""
+        """Middle of the window: the reference time of rates, at which they are nearly uncorrelated with the others."""
         return 0.5 * self.first
 
     @property

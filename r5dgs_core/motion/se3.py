@@ -138,7 +138,8 @@ def step_twists(
         v: Velocity of the point at the origin at time 0. [3]
         eps: Rate of w. [3]
         a: Rate of v. [3]
-        durations: Signed durations T. [...] steps: Number n >= 1 of equal steps for each T.
+        durations: Signed durations T. [...]
+        steps: Number n >= 1 of equal steps for each T.
         order: 2 for exp(h m) with the midpoint twist m, 4 for exp(h m - h^3/12 [m, b]) with b = (eps, a).
 
     Returns:

@@ -143,7 +143,7 @@ def _bent(scene: Scene, start: int, splats: Splats, bend: Bend) -> Splats:
 
 
 def _relight(scene: Scene, start: int, factor: np.ndarray | None, turn: np.ndarray, bend: Bend) -> None:
-    """Write shading factors of deviating Gaussians, then rotated by ``turn``. factor [n, 1], turn [3, 3]"""
+    """Write the shading factors of deviating Gaussians that ``turn`` then rotates. factor [n, 1], turn [3, 3]"""
     if factor is None or scene.shading is None:
         return
     light = np.asarray(scene.shading.light, np.float64)

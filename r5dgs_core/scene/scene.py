@@ -88,7 +88,7 @@ class MotionGroup:
         follows: Group whose displacement, mapped by ``follow_matrix``, moves this one without rotation, or None.
         follow_matrix: Linear map from that group's displacement to this one's. [3, 3]
         rigid_rms: Root mean square distance of members from this rigid motion in the observed time, world units.
-        rigid_max: The same as a maximum.
+        rigid_max: Largest of these distances, world units.
         seen: First and last time at which masks localised the object; before them, the track is extrapolated or holds
             its first pose. None if never observed.
         history: Events in the observed time, and the confidence band of the motion past t_max.

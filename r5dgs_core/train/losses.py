@@ -78,7 +78,7 @@ def _moments(worker, workers, x, y, window, moments):
 
 @kernels.kernel
 def _compare(worker, workers, x, y, window, moments, slopes, sums):
-    """Compute SSIM per pixel from the blurred moments, and its derivatives by them, blurred along the rows."""
+    """Compute SSIM per pixel from the blurred moments, and its derivatives by these, blurred along the rows."""
     height, length = x.shape
     full = np.empty((5, length), np.float32)
     raw = np.empty((3, length), np.float32)
@@ -109,7 +109,7 @@ def _compare(worker, workers, x, y, window, moments, slopes, sums):
 
 @kernels.kernel
 def _gather(worker, workers, x, y, window, slopes, weight, gradient):
-    """Compute the gradient of the loss by x from the derivatives, blurred along the columns."""
+    """Compute the gradient of the loss with respect to x from the derivatives, blurred along the columns."""
     height, length = x.shape
     full = np.empty((3, length), np.float32)
     n = np.float32(height * length)

@@ -195,7 +195,7 @@ class Server:
         return output, self._stage.ms_motion, sum(instance.count for instance in instances)
 
     def _play(self, wanted: messages.RenderRequest, t: float, scene: Scene):
-        """Render a scene at a time; returns as `_draw`."""
+        """Render a scene at a time; returns the same as `_draw`."""
         from ..raster import RasterSettings
         from ..render import scene_renderer
 

@@ -83,7 +83,7 @@ class Rates(namedtuple("Rates", [unit.symbol for unit in FIELDS.values()], defau
         return clocks(self.frequency, span, self.damping)
 
     def clock_slopes(self, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of `clocks` by time."""
+        """Derivatives of `clocks` with respect to time."""
         return clock_slopes(self.frequency, span, self.damping)
 
 
@@ -259,7 +259,7 @@ def clocks(frequency: float | np.ndarray, span: np.ndarray, damping: float | np.
 
 
 def clock_slopes(frequency: float | np.ndarray, span: np.ndarray, damping: float | np.ndarray) -> se3.Pose:
-    """Derivatives by time of the factors of `clocks`; same arguments."""
+    """Derivatives with respect to time of the factors of `clocks`; same arguments."""
     if not np.any(damping):
         return np.cos(frequency * span), clocks(frequency, span)[0]
     c = np.where(np.asarray(frequency) > 0, damping, 0.0)

@@ -81,7 +81,7 @@ class Bounce(MotionKind):
         return quats, parts["e"] + place(tau[:, None]) - place(np.zeros((1, 1)))
 
     def starts(self, blocks: Sequence[str], track: PoseTrack, window: Window) -> list[first_guesses.Guess]:
-        """Two parabolas with one acceleration meet between two poses, for each gap; the best two with a real bounce."""
+        """Fit two parabolas of one acceleration that meet between two poses; the best two gaps with a bounce."""
         count, tau = len(track), track.tau
         if count < 8:
             return []

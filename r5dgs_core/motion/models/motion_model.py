@@ -64,7 +64,7 @@ class MotionModel:
         stop_time: T >= 0, time past t_max at which a body of the kind "friction" rests; 0 if it never does.
         bounce_time: Time past t_max of the next impact of the kind "bounce", >= 0.
         restitution: Speed after an impact / speed before it, in [0, 1].
-        second_velocity: As `velocity`, of the second oscillation of the kind "two_oscillations"; so are the others.
+        second_velocity: As `velocity`, of the second oscillation of the kind "two_oscillations"; likewise the others.
         inertia: J in the world at tau = 0, up to a factor, of kinds that need it; None for others. [3, 3]
         covariance: Covariance of the fitted rates, or None. [P, P] in the order of `covariance_names`
         covariance_names: Names of its rows, such as "velocity.x" or "frequency".

@@ -52,7 +52,7 @@ def fit_field(
         groups: Their motion groups. [R]
         tracks: Tracks; all knots up to the horizon are fitted.
         first: Knot at which the Gaussians are canonical.
-        steps: Steps; each evaluates four times.
+        steps: Number of steps; each evaluates the field at four random knots.
         generator: Random generator.
     """
     if len(means) == 0 or steps == 0:
