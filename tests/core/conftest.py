@@ -1,7 +1,6 @@
 """Shared fixtures: the tiny data set, one training of it, a synthetic scene and a data set of its pictures."""
 
 import copy
-import dataclasses
 import hashlib
 import pickle
 import shutil
@@ -10,7 +9,6 @@ import pytest
 
 from r5dgs_core.bake import bake, image_evidence
 from r5dgs_core.bench import playback_speed
-from r5dgs_core.config.config import Config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.train import learning_curves, run
 from r5dgs_core.train.initialization import initialize
@@ -47,17 +45,15 @@ def short_playback():
 def shared_starts():
     """Place the Gaussians of equal runs once and give trainers copies.
 
-    Views without masks or motion are placed anew, as that warns. Settings that the start does not depend on have their
-    defaults.
+    Views without masks or motion are placed anew, as that warns. Settings that the start does not read may differ.
     """
     start, made = initialize.start, {}
 
     def shared(views, config, motion, find_sky, rng, cloud=None):
         if any(view.mask is None for view in views) or len({view.t for view in views}) == 1:
             return start(views, config, motion, find_sky, rng, cloud)
-        settings = {f"train.{name}": getattr(config.train, name) for name in ("sh_degree", "shadows")}
-        config = dataclasses.replace(Config(), init=config.init, curriculum=config.curriculum).replace(**settings)
-        given = (views, config, motion.name, find_sky, rng.bit_generator.state, cloud)
+        settings = (config.init, config.curriculum, config.train.sh_degree, config.train.shadows, motion.name)
+        given = (views, settings, find_sky, rng.bit_generator.state, cloud)
         key = hashlib.sha1(pickle.dumps(given)).digest()
         if key not in made:
             made[key] = start(views, config, motion, find_sky, rng, cloud), rng.bit_generator.state
