@@ -83,7 +83,9 @@ def _plain() -> Progress:
             print(f"{event['event']}: {describe(event)}", flush=True)
         elif position[0] == position[1] or now - last.get(event["event"], -PLAIN_EVERY_S) >= PLAIN_EVERY_S:
             last[event["event"]] = now
-            print(f"{event['event']} {position[0]}: {describe(event)}", flush=True)
+            total = f" of {event['total']} {event.get('unit', 'images')}" if "total" in event else ""
+            text = describe(event)
+            print(f"{event['event']} {position[0]}{total}{text and ': ' + text}", flush=True)
 
     return show
 
@@ -129,6 +131,4 @@ def describe(event: Event) -> str:
         parts.append(f"{event['iterations']} steps")
     if event.get("from"):
         parts.append(f"continuing at step {event['from']}")
-    if "total" in event:
-        parts.append(f"of {event['total']} {event.get('unit', 'images')}")
     return terminal.printable(", ".join(parts))

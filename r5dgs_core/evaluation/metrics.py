@@ -210,25 +210,6 @@ def rigid(matrices: np.ndarray) -> np.ndarray:
     return out
 
 
-def aligned_pose_error(
-    predicted: np.ndarray, truth: np.ndarray, observed: np.ndarray, center: np.ndarray
-) -> tuple[float, float]:
-    """Return the error of a predicted motion at the last time, against true poses in another frame of the object.
-
-    Args:
-        predicted: Map from the bind state to the world at each time, rigid. [T, 4, 4]
-        truth: Object to world at the same times; scale is removed. [T, 4, 4]
-        observed: Times from which the offset between both frames is estimated, at least one. [T] bool
-        center: Center of the object in the bind state; its distance is measured. [3]
-
-    Returns:
-        Distance of the centers at the last time in world units, and angle between the rotations in degrees.
-    """
-    motion = true_motion(predicted, truth, observed, center)
-    distances, angles = pose_errors(predicted[-1:], motion[-1:], center)
-    return float(distances[0]), float(angles[0])
-
-
 def true_motion(predicted: np.ndarray, truth: np.ndarray, observed: np.ndarray, center: np.ndarray) -> np.ndarray:
     """Return the true motion of a bind state, from true poses in another frame of the object.
 

@@ -236,20 +236,6 @@ def make_continuous(quats: Array) -> Array:
     return quats * signs
 
 
-def slerp(start: Array, end: Array, fraction: Array) -> Array:
-    """Rotate from ``start`` to ``end`` the short way at a constant rate. [..., 4], [..., 4], [...] -> [..., 4]
-
-    Args:
-        start: Unit wxyz, reached at fraction 0. [..., 4]
-        end: Unit wxyz, reached at fraction 1 (up to sign). [..., 4]
-        fraction: Any real; extrapolates outside [0, 1]. [...] or a number
-    """
-    turn = quats_to_rotvecs(multiply(end, conjugate(start)))
-    if hasattr(fraction, "shape"):
-        fraction = fraction[..., None]
-    return multiply(rotvecs_to_quats(turn * fraction), start)
-
-
 def angle_between(p: Array, q: Array) -> Array:
     """Rotation angle from p to q in radians, in [0, pi], accurate near 0 and pi. [..., 4] -> [...]"""
     xp = array_namespace(p, q)

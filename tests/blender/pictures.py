@@ -1,7 +1,7 @@
 """Take the pictures of docs/user/blender.md in a real Blender with a window.
 
     xvfb-run -a -s "-screen 0 1600x1400x24 +extension GLX" blender --factory-startup --window-geometry 0 0 1600 1400 \\
-        --python tests/blender/pictures.py -- SCENE.r5dgs FOLDER [PICTURE ...]
+        --python tests/blender/pictures.py -- demo.r5dgs FOLDER [PICTURE ...]
 
 Needs ImageMagick's ``import`` (Blender's own screenshots are black under software rendering) and a worker's Python
 (`R5DGS_PYTHON`). Each picture is a function that sets the window up and is followed by a while in which Blender draws;
@@ -72,29 +72,18 @@ def collection():
 
 
 def load(path: Path, window: Window) -> None:
-    """Load a scene into an empty file, seen by a camera of its data set."""
+    """Load a scene into an empty file, seen by the captured camera that loading chooses."""
     for obj in list(bpy.data.objects):
         bpy.data.objects.remove(obj)
     bpy.ops.wm.save_as_mainfile(filepath=str(path.with_suffix(".blend")))  # the sidebar shows paths from here
     with window.inside():
         bpy.ops.r5dgs.load_scene(filepath=str(path))
     collection().r5dgs.filepath = f"//{path.name}"
-    scene = bpy.context.scene
-    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    scene.collection.objects.link(camera)
-    scene.camera = camera
-    low, high = bounds()
-    middle, size = (low + high) / 2, (high - low).length
-    camera.location = middle + Vector((0.25, -0.85, 0.55)).normalized() * 0.75 * size
-    camera.rotation_mode = "QUATERNION"
-    camera.rotation_quaternion = (middle - camera.location).to_track_quat("-Z", "Y")
-    scene.render.resolution_x, scene.render.resolution_y = 800, 600
     area = window.area("VIEW_3D")
     space = area.spaces.active
     space.show_region_ui = True
     space.overlay.show_relationship_lines = False
     space.shading.type = "MATERIAL"
-    space.region_3d.view_perspective = "CAMERA"
 
 
 def bounds() -> tuple[Vector, Vector]:
@@ -120,13 +109,13 @@ def loaded(window: Window):
 def prompt(window: Window):
     """Matches of a prompt, and their selection."""
     with window.inside():
-        bpy.ops.r5dgs.select_by_prompt(text="mug and the apple")
+        bpy.ops.r5dgs.select_by_prompt(text="globe and the vase")
 
 
 def nothing(window: Window):
     """A prompt without matches, and its suggestions."""
     with window.inside():
-        bpy.ops.r5dgs.select_by_prompt(text="muk up")
+        bpy.ops.r5dgs.select_by_prompt(text="glowb")
 
 
 def physics(window: Window):
@@ -136,8 +125,11 @@ def physics(window: Window):
     with window.inside():
         bpy.ops.object.select_all(action="DESELECT")
         bpy.ops.r5dgs.show_confidence(action="SHOW")
-        bpy.ops.r5dgs.select_by_prompt(text="apple")
+        bpy.ops.r5dgs.select_by_prompt(text="beach ball")
         bpy.ops.r5dgs.extrapolate_until(t_end=1.6)
+    ball = bpy.data.objects["beach ball"]
+    bpy.context.view_layer.objects.active = ball
+    ball.select_set(True)
 
 
 def ellipsoids(window: Window):

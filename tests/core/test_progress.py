@@ -59,6 +59,7 @@ def test_a_log_gets_few_lines(capsys, monkeypatch):
         "sheet: contact sheet",
     ]
     counted = [line.split()[0] for line in lines if line not in told]
+    assert any(line.startswith("evaluate 3 of 9 images") for line in lines)
     assert 5 <= counted.count("step") <= 1 + 100 / progress.PLAIN_EVERY_S
     assert counted[-2:] == ["identity", "evaluate"]  # each phase shows at once
     assert lines[2] == "step 1: loss 0.5000, 10 Gaussians, 99 s left"
@@ -77,7 +78,7 @@ def test_a_terminal_gets_bars(capsys, monkeypatch):
     [
         ({"event": "x"}, ""),
         ({"event": "x", "text": "now this"}, "now this"),
-        ({"event": "x", "done": 3, "total": 9}, "of 9 images"),
+        ({"event": "x", "done": 3, "total": 9}, ""),
         ({"event": "x", "iterations": 7}, "7 steps"),
         ({"event": "x", "loss": 0.25, "iterations": 7}, "loss 0.2500"),
         ({"event": "x", "loss": 0.25, "val_psnr": 31.23, "gaussians": 5}, "loss 0.2500, held-out 31.2 dB, 5 Gaussians"),

@@ -152,7 +152,7 @@ def test_gradients_are_finite_and_right_at_zero():
 
 def test_numpy_and_torch_agree_to_rounding():
     rng = np.random.default_rng(2)
-    p, q, v, f = random_quats(50, 3), random_quats(50, 4), rng.normal(size=(50, 3)), rng.uniform(size=50)
+    p, q, v = random_quats(50, 3), random_quats(50, 4), rng.normal(size=(50, 3))
     mats = rot.quats_to_rotmats(p)
     calls = [
         (rot.normalize, (3 * p,)),
@@ -164,7 +164,6 @@ def test_numpy_and_torch_agree_to_rounding():
         (rot.quats_to_rotmats, (p,)),
         (rot.rotmats_to_quats, (mats,)),
         (rot.make_continuous, (p,)),
-        (rot.slerp, (p, q, f)),
         (rot.angle_between, (p, q)),
         (rot.quat_rates, (p, v)),
         (rot.cross, (v, v[::-1].copy())),
@@ -182,14 +181,6 @@ def test_signs_are_continuous_over_ten_turns():
     assert ((raw[1:] * raw[:-1]).sum(-1) < 0).any()
     steps = np.abs(np.linalg.norm(np.diff(rot.make_continuous(raw), axis=0), axis=-1))
     assert steps.max() <= 2 * np.sin(np.radians(20) / 4) + 1e-12
-
-
-@given(quats(), quats())
-def test_slerp_takes_the_short_way_between_its_ends(p, q):
-    assert rot.angle_between(rot.slerp(p, q, 0.0), p) < 1e-7
-    assert rot.angle_between(rot.slerp(p, q, 1.0), q) < 1e-7
-    half = rot.slerp(p, q, 0.5)
-    assert rot.angle_between(p, half) == pytest.approx(0.5 * rot.angle_between(p, q), abs=1e-7)
 
 
 @settings(max_examples=30)
