@@ -246,15 +246,15 @@ def test_a_scene_file_that_was_moved_away_is_missed_by_name_and_nothing_breaks(l
 
 
 @pytest.fixture
-def without_torch(monkeypatch, tmp_path):
-    """Make this Python the worker's, as if torch were not installed."""
+def without_numba(monkeypatch, tmp_path):
+    """Make this Python the worker's, as if numba were not installed."""
     path = tmp_path / "python"
     path.write_text(
         f"#!{sys.executable}\n"
         "import importlib.util, os, runpy, sys\n"
         "sys.path.insert(0, os.environ['PYTHONPATH'].split(os.pathsep)[0])\n"
         "find = importlib.util.find_spec\n"
-        "importlib.util.find_spec = lambda name, *a: None if name == 'torch' else find(name, *a)\n"
+        "importlib.util.find_spec = lambda name, *a: None if name == 'numba' else find(name, *a)\n"
         "runpy.run_module('r5dgs_core.worker.server', run_name='__main__')\n"
     )
     path.chmod(path.stat().st_mode | stat.S_IXUSR)
@@ -267,10 +267,10 @@ def without_torch(monkeypatch, tmp_path):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="the script is one of POSIX")
-def test_a_python_without_torch_is_named_with_the_remedy_and_the_next_choice_works(loaded, without_torch, tmp_path):
+def test_a_python_without_numba_is_named_with_the_remedy_and_the_next_choice_works(loaded, without_numba, tmp_path):
     pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
     loaded.context.scene.render.engine = "R5DGS"
-    said = "worker: .*python lacks torch; install the core there.*pip install r5dgs.*'Worker Python'"
+    said = "worker: .*python lacks numba; install the core there.*pip install r5dgs.*'Worker Python'"
     for act in (
         loaded.ops.r5dgs.preview,
         loaded.ops.r5dgs.check_worker,
@@ -280,7 +280,7 @@ def test_a_python_without_torch_is_named_with_the_remedy_and_the_next_choice_wor
         with refused(loaded, said):
             act()
     assert not Path(loaded.data.filepath).with_name("f12.png").exists()
-    without_torch(False)
+    without_numba(False)
     assert loaded.ops.r5dgs.preview() == {"FINISHED"} and f12(loaded)
 
 

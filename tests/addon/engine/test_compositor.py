@@ -37,9 +37,11 @@ def merged(blender, tmp_path, monkeypatch):
     blender.ops.r5dgs.use_engine()
     blender.ops.r5dgs.show_colors_as_trained()
     gaussians.frame_set(46)
+    gaussians.camera = blender.data.objects["Camera"]
     gaussians.camera.location, gaussians.camera.rotation_euler = (0, -5, 1), (1.4, 0, 0)
     gaussians.view_layers[0].use_pass_z = True
     render = gaussians.render
+    render.pixel_aspect_x = render.pixel_aspect_y = 1.0
     render.resolution_x, render.resolution_y, render.resolution_percentage, render.dither_intensity = 96, 72, 100, 0
 
     meshes = blender.data.scenes.new("meshes")

@@ -344,18 +344,18 @@ def fake_python(path, script):
     return str(path)
 
 
-def test_a_python_without_torch_is_named_with_the_remedy(blender, loaded, monkeypatch, tmp_path):
+def test_a_python_without_numba_is_named_with_the_remedy(blender, loaded, monkeypatch, tmp_path):
     script = (
         "import importlib.util, os, runpy, sys\n"
         "sys.path.insert(0, os.environ['PYTHONPATH'].split(os.pathsep)[0])\n"
         "find = importlib.util.find_spec\n"
-        "importlib.util.find_spec = lambda name, *a: None if name == 'torch' else find(name, *a)\n"
+        "importlib.util.find_spec = lambda name, *a: None if name == 'numba' else find(name, *a)\n"
         "runpy.run_module('r5dgs_core.worker.server', run_name='__main__')\n"
     )
     monkeypatch.setenv("R5DGS_PYTHON", fake_python(tmp_path / "python", script))
-    with pytest.raises(RuntimeError, match="lacks torch.*pip install r5dgs"):
+    with pytest.raises(RuntimeError, match="lacks numba.*pip install r5dgs"):
         blender.ops.r5dgs.preview()
-    with pytest.raises(RuntimeError, match="lacks torch"):
+    with pytest.raises(RuntimeError, match="lacks numba"):
         blender.ops.r5dgs.check_worker()
 
 

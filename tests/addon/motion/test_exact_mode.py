@@ -126,7 +126,7 @@ def test_undo_and_redo_keep_points_and_listener_in_step(blender, scene, loaded):
 
 def test_exact_mode_raises_for_a_rigid_scene(blender, tmp_path):
     motions.load(blender, scene_file.write(tiny_datasets.make_truth(), tmp_path / "rigid.r5dgs"))
-    with pytest.raises(RuntimeError, match="moves as a whole"):
+    with pytest.raises(RuntimeError, match="all objects are rigid"):
         blender.ops.r5dgs.exact_mode()
     assert not listeners()
 

@@ -504,7 +504,7 @@ def test_stepped_keys_are_not_smoothed_away(blender, loaded, mug):
 
 
 def test_the_panel_shows_the_fields_of_a_motion_and_marks_edits(blender, loaded, mug):
-    (panel,) = importlib.import_module("r5dgs.r5dgs_addon.panels.motion").CLASSES
+    panel = blender.types.R5DGS_PT_motion
     for kind, fields in ((name, kind.fields) for name, kind in models.KINDS.items()):
         mug.r5dgs_motion.kind = kind
         said = layouts.draw(blender, panel)
@@ -562,7 +562,7 @@ def test_a_spin_too_fast_for_keys_is_keyed_at_every_frame_and_named(blender, loa
     state.kind, state.angular_velocity = "ballistic_spin", (0.0, 300.0, per_second(blender, 1e4))
     assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
     assert "Too fast for keys, which are exact only at frames: mug anchor" in capfd.readouterr().out
-    (panel,) = importlib.import_module("r5dgs.r5dgs_addon.panels.motion").CLASSES
+    panel = blender.types.R5DGS_PT_motion
     assert state.too_fast and "Too fast for keys: exact only at frames" in layouts.draw(blender, panel)
     curves = [curve for name, curve in motions.curves(mug).items() if name[0] == "rotation_quaternion"]
     keys = np.array([[point.co for point in curve.keyframe_points if point.co[0] > LAST] for curve in curves])

@@ -1,7 +1,5 @@
 """Pivot and axis of a motion are shown and edited in every kind that has them."""
 
-import importlib
-
 import numpy as np
 import pytest
 
@@ -205,7 +203,7 @@ def test_export_writes_the_moved_pivot(blender, scene_path, tmp_path):
 
 
 def test_motions_without_a_pivot_show_none(blender, loaded, mug):
-    (panel,) = importlib.import_module("r5dgs.r5dgs_addon.panels.motion").CLASSES
+    panel = blender.types.R5DGS_PT_motion
     state = mug.r5dgs_motion
     has = {"static": 0, "translation": 0, "ballistic_spin": 2, "constant_twist": 2, "world_twist": 2, "free_top": 0}
     for kind, count in has.items():
@@ -223,7 +221,7 @@ def test_motions_without_a_pivot_show_none(blender, loaded, mug):
 
 
 def test_nan_and_unreadable_curves_do_no_harm(blender, loaded, mug):
-    (panel,) = importlib.import_module("r5dgs.r5dgs_addon.panels.motion").CLASSES
+    panel = blender.types.R5DGS_PT_motion
     state = mug.r5dgs_motion
     set_up(state, "world_twist", **SPIN)
     before = [tuple(getattr(state, name)) for name in ("velocity", "angular_velocity")]

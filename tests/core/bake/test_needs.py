@@ -212,7 +212,7 @@ def test_a_run_can_be_baked_without_learned_features(trained, baked, tiny, tmp_p
 
 
 def test_bake_accepts_only_overrides_of_needs(trained, tmp_path):
-    with pytest.raises(ConfigError, match="--set train.seed=1: .*bake takes needs.NAME"):
+    with pytest.raises(ConfigError, match="--set train.seed=1: .*bake accepts only needs.NAME"):
         bake.run_bake(trained.folder, tmp_path / "x.r5dgs", None, ["train.seed=1"])
 
 
