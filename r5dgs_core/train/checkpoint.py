@@ -85,7 +85,7 @@ class Checkpoint:
         running_loss: Smoothed loss, nan before the first step.
         origin: World point at the origin of training coordinates. [3]
         scale: World units per unit of training coordinates.
-        observed: Times at which each object was located by its masks. [B - 1, S] bool
+        observed: Times at which the masks determine the pose of each object. [B - 1, S] bool
         finished: True if labels and identities are complete, too.
         seconds: Wall time of training, over all resumed sessions.
     """

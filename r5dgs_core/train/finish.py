@@ -96,7 +96,7 @@ def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dic
     motion = trainer.motion.observed_motion(
         tensors | {"gaussians.motion_ids": ids},
         trainer.object_ids,
-        trainer.places.measured,
+        trainer.places.shown,
         given,
         trainer.config,
     )

@@ -317,7 +317,7 @@ class Trainer:
             running_loss=self.running_loss,
             origin=(x, y, z),
             scale=float(self.normalization.scale),
-            observed=torch.from_numpy(self.places.measured.copy()),
+            observed=torch.from_numpy(self.places.shown.copy()),
         )
 
     def restore(self, state: Checkpoint) -> None:

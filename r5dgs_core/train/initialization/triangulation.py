@@ -27,6 +27,7 @@ VELOCITY = 30.0  # standard deviation of its velocity, units per span; long gaps
 DEPTH_NOISE = 3.0  # standard deviation of the prior depth, that of the cameras' focus, normalised units
 CUT_OFF = 0.003  # weight of masks that the image border cuts
 PLACED = 0.05  # maximum standard deviation of a measured position, normalised units
+MOST_OF_IT = 0.5  # minimum visible area of an object whose pose training determines, relative to the median over time
 ROUNDS = 5
 
 
@@ -41,6 +42,8 @@ class Places:
         visibility: Share of the views at that time that show the whole object, weighted by its area. [M, S]
         radii: Radius of a ball that contains the object. [M]
         evidence: Visible area of the object relative to its median over time, at most 1. [M, S]
+        shown: Times at which training can determine the pose: the centre is measured, or two cameras show most of the
+            object, cut by the image border or not. [M, S] bool
     """
 
     object_ids: np.ndarray
@@ -49,6 +52,7 @@ class Places:
     visibility: np.ndarray
     radii: np.ndarray
     evidence: np.ndarray
+    shown: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -80,12 +84,14 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> P
     centers = np.zeros((m, count, 3))
     measured = np.zeros((m, count), bool)
     visibility, evidence = np.zeros((m, count)), np.zeros((m, count))
+    from_two = np.zeros((m, count), bool)
     radii = np.zeros(m)
     for row, object_id in enumerate(ids):
         seen = found[int(object_id)]
         for x in seen:
             visibility[row, x.knot] += x.weight * x.whole
             evidence[row, x.knot] += x.area
+            from_two[row, x.knot] |= any(y.knot == x.knot and (y.origin != x.origin).any() for y in seen)
         used = _votes(seen)
         centers[row], measured[row] = _path(used, times)
         if not measured[row].any():
@@ -99,7 +105,9 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> P
         radii[row] = np.quantile(sizes, 0.8)
         evidence[row] /= np.median(evidence[row][evidence[row] > 0])
     peak = visibility.max(axis=1, keepdims=True) if m else visibility
-    return Places(ids, centers, measured, visibility / np.maximum(peak, 1e-12), radii, np.minimum(evidence, 1.0))
+    shown = measured | (from_two & (evidence >= MOST_OF_IT))
+    visibility = visibility / np.maximum(peak, 1e-12)
+    return Places(ids, centers, measured, visibility, radii, np.minimum(evidence, 1.0), shown)
 
 
 def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> dict[int, list[_Sighting]]:

@@ -12,7 +12,13 @@ from r5dgs_core.train.initialization import background_images, initialize, plane
 from tests.support import scenes
 
 NO_PLACES = triangulation.Places(
-    np.zeros(0, np.int64), np.zeros((0, 1, 3)), np.zeros((0, 1), bool), np.zeros((0, 1)), np.zeros(0), np.zeros((0, 1))
+    np.zeros(0, np.int64),
+    np.zeros((0, 1, 3)),
+    np.zeros((0, 1), bool),
+    np.zeros((0, 1)),
+    np.zeros(0),
+    np.zeros((0, 1)),
+    np.zeros((0, 1), bool),
 )
 
 

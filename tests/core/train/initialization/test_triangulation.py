@@ -77,6 +77,21 @@ def test_times_without_a_sighting_are_filled_from_their_neighbours():
     assert places.visibility[0, 1] == 0
 
 
+@pytest.mark.parametrize("share, count, shown", [(0.7, 6, True), (0.2, 6, False), (0.7, 1, False)])
+def test_an_object_that_the_border_cuts_is_shown_if_two_cameras_see_most_of_it(share, count, shown):
+    seen = [disc_view(c, t, [(1, [0, 0, 0.3], 0.3)]) for t in TIMES for c in ring(6)]
+    for k, view in enumerate(seen[-6:], start=len(seen) - 6):
+        columns = np.nonzero(view.mask)[1]
+        mask = np.zeros_like(view.mask)
+        if k < len(seen) - 6 + count:
+            cut = int(np.quantile(columns, 1 - share))
+            mask[:, : mask.shape[1] - cut] = view.mask[:, cut:]
+        seen[k] = dataclasses.replace(view, mask=mask)
+    places = triangulation.locate(seen, TIMES, 5e-4)
+    assert places.measured.tolist() == [[True, True, False]]
+    assert places.shown.tolist() == [[True, True, shown]]
+
+
 def test_an_object_seen_by_one_camera_is_placed_on_its_rays_with_a_warning(caplog):
     camera = ring()[0]
     center = np.array([0.1, 0.2, 0.3])

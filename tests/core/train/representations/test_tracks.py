@@ -33,7 +33,13 @@ def make(measured, absent=None, first=3, path=None):
     tracks = initialize.FirstTracks(TIMES, np.zeros((2, 3)), np.zeros((2, count, 3)), np.array([1]), None, np.zeros(3))
     centers = np.asarray(path if path is not None else [truth(t)[0] for t in TIMES])[None]
     places = triangulation.Places(
-        np.array([1]), centers, np.array([measured], bool), np.ones((1, count)), np.ones(1), np.ones((1, count))
+        np.array([1]),
+        centers,
+        np.array([measured], bool),
+        np.ones((1, count)),
+        np.ones(1),
+        np.ones((1, count)),
+        np.array([measured], bool),
     )
     gone = np.zeros((1, count), bool) if absent is None else np.array([absent], bool)
     known = evidence.Evidence(np.ones((1, count)), np.tile(np.eye(3), (1, count, 1, 1)), gone)
