@@ -4,9 +4,11 @@ A marker names the loaded scene and the motion group that it belongs to, so that
 removed with the scene, while markers of users stay.
 """
 
+import contextlib
 import re
 import threading
 import uuid
+from collections.abc import Collection
 
 import bpy
 from bpy.app.handlers import persistent
@@ -22,22 +24,41 @@ def show(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
     """Set the markers of a loaded scene's events in a Blender scene. Markers of users stay."""
     key, wanted = _new_key(collection), _wanted(collection)
     present = set()
-    for marker in [one for one in scene.timeline_markers if one.get(SCENE) == key]:
-        place = (marker.name, marker.frame, marker.get(GROUP))
+    for marker in list(scene.timeline_markers):
+        owner, group = _owner(marker, key, wanted)
+        if owner != key:
+            continue
+        place = (marker.name, marker.frame, group)
         if place in wanted and place not in present:
             present.add(place)
         else:
             scene.timeline_markers.remove(marker)
     for name, frame, group in sorted(wanted - present):
         marker = scene.timeline_markers.new(name, frame=frame)
-        marker[SCENE], marker[GROUP] = key, group
+        with contextlib.suppress(TypeError):  # see `_owner`
+            marker[SCENE], marker[GROUP] = key, group
 
 
 def shown(scene: bpy.types.Scene, collection: bpy.types.Collection) -> bool:
     """Return True if no marker is missing or outdated."""
-    key = _key(collection)
-    own = [one for one in scene.timeline_markers if one.get(SCENE) == key]
-    return sorted(_wanted(collection)) == sorted((one.name, one.frame, one.get(GROUP)) for one in own)
+    key, wanted = _key(collection), _wanted(collection)
+    owners = [(marker, *_owner(marker, key, wanted)) for marker in scene.timeline_markers]
+    own = [(marker.name, marker.frame, group) for marker, owner, group in owners if owner == key]
+    return sorted(wanted) == sorted(own)
+
+
+def _owner(
+    marker: bpy.types.TimelineMarker, key: str, wanted: Collection[tuple[str, int, int]]
+) -> tuple[str | None, int | None]:
+    """Loaded scene and motion group of a marker, or None for both.
+
+    Markers of Blender 5.0 cannot have custom properties. There, markers with a wanted name and frame belong to ``key``.
+    """
+    try:
+        return marker.get(SCENE), marker.get(GROUP)
+    except TypeError:
+        groups = [group for name, frame, group in wanted if (name, frame) == (marker.name, marker.frame)]
+        return (key, groups[0]) if groups else (None, None)
 
 
 def _key(collection: bpy.types.Collection) -> str:
@@ -72,7 +93,7 @@ def _label(anchor: bpy.types.Object) -> str:
 @persistent
 def _follow(scene, depsgraph=None):
     """Rename the markers of renamed objects, and remove those of scenes that are gone."""
-    own = [marker for marker in scene.timeline_markers if SCENE in marker]
+    own = [marker for marker in scene.timeline_markers if _owner(marker, "", ())[0] is not None]
     if not own or threading.current_thread() is not threading.main_thread():
         return
     there = {_key(collection): collection for collection in loaded_scenes.shown(scene)}
