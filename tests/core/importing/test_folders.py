@@ -292,7 +292,7 @@ def test_the_command_writes_a_scene_that_info_reads(deformed, tmp_path, capsys):
     assert main.main(["import", str(deformed), "--out", str(out), "--knots", "3", "--progress", "none"]) == 0
     assert f"{out}: 24 Gaussians, 0 objects, t_max 1" in capsys.readouterr().out
     assert main.main(["import", str(deformed), "--out", str(out), "--knots", "3"]) == 0
-    assert "import 24: of 24 Gaussians" in capsys.readouterr().out
+    assert "import 24 of 24 Gaussians" in capsys.readouterr().out
     scene = scene_file.read(out)
     assert scene.name == "run" and len(scene.tracks.times) == 3
     assert scene.provenance["imported"]["settings"]["is_blender"] is True
