@@ -35,6 +35,7 @@ OPTIONS = (
     "cameras",
     "sh_degree",
     "display",
+    "bend",
 )
 
 
@@ -88,6 +89,11 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         items=viewport_display.ITEMS,
         default=viewport_display.SPLATS,
     )
+    bend: BoolProperty(
+        name="Play Bending",
+        description="Play the motion of single Gaussians of objects that bend; Lock Interface is switched on for them",
+        default=True,
+    )
 
     @classmethod
     def poll(cls, context):
@@ -120,6 +126,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             frame_views=self.frame_views,
             cameras=self.cameras,
             display=self.display,
+            bend=self.bend,
         )
         try:
             with stepwise_operator.cursor(context) as progress:
@@ -141,12 +148,9 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         too_fast = physics.too_fast(loaded_scenes.members(collection, "ANCHOR"))
         if too_fast:
             self.report({"WARNING"}, too_fast)
-        if scene.residuals is not None:  # anchors only hold one transform per group
-            count = len(scene.residuals.rows)
-            self.report(
-                {"WARNING"},
-                f"{plural.of(count, 'Gaussian', 'deform')} in the observed time; shown rigid, unless Exact Mode is on",
-            )
+        if scene.residuals is not None and not self.bend:
+            count = plural.of(len(scene.residuals.rows), "Gaussian", "deform")
+            self.report({"WARNING"}, f"{count} in the observed time; shown rigid, unless Exact Mode is on")
         return {"FINISHED"}
 
     def draw(self, context):

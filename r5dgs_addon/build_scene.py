@@ -19,7 +19,7 @@ from ..r5dgs_core.scene import cameras, spherical_harmonics
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
 from ..r5dgs_core.scene.splats import to_opacities
 from . import compat
-from .motion import event_markers, keyframes, physics
+from .motion import event_markers, exact_mode, keyframes, physics
 from .scene import (
     captured_cameras,
     first_view,
@@ -48,6 +48,7 @@ class Options:
         frame_views: True to look at the scene in all 3D views.
         cameras: True to create the captured cameras.
         display: Key of `viewport_display.ITEMS`.
+        bend: True to play the residual motion of single Gaussians.
     """
 
     world_convention: str = ""
@@ -59,6 +60,7 @@ class Options:
     frame_views: bool = True
     cameras: bool = True
     display: str = viewport_display.SPLATS
+    bend: bool = True
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,8 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
             timeline.fit(context.scene, times)
             event_markers.show(context.scene, collection)
         context.view_layer.update()
+        if options.bend and scene.residuals is not None and len(scene.residuals.rows):
+            exact_mode.switch_on(context, collection, scene)
     if options.frame_views:
         first_view.show(context, collection)
     for selected in context.selected_objects:

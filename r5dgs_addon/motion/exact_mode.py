@@ -1,8 +1,9 @@
 """Exact Mode: per-Gaussian residual motion, applied to the points by a frame change handler.
 
 Anchors move groups rigidly. Residuals of the scene file describe how single Gaussians deviate from that motion. With
-Exact Mode on, the point clouds of a scene keep their bind state in additional attributes, and each frame change writes
-the points. Edits of points are transferred to the bind state. Handlers are installed only while a scene uses the mode.
+Exact Mode on, the point clouds that bend keep their bind state in additional attributes, and each frame change writes
+their points; keys and other edits of motion work as without it. Edits of points are transferred to the bind state.
+Loading a scene with residuals switches the mode on. Handlers are installed only while a scene uses it.
 """
 
 import logging
@@ -15,6 +16,7 @@ from bpy.props import BoolProperty, PointerProperty, StringProperty
 from ...r5dgs_core import errors
 from ...r5dgs_core.playback.residuals import Residuals
 from ...r5dgs_core.scene import scene_file
+from ...r5dgs_core.scene.scene import Scene
 from ..engine import render_request
 from ..scene import file_cache, loaded_scenes, timeline
 from . import exact_points
@@ -32,9 +34,12 @@ class R5DGS_PG_exact(bpy.types.PropertyGroup):
     problem: StringProperty(name="Problem", description="Error that prevents the residual motion", options={"HIDDEN"})
 
 
-def _read_file(path: Path) -> File:
-    scene = scene_file.read(path)
+def _content(scene: Scene) -> File:
     return File(Residuals(scene), scene.gaussians.means)
+
+
+def _read_file(path: Path) -> File:
+    return _content(scene_file.read(path))
 
 
 # Quoted: `typing` would keep the class, and thus this module, alive until after Blender's exit, which crashes.
@@ -61,8 +66,16 @@ def _file_of(collection: bpy.types.Collection, again: bool = False) -> File:
     return found
 
 
-def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
-    """Enable Exact Mode. Returns the number of Gaussians with residual motion.
+def switch_on(context: bpy.types.Context, collection: bpy.types.Collection, scene: Scene | None = None) -> int:
+    """Enable Exact Mode.
+
+    Args:
+        context: Context whose frame is applied.
+        collection: Loaded scene.
+        scene: Content of its file if the caller has just read it.
+
+    Returns:
+        Number of Gaussians with residual motion.
 
     Raises:
         SceneFileError: The file cannot be read.
@@ -70,6 +83,8 @@ def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> i
     """
     if collection.library is not None or any(c.data.library for c in loaded_scenes.members(collection, "CLOUD")):
         raise errors.ConfigError(f"{collection.name}: its points lie in another .blend file; append the scene instead")
+    if scene is not None:
+        _files.put(render_request.scene_path(collection), _content(scene))
     count = len(_file_of(collection, again=True).bending.rows)
     if not count:
         raise errors.ConfigError(f"{collection.name}: all objects are rigid; there is no residual motion to play")
@@ -123,6 +138,7 @@ def _follow_edits(scene, depsgraph=None):
     updated = set() if depsgraph is None else {one.id.original for one in depsgraph.updates if one.is_updated_geometry}
     if not updated:
         return
+    exact_points.check_again(one.session_uid for one in updated)
     for collection in _exact_scenes():
         members = loaded_scenes.members(collection, "CLOUD")
         if any((one in updated or one.data in updated) and exact_points.is_edited(one.data) for one in members):
@@ -152,6 +168,7 @@ def refresh() -> None:
 @persistent
 def _look_again(*_):
     """Update handlers and points after loading, undo and redo."""
+    exact_points.forget()
     listen()
     refresh()
 

@@ -1,5 +1,7 @@
 """Points of one point cloud in Exact Mode: bind state in additional attributes, residual motion, edits."""
 
+import weakref
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import bpy
@@ -16,7 +18,7 @@ _PARTS = (
     ("scale", "FLOAT_VECTOR", "vector", 3),
 )
 
-_WRITTEN = "r5dgs_exact_written"  # custom property of point clouds: fingerprints and time of the written attributes
+_rigid: dict[int, weakref.ref[Residuals]] = {}  # residuals that bend no point of a cloud, by session_uid
 _turns: dict[int, tuple[str, tuple[np.ndarray, np.ndarray] | None]] = {}  # cache by session_uid, see `_turn_of`
 
 
@@ -30,16 +32,20 @@ class File:
 
 def write(cloud: bpy.types.PointCloud, file: File, t: float) -> None:
     """Write the points of a point cloud at a scene time. Edits of points are kept."""
+    rigid = _rigid.get(cloud.session_uid)
+    if rigid is not None and rigid() is file.bending:
+        return
     rows = _rows(cloud)
     points, part = _bending_points(rows, file.bending)
     if len(points) == 0:
+        _rigid[cloud.session_uid] = weakref.ref(file.bending)
         return
     bind = _bind_state(cloud)
     _keep_edits(cloud, file, rows, points, part, bind)
     bent = _bend(bind, file.bending, t, points, part, _turn_of(cloud, file.means, rows, bind["position"]))
     for name, _, field, _ in _PARTS:
         cloud.attributes[name].data.foreach_set(field, bent[name].ravel())
-    cloud[_WRITTEN] = {"t": t, **{name: point_clouds.fingerprint(values) for name, values in bent.items()}}
+    cloud[point_clouds.WRITTEN] = {"t": t, **{name: point_clouds.fingerprint(values) for name, values in bent.items()}}
     cloud.update_tag()
 
 
@@ -115,7 +121,7 @@ def _turn_of(
 
 def is_edited(cloud: bpy.types.PointCloud) -> bool:
     """Return True if points differ from those written by `write`."""
-    written = cloud.get(_WRITTEN)
+    written = cloud.get(point_clouds.WRITTEN)
     if written is None:
         return False
     every = ((point_clouds.attribute(cloud, name, kind), name, field, width) for name, kind, field, width in _PARTS)
@@ -136,7 +142,7 @@ def _keep_edits(
     """Transfer edits of the points since `write` to the bind state ``bind``, in place."""
     if not is_edited(cloud):
         return
-    turn, t = _turn_of(cloud, file.means, rows, bind["position"]), cloud[_WRITTEN]["t"]
+    turn, t = _turn_of(cloud, file.means, rows, bind["position"]), cloud[point_clouds.WRITTEN]["t"]
     written = _bend(bind, file.bending, t, points, part, turn)
     now = {name: point_clouds.read(cloud.attributes[name], field, width) for name, _, field, width in _PARTS}
     back = _bend(now, file.bending, t, points, part, turn, back=True)
@@ -176,10 +182,17 @@ def give_back(cloud: bpy.types.PointCloud) -> None:
         kept.data.foreach_get(field, values)
         cloud.attributes[name].data.foreach_set(field, values)
         cloud.attributes.remove(cloud.attributes[point_clouds.BIND + name])
-    cloud.pop(_WRITTEN, None)
+    cloud.pop(point_clouds.WRITTEN, None)
     cloud.update_tag()
 
 
+def check_again(uids: Iterable[int]) -> None:
+    """Read the rows of point clouds again that had no residuals, by ``session_uid``, because they may have changed."""
+    for uid in uids:
+        _rigid.pop(uid, None)
+
+
 def forget() -> None:
-    """Clear the cache of `_turn_of`."""
+    """Clear all caches."""
+    _rigid.clear()
     _turns.clear()

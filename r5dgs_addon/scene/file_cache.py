@@ -48,6 +48,11 @@ class Remembered(Generic[T]):
             raise errors.SceneFileError(str(known[1]))
         return known[1]
 
+    def put(self, path: Path, content: T) -> None:
+        """Store the content of a file that the caller has just read."""
+        status = path.stat()
+        self._known[path] = (status.st_mtime_ns, status.st_size), content
+
     def clear(self) -> None:
         """Clear the cache."""
         self._known.clear()

@@ -19,7 +19,8 @@ ROW = "gaussian"
 HARMONICS = "radiance:sh_"
 SHADING, SHADING_REST = "shading", "shading_rest"
 BIND = "bind_state:"  # prefix of attributes that keep the values overwritten by Exact Mode
-_FINGERPRINTS = "r5dgs_fingerprints"  # custom property of point clouds
+FINGERPRINTS = "r5dgs_fingerprints"  # custom property of point clouds
+WRITTEN = "r5dgs_exact_written"  # the same: fingerprints and time of the attributes that Exact Mode wrote
 _BLOCK = 2048
 # Display radius of Gaussians in viewports without splats, limited so that large or faint ones hide little.
 DISPLAY_SIGMAS = 1.2
@@ -59,7 +60,7 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     if scene.shading is not None:
         _write(cloud, SHADING, "FLOAT_VECTOR", "vector", scene.shading.vectors[rows])
         _write(cloud, SHADING_REST, "FLOAT", "value", posing.rest_factors(scene)[rows])
-    cloud[_FINGERPRINTS] = {name: fingerprint(values) for name, values in written.items()}
+    cloud[FINGERPRINTS] = {name: fingerprint(values) for name, values in written.items()}
     _write(cloud, "object_id", "INT", "value", scene.gaussians.object_ids[rows], np.int32)
     _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", np.concatenate([shown, opacities[:, None]], axis=-1))
     compat.make_gaussian_splat(cloud)
@@ -79,7 +80,7 @@ def fingerprint(values: np.ndarray) -> str:
 
 def fingerprints(cloud: bpy.types.PointCloud) -> dict[str, str]:
     """Return the stored fingerprints of the loaded attributes by name; empty for files of older versions."""
-    stored = cloud.get(_FINGERPRINTS)
+    stored = cloud.get(FINGERPRINTS)
     return {} if stored is None else stored.to_dict()
 
 

@@ -9,7 +9,6 @@ code 1 where anything differs by more than it may.
 """
 
 import argparse
-import dataclasses
 import importlib.util
 import json
 import os
@@ -76,9 +75,7 @@ def set_time(collection, t: float) -> None:
 def position_error(collection, scene, modules, t: float) -> float:
     """Largest distance between a point as Blender evaluates it and playback, as a fraction of the scene's size."""
     set_time(collection, t)
-    # Anchors have only the rigid part of the motion; residuals need Exact Mode, which is off here.
-    rigid = dataclasses.replace(scene, residuals=None)
-    expected = modules["scene_player"].frame(rigid, t).means.astype(np.float64)
+    expected = modules["scene_player"].frame(scene, t).means.astype(np.float64)
     world = modules["cameras"].WORLD_TO_BLENDER[scene.world_convention]
     depsgraph = bpy.context.evaluated_depsgraph_get()
     worst, seen = 0.0, 0

@@ -1,4 +1,4 @@
-"""Exact Mode plays residual motion and leaves no traces when disabled."""
+"""Exact Mode plays residual motion, from loading on, and leaves no traces when disabled."""
 
 import importlib
 
@@ -27,6 +27,12 @@ def scene_path(tmp_path):
 @pytest.fixture
 def scene(scene_path):
     return scene_file.read(scene_path)
+
+
+@pytest.fixture
+def loaded(blender, scene_path):
+    """The scene, loaded rigid."""
+    return motions.load(blender, scene_path, bend=False)
 
 
 def listeners():
@@ -62,7 +68,48 @@ def assert_bends_like_the_core(bpy, collection, scene, times):
             assert off.max() < 1e-3
 
 
-def test_exact_mode_is_off_by_default_without_handlers(blender, scene, loaded):
+def test_a_scene_that_bends_plays_like_the_core_when_loaded(blender, scene, scene_path):
+    collection = motions.load(blender, scene_path)
+    assert collection.r5dgs_exact.enabled and blender.context.scene.render.use_lock_interface
+    assert_bends_like_the_core(blender, collection, scene, TIMES)
+
+
+def test_keys_of_a_scene_that_bends_are_edited_as_those_of_others(blender, scene, scene_path, tmp_path):
+    collection = motions.load(blender, scene_path)
+    cloud = next(o for o in motions.clouds(collection) if o.r5dgs.start <= scene.residuals.rows[0])
+    motions.go_to(blender, collection, 0.2)
+    before, curve = motions.points(blender, cloud), next(iter(motions.curves(cloud.parent).values()), None)
+    if curve is None:
+        cloud.parent.keyframe_insert("location", index=0, frame=1)
+        curve = motions.curves(cloud.parent)["location", 0]
+    for key in curve.keyframe_points:
+        for point in (key.co, key.handle_left, key.handle_right):
+            point.y += 0.5
+    motions.go_to(blender, collection, 0.5)
+    motions.go_to(blender, collection, 0.2)
+    moved = motions.points(blender, cloud) - before
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=-1), 0.5, atol=1e-4)
+    np.testing.assert_allclose(exported(blender, cloud, tmp_path), motions.points(blender, cloud), atol=1e-5)
+
+
+def test_a_cloud_without_residuals_is_not_read_at_frame_changes(blender, scene, scene_path, monkeypatch):
+    collection = motions.load(blender, scene_path)
+    points = motions.addon("motion.exact_points")
+    own, read = points._rows, []
+    monkeypatch.setattr(points, "_rows", lambda cloud: read.append(cloud.name) or own(cloud))
+    for frame in (5, 9):
+        blender.context.scene.frame_set(frame)
+    bends = {c.data.name for c in motions.clouds(collection) if "bind_state:position" in c.data.attributes}
+    assert bends and len(bends) < len(motions.clouds(collection)) and set(read) == bends
+    rigid = next(c for c in motions.clouds(collection) if c.data.name not in bends)
+    rigid.data.attributes["gaussian"].data[0].value = int(scene.residuals.rows[0])
+    rigid.data.update_tag()
+    blender.context.view_layer.update()
+    motions.go_to(blender, collection, 0.2)
+    assert "bind_state:position" in rigid.data.attributes
+
+
+def test_exact_mode_can_be_off_without_handlers(blender, scene, loaded):
     assert not loaded.r5dgs_exact.enabled and not listeners()
     motions.go_to(blender, loaded, 0.2)
     with pytest.raises(AssertionError, match="t = 0.2"):

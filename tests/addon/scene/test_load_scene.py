@@ -48,12 +48,15 @@ def test_points_match_playback_at_any_time(blender, tmp_path, convention):
     motions.assert_plays_like_the_core(blender, motions.load(blender, path), scene_file.read(path), TIMES)
 
 
-def test_loading_warns_of_deformation_that_anchors_do_not_play(blender, tmp_path, capfd):
+def test_loading_warns_of_deformation_that_it_does_not_play(blender, tmp_path, capfd):
     datasets = drawn_scenes()
     scene = datasets.make_truth()
     bending = datasets.breathing(scene, 0.3)
     for name, wanted in (("rigid", scene), ("bending", bending)):
-        motions.load(blender, scene_file.write(wanted, tmp_path / f"{name}.r5dgs"))
+        path = scene_file.write(wanted, tmp_path / f"{name}.r5dgs")
+        motions.load(blender, path)
+        assert "deform" not in capfd.readouterr().out
+        motions.load(blender, path, bend=False)
         warned = f"{len(bending.residuals.rows)} Gaussians deform" in capfd.readouterr().out
         assert warned == (name == "bending")
 
