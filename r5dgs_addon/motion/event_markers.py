@@ -1,14 +1,15 @@
 """Timeline markers of observed events, such as "ball: impact".
 
-A marker names the loaded scene and the motion group that it belongs to, so that it follows renamed objects and is
-removed with the scene, while markers of users stay.
+A Blender scene registers the markers with the loaded scene and the motion group that they belong to. So they follow
+renamed objects and go with the loaded scene, while markers of users stay. A marker that a user renames or moves is the
+user's from then on. Blender 5.0 removed custom properties of markers, so the register is a property of the scene.
 """
 
-import contextlib
+import json
 import re
 import threading
 import uuid
-from collections.abc import Collection
+from typing import NamedTuple
 
 import bpy
 from bpy.app.handlers import persistent
@@ -16,49 +17,62 @@ from bpy.app.handlers import persistent
 from ..scene import loaded_scenes, timeline
 from . import physics
 
-SCENE = "r5dgs_scene"  # custom property of markers and of loaded scenes: id of the loaded scene
-GROUP = "r5dgs_group"  # the same, of markers only: motion group
+SCENE = "r5dgs_scene"  # custom property of loaded scenes: their id
+MARKERS = "r5dgs_markers"  # custom property of Blender scenes: JSON of the registered markers
+
+
+class Entry(NamedTuple):
+    """A registered marker: its name and frame, the id of the loaded scene, and the motion group."""
+
+    name: str
+    frame: int
+    owner: str
+    group: int
 
 
 def show(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
     """Set the markers of a loaded scene's events in a Blender scene. Markers of users stay."""
-    key, wanted = _new_key(collection), _wanted(collection)
-    present = set()
-    for marker in list(scene.timeline_markers):
-        owner, group = _owner(marker, key, wanted)
-        if owner != key:
-            continue
-        place = (marker.name, marker.frame, group)
-        if place in wanted and place not in present:
-            present.add(place)
-        else:
-            scene.timeline_markers.remove(marker)
-    for name, frame, group in sorted(wanted - present):
-        marker = scene.timeline_markers.new(name, frame=frame)
-        with contextlib.suppress(TypeError):  # see `_owner`
-            marker[SCENE], marker[GROUP] = key, group
+    wanted = _wanted(collection, _new_key(collection))
+    registered = _registered(scene)
+    others = [entry for entry in registered if entry.owner != _key(collection)]
+    for entry in set(registered) - set(others) - wanted:
+        _remove(scene, entry)
+    for entry in sorted(wanted):
+        if _marker(scene, entry) is None:
+            scene.timeline_markers.new(entry.name, frame=entry.frame)
+    _register(scene, [*others, *sorted(wanted)])
 
 
 def shown(scene: bpy.types.Scene, collection: bpy.types.Collection) -> bool:
     """Return True if no marker is missing or outdated."""
-    key, wanted = _key(collection), _wanted(collection)
-    owners = [(marker, *_owner(marker, key, wanted)) for marker in scene.timeline_markers]
-    own = [(marker.name, marker.frame, group) for marker, owner, group in owners if owner == key]
-    return sorted(wanted) == sorted(own)
+    key = _key(collection)
+    return _wanted(collection, key) == {entry for entry in _registered(scene) if entry.owner == key}
 
 
-def _owner(
-    marker: bpy.types.TimelineMarker, key: str, wanted: Collection[tuple[str, int, int]]
-) -> tuple[str | None, int | None]:
-    """Loaded scene and motion group of a marker, or None for both.
+def _registered(scene: bpy.types.Scene) -> list[Entry]:
+    """Registered markers that still exist."""
+    entries = [Entry(*row) for row in json.loads(scene.get(MARKERS, "[]"))]
+    return [entry for entry in entries if _marker(scene, entry) is not None]
 
-    Markers of Blender 5.0 cannot have custom properties. There, markers with a wanted name and frame belong to ``key``.
-    """
-    try:
-        return marker.get(SCENE), marker.get(GROUP)
-    except TypeError:
-        groups = [group for name, frame, group in wanted if (name, frame) == (marker.name, marker.frame)]
-        return (key, groups[0]) if groups else (None, None)
+
+def _register(scene: bpy.types.Scene, entries: list[Entry]) -> None:
+    """Replace the registered markers."""
+    if entries:
+        scene[MARKERS] = json.dumps(entries)
+    elif MARKERS in scene:
+        del scene[MARKERS]
+
+
+def _marker(scene: bpy.types.Scene, entry: Entry) -> bpy.types.TimelineMarker | None:
+    """Return the marker of an entry, or None if it was removed, renamed or moved."""
+    same = (marker for marker in scene.timeline_markers if (marker.name, marker.frame) == (entry.name, entry.frame))
+    return next(same, None)
+
+
+def _remove(scene: bpy.types.Scene, entry: Entry) -> None:
+    """Remove the marker of an entry, unless a linked scene with equal names has removed it before."""
+    if (marker := _marker(scene, entry)) is not None:
+        scene.timeline_markers.remove(marker)
 
 
 def _key(collection: bpy.types.Collection) -> str:
@@ -74,14 +88,14 @@ def _new_key(collection: bpy.types.Collection) -> str:
     return _key(collection)
 
 
-def _wanted(collection: bpy.types.Collection) -> set[tuple[str, int, int]]:
-    """Names, frames and motion groups of the markers. Shadows follow their casters, so they have none."""
+def _wanted(collection: bpy.types.Collection, key: str) -> set[Entry]:
+    """Markers of a loaded scene with id ``key``. Shadows follow their casters, so they have none."""
     times, wanted = timeline.of_collection(collection), set()
     for anchor in loaded_scenes.members(collection, "ANCHOR"):
         if anchor.r5dgs_motion.learned_leader is None:
             for event in physics.history(anchor).events:
                 frame = round(times.frame(event.time))
-                wanted.add((f"{_label(anchor)}: {event.kind}", frame, anchor.r5dgs.motion_id))
+                wanted.add(Entry(f"{_label(anchor)}: {event.kind}", frame, key, anchor.r5dgs.motion_id))
     return wanted
 
 
@@ -93,22 +107,26 @@ def _label(anchor: bpy.types.Object) -> str:
 @persistent
 def _follow(scene, depsgraph=None):
     """Rename the markers of renamed objects, and remove those of scenes that are gone."""
-    own = [marker for marker in scene.timeline_markers if _owner(marker, "", ())[0] is not None]
-    if not own or threading.current_thread() is not threading.main_thread():
+    if MARKERS not in scene or threading.current_thread() is not threading.main_thread():
         return
     there = {_key(collection): collection for collection in loaded_scenes.shown(scene)}
     labels: dict[tuple[str, int], set[str]] = {}
     for key, collection in there.items():
         for anchor in loaded_scenes.members(collection, "ANCHOR"):
             labels.setdefault((key, anchor.r5dgs.motion_id), set()).add(_label(anchor))
-    for marker in own:
-        if marker[SCENE] not in there:
-            scene.timeline_markers.remove(marker)
+    before, after = _registered(scene), []
+    for entry in before:
+        if entry.owner not in there:
+            _remove(scene, entry)
             continue
-        label, colon, kind = marker.name.rpartition(": ")
-        current = labels.get((marker[SCENE], marker.get(GROUP)), set())
-        if colon and len(current) == 1 and label not in current:  # duplicates share a group
-            marker.name = f"{next(iter(current))}: {kind}"
+        label, _, kind = entry.name.rpartition(": ")
+        current = labels.get((entry.owner, entry.group), set())
+        if len(current) == 1 and label not in current:  # duplicates share a group
+            marker, entry = _marker(scene, entry), entry._replace(name=f"{next(iter(current))}: {kind}")
+            marker.name = entry.name
+        after.append(entry)
+    if after != before:
+        _register(scene, after)
 
 
 def register():

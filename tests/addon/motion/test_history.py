@@ -57,6 +57,17 @@ def test_markers_follow_a_renamed_object(blender, loaded):
     assert markers(blender) == expected
 
 
+def test_a_moved_marker_belongs_to_the_user(blender, loaded):
+    scene = blender.context.scene
+    scene.timeline_markers["mug: impact"].frame = 33
+    blender.data.objects["mug anchor"].name = "cup anchor"
+    blender.context.view_layer.update()
+    expected = [(13, "cup: start"), (33, "mug: impact"), (46, "t_max")]
+    assert markers(blender) == expected
+    blender.ops.r5dgs.fit_timeline()
+    assert markers(blender) == sorted([*expected, (31, "cup: impact")])
+
+
 def test_two_scenes_have_markers_of_their_own_which_go_with_them(blender, loaded, scene_path, tmp_path):
     first = markers(blender)
     name = motions.load(blender, scene_path).name
