@@ -6,6 +6,7 @@ from types import ModuleType
 
 import bpy
 
+from ..r5dgs_addon.clean_up import tools
 from ..r5dgs_addon.panels import export
 from ..r5dgs_addon.ui import stepwise_operator
 
@@ -30,10 +31,11 @@ MENUS = ((bpy.types.TOPBAR_MT_file_import, _menu_import), (bpy.types.TOPBAR_MT_f
 
 
 def register():
-    """Register the classes of all modules, and the entries of File > Import and File > Export."""
+    """Register the classes of all modules, their tools, and the entries of File > Import and File > Export."""
     for module in modules():
         for cls in module.CLASSES:
             bpy.utils.register_class(cls)
+    tools.register()  # their keys name operators
     for menu, draw in MENUS:
         menu.append(draw)
 
@@ -43,6 +45,7 @@ def unregister():
     stepwise_operator.stop_all(bpy.context)
     for menu, draw in MENUS:
         menu.remove(draw)
+    tools.unregister()
     for module in reversed(modules()):
         for cls in reversed(module.CLASSES):
             bpy.utils.unregister_class(cls)

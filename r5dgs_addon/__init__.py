@@ -1,6 +1,7 @@
 """Services of the add-on: objects, keyframes, properties, preferences, panels and the worker client."""
 
 from . import panels, preferences
+from .clean_up import criteria, overlay
 from .engine import engine, live_preview, render_notes, render_stats
 from .language import prompt_state
 from .motion import event_markers, exact_mode, extrapolate, motion_fields, pivot
@@ -24,6 +25,8 @@ MODULES = (
     render_notes,
     engine,
     viewport_splats,
+    criteria,
+    overlay,
     panels,
     relink,
     click_select,

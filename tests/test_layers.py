@@ -170,7 +170,8 @@ ADDON_ALLOWED = {
     "motion": {"compat", "ui", "scene", "engine"},
     "build_scene": {"compat", "scene", "motion"},
     "export": {"ui", "scene", "worker", "engine", "motion"},
-    "panels": {"ui", "scene", "color", "worker", "engine", "splats", "language", "motion"},
+    "clean_up": {"ui", "scene"},
+    "panels": {"ui", "scene", "color", "worker", "engine", "splats", "language", "motion", "clean_up"},
     "capture": {"ui", "export"},
 }
 LIGHT = GROUND | {"motion", "scene", "color", "formats", "playback", "editing", "search", "protocol", "user_settings"}

@@ -202,11 +202,11 @@ def _members(collection: bpy.types.Collection) -> tuple[list[_Member], dict[int,
     clouds = [obj for obj in loaded_scenes.members(collection, "CLOUD") if obj.type == "POINTCLOUD"]
     clouds.sort(key=lambda obj: (obj.r5dgs.start, len(obj.name), obj.name))
     free = max([entry.object_id for entry in collection.r5dgs.table] + [0]) + 1
-    anchors: dict[tuple[int, int], list[bpy.types.Object | None]] = {}
+    anchors: dict[tuple[int, int, int], list[bpy.types.Object | None]] = {}
     copies: dict[tuple[int, bpy.types.Collection], int] = {}
     for cloud in clouds:
         state, anchor = cloud.r5dgs, _anchor(cloud)
-        rows = anchors.setdefault((state.start, state.count), [])
+        rows = anchors.setdefault((state.object_id, state.start, state.count), [])
         rows.append(anchor)
         object_id, home = state.object_id, cloud.users_collection[0]
         if object_id > 0 and len(rows) > 1:

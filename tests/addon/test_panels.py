@@ -179,7 +179,7 @@ def test_panels_are_in_the_order_of_tasks_and_only_the_first_ones_are_open(exten
     classes = [panel for module in panels.MODULES for panel in module.CLASSES if hasattr(panel, "bl_label")]
     sidebar = [one for one in classes if getattr(one, "bl_region_type", "") == "UI"]
     assert [one.bl_label for one in sidebar if not hasattr(one, "bl_parent_id")] == [
-        *("Scene", "Objects", "Select by Prompt", "Motion", "Preview", "Export", "Capture")
+        *("Scene", "Objects", "Select by Prompt", "Motion", "Clean Up", "Preview", "Export", "Capture")
     ]
     closed = {one for one in sidebar if "DEFAULT_CLOSED" in getattr(one, "bl_options", ())}
     assert {one for one in sidebar if hasattr(one, "bl_parent_id")} <= closed
