@@ -13,7 +13,7 @@ from ..config import training_needs
 from ..scene.splats import to_opacities
 from . import checkpoint_content, probe
 from .identity import identity_training, label_cleanup, label_votes, packed_masks
-from .representations.fused_posing import Splats
+from .representations.fused_posing import PosedSplats
 from .train_views import TrainView
 from .trainer import Trainer
 
@@ -39,7 +39,7 @@ def outcome(trainer: Trainer, progress: Progress) -> dict[str, torch.Tensor]:
     if any(v.mask is not None for v in trainer.views):
 
         @torch.no_grad()
-        def pose(view: TrainView) -> Splats:
+        def pose(view: TrainView) -> PosedSplats:
             return trainer.splats(view.camera, view.t)
 
         progress({"event": "prepare", "text": "labels, by a vote of the masks"})

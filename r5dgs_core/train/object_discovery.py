@@ -24,7 +24,7 @@ from ..raster import rasterize_splats
 from . import motion_clusters
 from .representations import gating
 from .representations.field import FieldRepresentation
-from .representations.fused_posing import Splats
+from .representations.fused_posing import PosedSplats
 from .train_views import TrainView, spread
 from .trainer import Trainer
 
@@ -195,7 +195,7 @@ def needed(trainer: Trainer, labels: np.ndarray) -> np.ndarray:
     return ranks[labels]
 
 
-def _drawn(trainer: Trainer, view: TrainView, splats: Splats, parts_of: Tensor) -> tuple[Tensor, Tensor]:
+def _drawn(trainer: Trainer, view: TrainView, splats: PosedSplats, parts_of: Tensor) -> tuple[Tensor, Tensor]:
     """Return the squared error of a view's pixels, and the part that each of them shows. [H, W], [H, W]"""
     shown = rasterize_splats(
         splats.means,

@@ -22,7 +22,7 @@ from ..scene import cameras, sh_color
 from ..scene.cameras import Camera
 from . import train_views
 from .representations import fused_posing
-from .representations.fused_posing import Splats
+from .representations.fused_posing import PosedSplats
 from .representations.tracks import TracksRepresentation
 from .trainer import Trainer
 
@@ -42,7 +42,7 @@ class _Look:
     camera: Camera
     truth: np.ndarray
     region: np.ndarray
-    others: Splats
+    others: PosedSplats
 
 
 class Registration:
@@ -152,10 +152,10 @@ class Registration:
         camera = dataclasses.replace(view.camera, intrinsics=intrinsics, **size)
         splats = self._trainer.splats(camera, view.t)
         near = self._others_near(camera, splats)
-        others = Splats(**{name: getattr(splats, name)[near] for name in _FIELDS})
+        others = PosedSplats(**{name: getattr(splats, name)[near] for name in _FIELDS})
         return _Look(camera, view.image[rows, columns].astype(np.float32) / 255, region[rows, columns], others)
 
-    def _others_near(self, camera: Camera, splats: Splats) -> torch.Tensor:
+    def _others_near(self, camera: Camera, splats: PosedSplats) -> torch.Tensor:
         """Rows of the Gaussians of other groups that reach a camera's picture."""
         pixels, depth = cameras.project(camera, splats.means.numpy().astype(np.float64))
         reach = _REACH * splats.scales.amax(1).numpy() * camera.intrinsics[0, 0] / np.maximum(depth, 1e-6) + 1

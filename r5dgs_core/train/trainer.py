@@ -224,7 +224,7 @@ class Trainer:
 
     def _draw_all(
         self, view: train_views.TrainView, stats: RasterStats
-    ) -> tuple[Tensor, Tensor | None, fused_posing.Splats]:
+    ) -> tuple[Tensor, Tensor | None, fused_posing.PosedSplats]:
         """Render a training view: image, blended encodings (None if rendered separately) and splats."""
         splats = self.splats(view.camera, view.t, self.generator)
         colors, background = splats.colors, self.background.image(view.camera)
@@ -256,7 +256,7 @@ class Trainer:
             self.background.image(camera),
         ).image
 
-    def splats(self, camera: Camera, t: float, draw: torch.Generator | None = None) -> fused_posing.Splats:
+    def splats(self, camera: Camera, t: float, draw: torch.Generator | None = None) -> fused_posing.PosedSplats:
         """Return activated Gaussians in normalised coordinates at a time, as seen by a camera."""
         return self.motion.splats(self.gaussians, camera, t, draw)
 

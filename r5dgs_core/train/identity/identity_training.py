@@ -16,7 +16,7 @@ from torch import Tensor
 from ...config.config import Config
 from ...raster import rasterize_splats
 from ...scene.scene import IDENTITY_DIM
-from ..representations.fused_posing import Splats
+from ..representations.fused_posing import PosedSplats
 from ..train_views import TrainView
 from . import identity_losses
 from .label_votes import class_map
@@ -24,7 +24,7 @@ from .label_votes import class_map
 
 def train_encodings(
     views: list[TrainView],
-    pose: Callable[[TrainView], Splats],
+    pose: Callable[[TrainView], PosedSplats],
     classes: dict[int, int],
     labels: Tensor,
     config: Config,
@@ -143,7 +143,7 @@ def distinct_classes(count: int, generator: torch.Generator) -> tuple[Tensor, Te
     return 2 * weight / weight.norm(dim=1, keepdim=True), bias
 
 
-def rasterize(splats: Splats, channels: Tensor, view: TrainView) -> Tensor:
+def rasterize(splats: PosedSplats, channels: Tensor, view: TrainView) -> Tensor:
     """Blend channels [N, F] over a view without gradients of the geometry. [H, W, F]"""
     return rasterize_splats(
         splats.means.detach(),

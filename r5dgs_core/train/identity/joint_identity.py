@@ -15,7 +15,7 @@ from ...config.config import Config
 from ...model.gaussians import Gaussians
 from ...scene import sh_color
 from ...scene.scene import IDENTITY_DIM
-from ..representations.fused_posing import Splats
+from ..representations.fused_posing import PosedSplats
 from ..train_views import TrainView
 from . import identity_losses, identity_training
 from .label_votes import class_map
@@ -109,7 +109,7 @@ class JointIdentity:
     def loss(
         self,
         gaussians: Gaussians,
-        splats: Splats,
+        splats: PosedSplats,
         view: TrainView,
         iteration: int,
         features: Tensor | None = None,

@@ -12,13 +12,15 @@ import torch
 from torch import Tensor
 
 from ...render.segment_weights import segment_weights
-from ..representations.fused_posing import Splats
+from ..representations.fused_posing import PosedSplats
 from ..train_views import TrainView, spread
 
 VOTE_VIEWS = 80
 
 
-def votes(views: list[TrainView], pose: Callable[[TrainView], Splats], classes: dict[int, int], count: int) -> Tensor:
+def votes(
+    views: list[TrainView], pose: Callable[[TrainView], PosedSplats], classes: dict[int, int], count: int
+) -> Tensor:
     """Return the contribution of each Gaussian to the mask pixels of each class.
 
     Args:

@@ -99,7 +99,7 @@ class FieldRepresentation(Representation):
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
-    ) -> fused_posing.Splats:
+    ) -> fused_posing.PosedSplats:
         """See `Representation.splats`."""
         params = gaussians.params
         moved = self.move(gaussians, t, draw)

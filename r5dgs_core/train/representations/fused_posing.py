@@ -26,7 +26,7 @@ CHUNKS = 16
 
 
 @dataclass(frozen=True)
-class Splats:
+class PosedSplats:
     """Posed, activated Gaussians: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], colors [N, 3]."""
 
     means: Tensor
@@ -47,7 +47,7 @@ def pose(
     motion_ids: Tensor,  # [N]
     group_poses: GroupPoses,
     centers: Tensor,  # [G, 3]
-) -> Splats:
+) -> PosedSplats:
     """Move canonical Gaussians with their groups and activate their parameters.
 
     Args:
@@ -65,7 +65,7 @@ def pose(
     Returns:
         Splats for the rasterizer; differentiable in everything but ``motion_ids`` and ``centers``.
     """
-    return Splats(
+    return PosedSplats(
         *_Pose.apply(
             means,
             quats,

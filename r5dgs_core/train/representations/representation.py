@@ -57,7 +57,7 @@ class Representation:
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
-    ) -> fused_posing.Splats:
+    ) -> fused_posing.PosedSplats:
         """Return activated Gaussians at a time, with colours as seen by a camera; differentiable.
 
         Args:

@@ -45,7 +45,7 @@ class StillRepresentation(Representation):
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
-    ) -> fused_posing.Splats:
+    ) -> fused_posing.PosedSplats:
         """See `Representation.splats`; the result is the same at all times."""
         params = gaussians.params
         if params["sh_rest"].shape[1] == 0:

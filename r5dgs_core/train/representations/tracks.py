@@ -68,7 +68,7 @@ class TracksRepresentation(Representation):
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
-    ) -> fused_posing.Splats:
+    ) -> fused_posing.PosedSplats:
         """See `Representation.splats`."""
         poses = self.tracks.poses(t)
         centers = self.tracks.group_centers()

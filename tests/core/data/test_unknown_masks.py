@@ -16,7 +16,7 @@ from r5dgs_core.playback import scene_player
 from r5dgs_core.train import normalization, run, train_views
 from r5dgs_core.train.identity import identity_training, joint_identity, label_votes
 from r5dgs_core.train.initialization import background_images, scatter, triangulation, visual_hull
-from r5dgs_core.train.representations.fused_posing import Splats
+from r5dgs_core.train.representations.fused_posing import PosedSplats
 from tests.support import tiny_datasets
 
 CLASSES = {0: 0, tiny_datasets.BRICK: 1, tiny_datasets.BALL: 2}
@@ -35,7 +35,7 @@ def pose(tiny):
 
     def at(view):
         frame = scene_player.frame(tiny.truth, view.t)
-        return Splats(
+        return PosedSplats(
             *(torch.from_numpy(np.asarray(a, np.float32)) for a in (frame.means, frame.quats)),
             torch.from_numpy(np.exp(np.asarray(tiny.truth.gaussians.log_scales, np.float32))),
             torch.sigmoid(torch.from_numpy(tiny.truth.gaussians.opacity_logits)),

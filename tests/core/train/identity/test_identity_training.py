@@ -14,14 +14,14 @@ from r5dgs_core.raster import rasterize_splats
 from r5dgs_core.scene import scene
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.train.identity import identity_losses, identity_training, joint_identity, label_votes
-from r5dgs_core.train.representations.fused_posing import Splats
+from r5dgs_core.train.representations.fused_posing import PosedSplats
 from r5dgs_core.train.train_views import TrainView
 
 
 def row_of_blobs(opacities=(0.9, 0.9, 0.9)):
     """Three blobs side by side before a camera of 30 x 12 pixels, and a mask that names them 0, 5 and 3."""
     camera = Camera(30, 12, np.array([[30.0, 0, 15], [0, 30, 6], [0, 0, 1]]), np.eye(4))
-    splats = Splats(
+    splats = PosedSplats(
         torch.tensor([[-1.0, 0, 3], [0, 0, 3], [1, 0, 3]]),
         torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4),
         torch.full((3, 3), 0.1),
@@ -106,7 +106,7 @@ def wall(n=300, seed=0):
 
 def posed(gaussians):
     opacities, colors = torch.sigmoid(gaussians.opacity_logits), torch.rand(len(gaussians), 3)
-    return Splats(gaussians.means * 1, gaussians.quats * 1, gaussians.log_scales.exp(), opacities, colors)
+    return PosedSplats(gaussians.means * 1, gaussians.quats * 1, gaussians.log_scales.exp(), opacities, colors)
 
 
 def make_joint(view, gaussians, training, **changes):

@@ -41,7 +41,7 @@ def plain(values, ids, centers):
     change = (rotmats.transpose(1, 2) @ v["light"]) - v["light"]
     factor = (1 + (change * v["shading"]).sum(-1)).clamp(min=0)
     colors = v["colors"].clamp(min=0) * factor[:, None]
-    return fused_posing.Splats(means, quats, v["log_scales"].exp(), v["logits"].sigmoid(), colors)
+    return fused_posing.PosedSplats(means, quats, v["log_scales"].exp(), v["logits"].sigmoid(), colors)
 
 
 def weighted_sum(splats, seed=9):
