@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from . import terminal
-from .time_left import Timed
+from .time_left import TimedProgress
 
 Event = dict[str, Any]
 Progress = Callable[[Event], None]
@@ -19,21 +19,21 @@ LABELS = {"step": "train", "identity": "identities"}  # labels of bars; the defa
 
 
 @contextmanager
-def make(kind: str) -> Iterator[Timed]:
+def make(kind: str) -> Iterator[TimedProgress]:
     """Yield a function that shows events and adds the remaining seconds to counted ones.
 
     Args:
         kind: "auto" (bars in a terminal, else a plain line per phase and every ten seconds), "json" or "none".
     """
     if kind == "json":
-        yield Timed(lambda event: print(json.dumps(event), flush=True))
+        yield TimedProgress(lambda event: print(json.dumps(event), flush=True))
     elif kind == "none":
-        yield Timed(lambda event: None)
+        yield TimedProgress(lambda event: None)
     elif sys.stdout.isatty():
         with _rich() as show:
-            yield Timed(show)
+            yield TimedProgress(show)
     else:
-        yield Timed(_plain())
+        yield TimedProgress(_plain())
 
 
 @contextmanager

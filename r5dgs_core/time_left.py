@@ -126,7 +126,7 @@ class TimeLeft:
         return sum(self._done[phase.name] * phase.cost for phase in self._phases.values())
 
 
-class Timed:
+class TimedProgress:
     """Progress function that adds ``seconds_left`` to counted events, over all phases of the command.
 
     Args:

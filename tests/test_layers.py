@@ -61,7 +61,7 @@ ALLOWED = {
     "playback": {"motion", "scene", "color"},
     "formats": {"motion", "scene", "playback"},
     "editing": {"motion", "scene", "color", "playback"},
-    "protocol": {"scene", "search", "playback"},
+    "protocol": {"scene", "search"},
     "model": {"motion", "playback"},
     "render": {"motion", "scene", "raster", "playback"},
     "importing": {"motion", "scene", "data", "formats", "model"},

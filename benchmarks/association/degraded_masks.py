@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage, optimize
 
-from r5dgs_core.association.associate import Row
+from r5dgs_core.association.associate import SegmentResult
 from r5dgs_core.data.masks import UNKNOWN
 
 from .scenes import Image
@@ -168,7 +168,9 @@ def majority(masks: Sequence[np.ndarray], images: Sequence[Image], count: int) -
     return repaired
 
 
-def switches(masks: Sequence[np.ndarray], images: Sequence[Image], rows: Sequence[Row]) -> tuple[float, float]:
+def switches(
+    masks: Sequence[np.ndarray], images: Sequence[Image], rows: Sequence[SegmentResult]
+) -> tuple[float, float]:
     """Precision and recall of ``relabelled``: segments that show another object than their id mostly does in the view.
 
     NaN where there are none.

@@ -17,7 +17,7 @@ FEWEST = 4
 PASSES = 3
 
 
-def associate(stack: segment_stack.Stack, threshold: float = THRESHOLD, fewest: int = FEWEST) -> np.ndarray:
+def associate(stack: segment_stack.SegmentStack, threshold: float = THRESHOLD, fewest: int = FEWEST) -> np.ndarray:
     """Object of each segment, 0 = background, -1 = none. [S]"""
     labels = np.where(stack.ids > 0, -1, 0)
     most = int((stack.ids > 0).sum())

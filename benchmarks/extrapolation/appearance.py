@@ -41,7 +41,7 @@ from r5dgs_core.error_vs_time import image_task
 from r5dgs_core.evaluation import evaluate, metrics
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_player
-from r5dgs_core.render import scene_renderer, segment_weights
+from r5dgs_core.render import posed_scene, scene_renderer, segment_weights
 from r5dgs_core.render.warm_up import warm_up
 from r5dgs_core.scene import cameras
 from r5dgs_core.scene.cameras import Camera
@@ -159,7 +159,7 @@ def _towards(frame: scene_player.Frame, camera: Camera) -> np.ndarray:
 
 def visibility(scene: Scene, frame: scene_player.Frame, camera: Camera) -> np.ndarray:
     """Visible share of each Gaussian in a view, relative to drawing it alone and completely. [N]"""
-    posed = scene_renderer.pose_frame(scene, frame)
+    posed = posed_scene.pose_frame(scene, frame)
     gaussians = scene_renderer.PosedGaussians(posed)
     shapes = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     everywhere = np.zeros((camera.height, camera.width), np.int64)

@@ -27,10 +27,10 @@ import torch
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.raster import RenderOutput, compilation
-from r5dgs_core.render import incremental_renderer, scene_renderer
-from r5dgs_core.render.scene_renderer import Instance
+from r5dgs_core.render import incremental_renderer, posed_scene, scene_renderer
 from r5dgs_core.scene import row_runs
 from r5dgs_core.scene.cameras import Camera
+from r5dgs_core.scene.instance import Instance
 from r5dgs_core.scene.scene import Gaussians, MotionGroup, Scene, SceneObject, Shading, Tracks
 
 PLAIN = ("fps", "ms_frame", "ms_motion", "ms_colors", "ms_raster")
@@ -136,7 +136,7 @@ def instances_at(scene: Scene, t: float) -> list[Instance]:
 
 def compare(staged: RenderOutput, scene: Scene, instances: list[Instance], camera: Camera) -> None:
     """Raise AssertionError if the picture of a stage differs from a complete drawing."""
-    anew = scene_renderer.render_frame(scene, scene_renderer.pose_instances(scene, instances), camera)
+    anew = scene_renderer.render_frame(scene, posed_scene.pose_instances(scene, instances), camera)
     for name in ("color", "alpha"):
         difference = np.abs(getattr(staged, name) - getattr(anew, name)).max()
         if not difference <= TOLERANCE:
@@ -153,7 +153,7 @@ def measure(scene: Scene, camera: Camera, frames: int) -> dict[str, float]:
         moved = time.perf_counter()
         scene_renderer.render_frame(scene, frame, camera)
         drawn = time.perf_counter()
-        posed = scene_renderer.pose_frame(scene, frame)
+        posed = posed_scene.pose_frame(scene, frame)
         scene_renderer.colors(posed, camera)
         scene_renderer.sky(scene, camera)
         colored = time.perf_counter()

@@ -20,7 +20,7 @@ import torch
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.raster import RasterSettings
-from r5dgs_core.render import scene_renderer
+from r5dgs_core.render import posed_scene, scene_renderer
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.scene.scene import Scene
 
@@ -80,7 +80,7 @@ def check(name: str, garden: Path | None = None) -> None:
 
 def pose_scene(name: str, scene: Scene, camera: Camera, t: float) -> Workload:
     """A scene at a time, drawn as playback poses it."""
-    posed = scene_renderer.pose_frame(scene, scene_player.frame(scene, t))
+    posed = posed_scene.pose_frame(scene, scene_player.frame(scene, t))
     inputs = _tensors(
         posed.means,
         posed.quats,

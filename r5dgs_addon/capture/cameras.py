@@ -20,7 +20,7 @@ MIN_OWN_CAMERAS = 3  # fewer observed cameras do not constrain depth, so AUTO ad
 
 
 @dataclass(frozen=True)
-class View:
+class NamedCamera:
     """Camera with its name in the data set."""
 
     name: str
@@ -31,8 +31,8 @@ class View:
 class Views:
     """Observed and novel cameras of a capture; disjoint."""
 
-    observed: tuple[View, ...]
-    novel: tuple[View, ...]
+    observed: tuple[NamedCamera, ...]
+    novel: tuple[NamedCamera, ...]
 
 
 def choose(context: bpy.types.Context, settings: CaptureSettings, box: np.ndarray, overrides: Overrides) -> Views:
@@ -67,7 +67,7 @@ def choose(context: bpy.types.Context, settings: CaptureSettings, box: np.ndarra
             f"capture.observed: expected at least one camera {wanted}, found none among {len(cameras)} cameras of the "
             "scene; add cameras or choose a rig"
         )
-    views = Views(tuple(View(ob.name, ob) for ob in observed), tuple(View(ob.name, ob) for ob in novel))
+    views = Views(tuple(NamedCamera(ob.name, ob) for ob in observed), tuple(NamedCamera(ob.name, ob) for ob in novel))
     if rig != "NONE":
         built = _build_rig(context, settings, rig, box, overrides)
         views = Views(views.observed + built.observed, views.novel + built.novel)
@@ -220,7 +220,7 @@ def _build_rig(
             camera = bpy.data.objects.new(f"{prefix}{index}", data)
             scene.collection.objects.link(camera)
             camera.matrix_world = Matrix(pose.tolist())
-            views.append(View(f"{prefix}{index}", camera))
+            views.append(NamedCamera(f"{prefix}{index}", camera))
     context.view_layer.update()
     return Views(tuple(views[: len(groups[0])]), tuple(views[len(groups[0]) :]))
 

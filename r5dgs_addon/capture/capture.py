@@ -200,7 +200,7 @@ def _check_ids(highest: int) -> None:
         )
 
 
-def _jobs(plan: TimePlan, views: cameras.Views, test_views: int) -> Iterator[tuple[str, float, cameras.View]]:
+def _jobs(plan: TimePlan, views: cameras.Views, test_views: int) -> Iterator[tuple[str, float, cameras.NamedCamera]]:
     """Split, frame and view of every image, grouped by frame because changing the frame costs most."""
     picks = np.linspace(0, len(views.observed) - 1, min(test_views, len(views.observed))).round().astype(int)
     later_views = [views.observed[i] for i in picks] + list(views.novel)

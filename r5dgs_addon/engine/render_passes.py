@@ -58,7 +58,7 @@ def wanted(passes: Sequence[Pass], transparent: bool) -> tuple[str, ...]:
 def pixels(
     one: Pass,
     arrays: dict[str, np.ndarray],
-    seen: render_request.Shown,
+    seen: render_request.VisibleParts,
     transparent: bool,
     inverse: view_inverse.Inverse | None = None,
 ) -> np.ndarray:
@@ -95,7 +95,7 @@ def depths(arrays: dict[str, np.ndarray]) -> np.ndarray:
     return np.where(arrays["alpha"] >= SOLID, arrays["depth"], np.float32(NOTHING)).astype(np.float32)
 
 
-def indices(arrays: dict[str, np.ndarray], seen: render_request.Shown) -> np.ndarray:
+def indices(arrays: dict[str, np.ndarray], seen: render_request.VisibleParts) -> np.ndarray:
     """Object indices from ``owners``, 0 for background. [H, W] int64"""
     own = [index_of(instance) for instance in seen.instances]
     return np.array([*own, 0], np.int64)[arrays["owners"]]  # owner -1 (none) selects the last value

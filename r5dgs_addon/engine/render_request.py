@@ -15,9 +15,9 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core import errors
-from ...r5dgs_core.playback.instance import Sky
 from ...r5dgs_core.protocol.messages import RenderRequest
 from ...r5dgs_core.scene import cameras
+from ...r5dgs_core.scene.instance import Sky
 from ..scene import trust
 from ..worker import jobs
 from . import render_stats, view_cameras, visible_clouds
@@ -27,7 +27,7 @@ PREVIEW = "preview"  # job key for `jobs.busy`
 
 
 @dataclass(frozen=True)
-class Shown:
+class VisibleParts:
     """Visible parts of the loaded scenes.
 
     Attributes:
@@ -52,7 +52,7 @@ def shown(
     depsgraph: bpy.types.Depsgraph,
     looks: Callable[[Callable[[], np.ndarray]], view_cameras.View] | None = None,
     space: bpy.types.SpaceView3D | None = None,
-) -> Shown:
+) -> VisibleParts:
     """Visible parts of the loaded scenes at the evaluated frame, sub-frame included.
 
     Args:
@@ -70,10 +70,12 @@ def shown(
     instances = tuple(one for one in instances if one.seen)
     points = visible_clouds.points(instances)
     view = view_cameras.of_camera(depsgraph, points) if looks is None else looks(points)
-    return Shown(view, scenes, tuple(visible_clouds.world_of(one, depsgraph) for one in scenes), instances)
+    return VisibleParts(view, scenes, tuple(visible_clouds.world_of(one, depsgraph) for one in scenes), instances)
 
 
-def render(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def render(
+    seen: VisibleParts, want: tuple[str, ...] = (), sky: bool = True
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Render in the worker and wait for the result.
 
     Args:
@@ -95,7 +97,7 @@ def render(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> tuple[d
     return jobs.run(steps(seen, want, sky))
 
 
-def steps(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> list[tuple[str, str, dict[str, Any]]]:
+def steps(seen: VisibleParts, want: tuple[str, ...] = (), sky: bool = True) -> list[tuple[str, str, dict[str, Any]]]:
     """Worker requests of an image, for `jobs.start`. The job returns the same as `render`."""
     held = any(one.holdout for one in seen.instances)
     picture = RenderRequest(

@@ -47,7 +47,7 @@ class Wish:
 
     def __init__(
         self,
-        seen: render_request.Shown,
+        seen: render_request.VisibleParts,
         sky: bool,
         transparent: bool,
         moving: int,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ...r5dgs_core.playback.instance import Instance
+from ...r5dgs_core.scene.instance import Instance
 from ..scene import evaluated_points, loaded_scenes, point_clouds, timeline
 
 FLAT = 1e-6  # minimum ratio of smallest to largest scale

@@ -68,7 +68,9 @@ def steps(context: bpy.types.Context, folder: Path, *, format: str, every: bool,
     return Outcome(f"{folder}: {plural.of(len(frames), 'frame')} of {plural.of(len(names), 'object')}")
 
 
-def planes(seen: render_request.Shown, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def planes(
+    seen: render_request.VisibleParts, arrays: dict[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Object index, depth and alpha of an image. Indices are those of the render engine, 0 for background.
 
     Args:
@@ -95,7 +97,7 @@ def _write(folder: Path, image: str, format: str, indices: np.ndarray, depth: np
         image_files.write_exr(path, {f"{LAYER}.{name}": values for name, values in channels.items()})
 
 
-def _names(seen: render_request.Shown) -> dict[str, str]:
+def _names(seen: render_request.VisibleParts) -> dict[str, str]:
     """Names of the visible objects by index, in the format of a data set's ``objects.json``."""
     found = {}
     current = {collection: object_names.names(collection) for collection in seen.scenes}

@@ -29,7 +29,7 @@ _STILL = 1e-6  # maximum deviation of a parent's linear part that counts as the 
 
 
 @dataclass(frozen=True)
-class Edited:
+class EditedScene:
     """A loaded scene with its edits.
 
     Attributes:
@@ -56,7 +56,7 @@ class _Member:
     matrices: list[np.ndarray] = field(default_factory=list)
     pivot: np.ndarray | None = None
     parent: np.ndarray | None = None
-    points: evaluated_points.Found = field(default_factory=evaluated_points.Found)
+    points: evaluated_points.Comparison = field(default_factory=evaluated_points.Comparison)
     keys: set[str] = field(default_factory=set)
 
 
@@ -88,7 +88,7 @@ def edited_steps(
     clouds: Collection[bpy.types.Object] | None = None,
     *,
     further: int,
-) -> Generator[Step, None, Edited]:
+) -> Generator[Step, None, EditedScene]:
     """Apply the edits of a loaded scene. Blender's current frame is restored at the end.
 
     Args:
@@ -135,7 +135,7 @@ def edited_steps(
         )
     if not _rests(collection):
         notes.append("The root was moved; positions in the file are relative to the root")
-    return Edited(result, notes, len(when) + 1)
+    return EditedScene(result, notes, len(when) + 1)
 
 
 def _lost_points(members: list[_Member], source: Scene, extended: Scene) -> list[str]:

@@ -20,7 +20,7 @@ _LOOK_S = 0.1  # timer interval
 
 
 @dataclass(frozen=True)
-class Embedded:
+class PhraseEmbedding:
     """Embedding of a phrase.
 
     Attributes:
@@ -34,7 +34,7 @@ class Embedded:
     vector: np.ndarray
 
 
-_known: dict[tuple[str, str], Embedded] = {}  # by encoder folder and phrase
+_known: dict[tuple[str, str], PhraseEmbedding] = {}  # by encoder folder and phrase
 _job: jobs.Job | None = None
 _asked: tuple[str, list[str]] = ("", [])  # folder and phrases of the job
 _then: Callable[[str], None] | None = None
@@ -120,4 +120,4 @@ def _keep(where: str, asked: Sequence[str], answer: jobs.Answer) -> None:
     result, arrays = answer
     card = result["encoder"]
     for phrase, vector in zip(asked, arrays["embeddings"], strict=True):
-        _known[where, phrase] = Embedded(card["digest"], card["name"], np.array(vector))
+        _known[where, phrase] = PhraseEmbedding(card["digest"], card["name"], np.array(vector))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import bpy
 
 from ...r5dgs_core import errors
-from ...r5dgs_core.scene import scene_file
+from ...r5dgs_core.scene import scene_file, stored_embeddings
 from ...r5dgs_core.search import object_search
 from ..engine import render_request
 from ..scene import file_cache, loaded_scenes, object_names, selection
@@ -23,7 +23,9 @@ ASKING = "Running the text encoder for "  # prefix of the note shown while the e
 STRANGER = (
     "{}: its table was made by the encoder {!r}, not by {!r} of the preferences; make the table again with that one"
 )
-_meanings: file_cache.Remembered[object_search.Meanings | None] = file_cache.Remembered(scene_file.read_meanings)
+_meanings: file_cache.Remembered[stored_embeddings.StoredEmbeddings | None] = file_cache.Remembered(
+    scene_file.read_meanings
+)
 
 
 @dataclass(frozen=True)
@@ -210,7 +212,7 @@ def forget() -> None:
     _meanings.clear()
 
 
-def _stored_meanings(collection: bpy.types.Collection) -> tuple[object_search.Meanings | None, str]:
+def _stored_meanings(collection: bpy.types.Collection) -> tuple[stored_embeddings.StoredEmbeddings | None, str]:
     """Embeddings of a scene's file, or None and a message for the user."""
     if not collection.r5dgs_named.meanings:
         return None, ""

@@ -43,7 +43,7 @@ def pose_at(anchor: bpy.types.Object, where: Place, frame: float) -> tuple[np.nd
 
 
 def _value(name: str, curve: bpy.types.FCurve, frame: float) -> float:
-    points = Points(curve)
+    points = KeyArrays(curve)
     k = points.last(frame)
     if k >= 0 and points.at(k, frame):
         return float(points.co[k, 1])
@@ -52,7 +52,7 @@ def _value(name: str, curve: bpy.types.FCurve, frame: float) -> float:
     return float(_cut(name, curve, points, k, frame)[-1, 3, 1])
 
 
-class Points:
+class KeyArrays:
     """Keys of a curve as arrays: co, left, right [K, 2] float32."""
 
     def __init__(self, curve: bpy.types.FCurve):
@@ -73,7 +73,7 @@ class Points:
         return abs(float(self.co[k, 0]) - frame) <= AT
 
 
-def _cut(name: str, curve: bpy.types.FCurve, points: Points, k: int, frame: float) -> np.ndarray:
+def _cut(name: str, curve: bpy.types.FCurve, points: KeyArrays, k: int, frame: float) -> np.ndarray:
     """Split the segment that starts with key k at a frame; returns the one or two segments before it. [n, 4, 2]
 
     If k is the last key, the returned segment follows the curve's extrapolation.
@@ -147,7 +147,7 @@ def _start(curve: bpy.types.FCurve, frame: float, value: float) -> None:
 
 
 def _replace(anchor: bpy.types.Object, curve: bpy.types.FCurve, frame: float, tail: Keys | None) -> None:
-    before = Points(curve)
+    before = KeyArrays(curve)
     keep = before.last(frame) + 1
     points = curve.keyframe_points
     if keep == 0:  # the user removed all earlier keys; hold the value at the frame
@@ -155,7 +155,7 @@ def _replace(anchor: bpy.types.Object, curve: bpy.types.FCurve, frame: float, ta
         value = float(before.co[0, 1]) if before.count else still
         _shorten(curve, 0)
         _start(curve, frame, value)
-        before, keep = Points(curve), 1
+        before, keep = KeyArrays(curve), 1
     elif not before.at(keep - 1, frame) and (tail is not None or keep < before.count):
         parts = _cut(anchor.name, curve, before, keep - 1, frame)
         bends = curve.keyframe_points[keep - 1].interpolation == "BEZIER" and keep < before.count
@@ -169,7 +169,7 @@ def _replace(anchor: bpy.types.Object, curve: bpy.types.FCurve, frame: float, ta
                 _free(points[keep - 1], left_of_last, part[1])
             left_of_last = part[2]
             keep += 1
-        before = Points(curve)
+        before = KeyArrays(curve)
     _shorten(curve, keep)
     if tail is not None:
         gaps = np.diff(tail.times)
@@ -225,9 +225,9 @@ def _fill(
         points.foreach_set(field, whole)
 
 
-def _restore(curve: bpy.types.FCurve, before: Points, keep: int) -> None:
+def _restore(curve: bpy.types.FCurve, before: KeyArrays, keep: int) -> None:
     """Restore handles that Blender recomputed (automatic handles with changed neighbours)."""
-    after = Points(curve)
+    after = KeyArrays(curve)
     for k in range(keep):
         last = k == keep - 1
         right = after.right[k] if last else before.right[k]
@@ -251,7 +251,7 @@ def digest(where: Place, frame: float) -> str:
     """Digest of all keys after a frame, for detecting manual edits."""
     found = hashlib.sha1(usedforsecurity=False)
     for (path, index), curve in sorted(where.curves().items(), key=lambda item: item[0]):
-        points = Points(curve)
+        points = KeyArrays(curve)
         later = slice(points.last(frame) + 1, None)
         if len(points.co[later]):
             found.update(f"{path}{index}".encode())

@@ -14,7 +14,7 @@ import numpy as np
 from ...r5dgs_core.motion import cubic_curves, models, rotations
 from ...r5dgs_core.motion import key_reduction as reduction
 from ...r5dgs_core.motion.cubic_curves import Curves, Keys
-from ...r5dgs_core.playback import scene_player
+from ...r5dgs_core.playback import group_dynamics, scene_player
 from ...r5dgs_core.scene import row_runs
 from ...r5dgs_core.scene.scene import Scene
 from .. import compat
@@ -133,7 +133,7 @@ def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Cu
     """One key per knot, which is exact, or fewer keys if they stay within the tolerance."""
     times = np.asarray(scene.tracks.times, np.float64)
     own = slice(motion_id, motion_id + 1)
-    quats, displacements = (values[0] for values in scene_player.knots(scene, own))
+    quats, displacements = (values[0] for values in group_dynamics.knots(scene, own))
     quat_slopes, displacement_slopes = (values[0] for values in scene_player.knot_slopes(scene, own))
     exact = Curves(
         Keys(times, displacements, displacement_slopes, displacement_slopes),

@@ -118,7 +118,7 @@ def apply(plan: Replacement) -> None:
 
 
 def _read(curve: bpy.types.FCurve) -> Curve:
-    points = fcurves.Points(curve)
+    points = fcurves.KeyArrays(curve)
     enums = np.empty((len(_ENUMS), points.count), np.int32)
     for field, values in zip(_ENUMS, enums, strict=True):
         curve.keyframe_points.foreach_get(field, values)

@@ -65,7 +65,7 @@ def _plan(anchor: bpy.types.Object, allowed: float) -> tuple[timeline.Times, flo
 
 def _segments(name: str, curve: bpy.types.FCurve) -> np.ndarray:
     """Segments of a curve, or one degenerate segment if it has one key. [K, 4, 2]"""
-    points = fcurves.Points(curve)
+    points = fcurves.KeyArrays(curve)
     co, left, right = (values.astype(np.float64) for values in (points.co, points.left, points.right))
     if len(co) == 1:
         return np.repeat(co[:, None], 4, axis=1)

@@ -48,7 +48,7 @@ class Edit:
 
 
 @dataclass(frozen=True)
-class Found:
+class Comparison:
     """Result of comparing a point cloud with the scene file.
 
     Attributes:
@@ -60,10 +60,10 @@ class Found:
     notes: tuple[str, ...] = ()
 
 
-_known: dict[tuple, tuple[int, Found]] = {}  # by object and depsgraph; with session_uid of the data
+_known: dict[tuple, tuple[int, Comparison]] = {}  # by object and depsgraph; with session_uid of the data
 
 
-def of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, gaussians: int) -> Found:
+def of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, gaussians: int) -> Comparison:
     """Compare a point cloud's evaluated points with its scene file.
 
     Args:
@@ -114,7 +114,7 @@ def _is_modified(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
     return any(one.name not in viewport_display.MODIFIERS and getattr(one, flag) for one in found)
 
 
-def _compare(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, edited: bool, gaussians: int) -> Found:
+def _compare(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, edited: bool, gaussians: int) -> Comparison:
     cloud, problems = evaluated(obj, depsgraph), []
     hidden = cloud == obj.data
     if hidden and edited:
@@ -143,7 +143,7 @@ def _compare(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, edited: bool
     if _is_radius_changed(obj, cloud, stored):
         problems.append("the radius of points is for display only; change the attribute 'scale' instead")
     if rows is None and not values:
-        return Found(None, _notes(obj, problems))
+        return Comparison(None, _notes(obj, problems))
     whole = np.arange(obj.r5dgs.start, obj.r5dgs.start + obj.r5dgs.count, dtype=np.int32)
     rows = whole if rows is None else rows
     there = _drawable(rows, values, gaussians)
@@ -154,7 +154,7 @@ def _compare(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, edited: bool
     edit = None
     if values or not np.array_equal(rows, whole):
         edit = Edit(_key(rows, values), PointEdit(rows, **values), bent)
-    return Found(edit, _notes(obj, problems))
+    return Comparison(edit, _notes(obj, problems))
 
 
 def _notes(obj: bpy.types.Object, problems: list[str]) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ _allowed: set[str] = set()  # files that the user loaded, chose or allowed in th
 
 
 @dataclass(frozen=True)
-class Found:
+class SceneFileSearch:
     """Result of the search for the file of a loaded scene.
 
     Attributes:
@@ -68,19 +68,19 @@ def places(collection: bpy.types.Collection) -> list[Path]:
     return found
 
 
-def find(collection: bpy.types.Collection) -> Found:
+def find(collection: bpy.types.Collection) -> SceneFileSearch:
     """Return the first existing path of `places` that may be read, or the path that the user must allow."""
     trusted = [*folders(collection), *preferences.choice().trusted]
     asked = None
     for place in places(collection):
         if may_read(place, trusted):
             if place.is_file():
-                return Found(path=place)
+                return SceneFileSearch(path=place)
         elif on_network(place):
             asked = asked or place  # network path: not even looked up, so it is not known if the file exists
         elif place.is_file():
-            return Found(asked=asked or Path(os.path.realpath(place)))  # show the target of a link
-    return Found(asked=asked)
+            return SceneFileSearch(asked=asked or Path(os.path.realpath(place)))  # show the target of a link
+    return SceneFileSearch(asked=asked)
 
 
 def may_read(place: Path, folders: list[str]) -> bool:

@@ -13,7 +13,7 @@ WORTHWHILE = 0.3  # minimum share of unmoved Gaussians for which their order is 
 
 
 @dataclass(frozen=True)
-class Keys:
+class DepthKeys:
     """Conversion of depths to keys, the nearest Gaussian having the largest key.
 
     Perspective keys are the leading bits of the float32 depth, so their relative resolution is the same at all depths.
@@ -32,7 +32,7 @@ class Keys:
     parallel: bool
 
     @classmethod
-    def of(cls, depths: np.ndarray, near: float, parallel: bool) -> Keys:
+    def of(cls, depths: np.ndarray, near: float, parallel: bool) -> DepthKeys:
         """Return a conversion for some depths, with a margin for motion that is likely to follow. [n]"""
         low, high = float(depths.min()), float(depths.max())
         if parallel:
@@ -68,7 +68,7 @@ class _Sorted:
     """Sorted Gaussians of some groups: the groups, their conversion, keys and rows, from far to near."""
 
     groups: frozenset[int]
-    keys: Keys
+    keys: DepthKeys
     sorted_keys: np.ndarray
     rows: np.ndarray
 
@@ -135,8 +135,8 @@ class DepthOrder:
     def _sort(self, planes: dict[int, np.ndarray], groups: frozenset[int], near: float, parallel: bool) -> _Sorted:
         depths, rows = self._depths(planes, sorted(groups))
         if not len(rows):
-            return _Sorted(groups, Keys(near, near, near, False), np.empty(0, np.uint16), rows)
-        conversion = Keys.of(depths, near, parallel)
+            return _Sorted(groups, DepthKeys(near, near, near, False), np.empty(0, np.uint16), rows)
+        conversion = DepthKeys.of(depths, near, parallel)
         keys = conversion(depths)
         order = np.argsort(keys, kind="stable")
         return _Sorted(groups, conversion, keys[order], rows[order])

@@ -102,7 +102,7 @@ def _is_drawn_by_engine(context: bpy.types.Context) -> bool:
     return context.space_data.shading.type == "RENDERED" and context.scene.render.engine == engine.ENGINE
 
 
-def _draw_in_region(context: bpy.types.Context, found: visible_splats.Shown) -> None:
+def _draw_in_region(context: bpy.types.Context, found: visible_splats.VisibleSplats) -> None:
     region, space, view_3d = context.region, context.space_data, context.region_data
     picture = _state.pictures.setdefault(region.as_pointer(), _Picture())
     view = renderer.View(

@@ -24,7 +24,7 @@ LayerKey = tuple[int, str]
 
 
 @dataclass(frozen=True)
-class Shown:
+class VisibleSplats:
     """Visible splats of a viewport.
 
     Attributes:
@@ -103,7 +103,7 @@ def layer_key(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer) -> LayerK
     return scene.session_uid, view_layer.name
 
 
-def shown(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None) -> Shown | None:
+def shown(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None) -> VisibleSplats | None:
     """Return the visible splats of the loaded scenes with display *Splats*, or None if there are none.
 
     Args:
@@ -130,7 +130,7 @@ def shown(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = 
     groups = tuple(_group(numbers[slot], one) for slot, one in zip(slots, clouds, strict=True))
     present = {one.collection for one in clouds}
     first = next(scene for scene in scenes if scene in present)
-    return Shown(layer.table[1], groups, _sky(first), visible_clouds.world_of(first, depsgraph))
+    return VisibleSplats(layer.table[1], groups, _sky(first), visible_clouds.world_of(first, depsgraph))
 
 
 def _slots(clouds: list[visible_clouds.VisibleCloud]) -> tuple[Slot, ...]:

@@ -40,7 +40,7 @@ class Assignment:
     usual_iou: float
 
 
-def refine(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, count: int) -> Assignment:
+def refine(stack: segment_stack.SegmentStack, runs: np.ndarray, labels: np.ndarray, count: int) -> Assignment:
     """Repeat `assign` until the labels are stable, at most `PASSES` times.
 
     Args:
@@ -57,7 +57,7 @@ def refine(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, cou
     return found
 
 
-def assign(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, count: int) -> Assignment:
+def assign(stack: segment_stack.SegmentStack, runs: np.ndarray, labels: np.ndarray, count: int) -> Assignment:
     """Reassign each segment by the votes of segments with the given labels; arguments as in `refine`."""
     found = list(leave_one_out.overlaps(stack, labels, count))
     ious = np.concatenate([overlap.ious for overlap in found])
@@ -95,7 +95,7 @@ def assign(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, cou
     return Assignment(result, reached, own, margins, _agreement(stack, ious, labels), float(usual[0]))
 
 
-def measure(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> Assignment:
+def measure(stack: segment_stack.SegmentStack, labels: np.ndarray, count: int) -> Assignment:
     """Evaluate given labels: scores, margins and mean agreement; arguments as in `refine`."""
     ious = np.concatenate([overlap.ious for overlap in leave_one_out.overlaps(stack, labels, count)])
     own = np.flatnonzero(labels > 0)
@@ -107,7 +107,7 @@ def measure(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> Assig
     return Assignment(labels, plain, plain, margins, _agreement(stack, ious, labels), usual)
 
 
-def _agreement(stack: segment_stack.Stack, ious: np.ndarray, labels: np.ndarray) -> float:
+def _agreement(stack: segment_stack.SegmentStack, ious: np.ndarray, labels: np.ndarray) -> float:
     rows = np.flatnonzero(stack.ids > 0)
     kept = np.where(labels[rows] > 0, ious[rows, np.maximum(labels[rows], 0)], 0.0)
     return float((kept * stack.pixels[rows]).sum() / max(stack.pixels[rows].sum(), 1))

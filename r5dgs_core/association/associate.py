@@ -35,7 +35,7 @@ _NOBODY = -2  # temporary id of segments without an object
 
 
 @dataclass(frozen=True)
-class Row:
+class SegmentResult:
     """Result of the association for one segment.
 
     Attributes:
@@ -76,7 +76,7 @@ class Association:
     """
 
     ids: list[np.ndarray]
-    rows: list[Row]
+    rows: list[SegmentResult]
     objects: np.ndarray
     confident: float
     agreement: float
@@ -134,7 +134,7 @@ def associate(
     return _result(stack, ids, usual, found, confident, before.agreement)
 
 
-def _objects(stack: segment_stack.Stack, runs: np.ndarray) -> tuple[np.ndarray, int]:
+def _objects(stack: segment_stack.SegmentStack, runs: np.ndarray) -> tuple[np.ndarray, int]:
     """Initial objects [S], 0 = background, -1 = none, and their number K."""
     of_runs = clustering.cluster(clustering.gather(stack, runs))
     labels = np.where(runs >= 0, of_runs[runs] + 1, 0)
@@ -157,14 +157,16 @@ def _objects(stack: segment_stack.Stack, runs: np.ndarray) -> tuple[np.ndarray, 
     return number[labels], int(enough.sum())
 
 
-def _incoming(stack: segment_stack.Stack) -> assignment.Assignment:
+def _incoming(stack: segment_stack.SegmentStack) -> assignment.Assignment:
     """Evaluate the incoming ids as labels."""
     ids, labels = np.unique(np.where(stack.ids > 0, stack.ids, 0), return_inverse=True)
     labels = labels if ids[0] == 0 else labels + 1
     return assignment.measure(stack, labels, int(labels.max()))
 
 
-def _name(stack: segment_stack.Stack, found: assignment.Assignment, sure: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _name(
+    stack: segment_stack.SegmentStack, found: assignment.Assignment, sure: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """New id of each segment, and the usual new id of its incoming id in its view. [S], [S]"""
     shown = np.flatnonzero(stack.ids > 0)
     number = int(found.labels.max(initial=0))  # -1 if no segment has an object and no image shows background
@@ -219,7 +221,7 @@ def _compact(ids: np.ndarray, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _result(
-    stack: segment_stack.Stack,
+    stack: segment_stack.SegmentStack,
     ids: np.ndarray,
     usual: np.ndarray,
     found: assignment.Assignment,
@@ -233,7 +235,7 @@ def _result(
         done = "unknown" if ids[row] == masks.UNKNOWN else "kept" if ids[row] == usual[row] else "relabelled"
         image = int(stack.images[row])
         rows.append(
-            Row(
+            SegmentResult(
                 image=image,
                 segment=int(row - ends[image]),
                 old_id=int(stack.ids[row]),
@@ -257,11 +259,11 @@ def _result(
     )
 
 
-def _untouched(stack: segment_stack.Stack, found: assignment.Assignment, confident: float) -> Association:
+def _untouched(stack: segment_stack.SegmentStack, found: assignment.Assignment, confident: float) -> Association:
     ids, usual = _compact(stack.ids, stack.ids)
     return _result(stack, ids, usual, found, confident, found.agreement, fallback=True)
 
 
-def _plain(stack: segment_stack.Stack, agreement: float) -> assignment.Assignment:
+def _plain(stack: segment_stack.SegmentStack, agreement: float) -> assignment.Assignment:
     nothing = np.zeros(len(stack.ids))
     return assignment.Assignment(np.zeros(len(stack.ids), int), nothing, nothing, nothing, agreement, 0.0)

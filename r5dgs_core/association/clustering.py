@@ -26,7 +26,7 @@ THIN = 0.1  # share of the smaller tracklet's pixels below which common evidence
 
 
 @dataclass(frozen=True)
-class Evidence:
+class TrackletOverlaps:
     """Overlap of tracklets, summed over the pairs of their images.
 
     Attributes:
@@ -53,7 +53,7 @@ class Evidence:
         return self.seen + self.seen.T - self.common
 
 
-def gather(stack: segment_stack.Stack, runs: np.ndarray) -> Evidence:
+def gather(stack: segment_stack.SegmentStack, runs: np.ndarray) -> TrackletOverlaps:
     """Sum the overlaps of segments over their tracklets."""
     rows = np.flatnonzero(runs >= 0)
     count = int(runs.max(initial=-1)) + 1
@@ -64,7 +64,7 @@ def gather(stack: segment_stack.Stack, runs: np.ndarray) -> Evidence:
     )
     lengths = np.bincount(runs[rows], minlength=count)
     first = rows[np.unique(runs[rows], return_index=True)[1]]
-    return Evidence(
+    return TrackletOverlaps(
         common=sparse.csr_matrix(shared @ shared.T).toarray().astype(float),
         seen=sparse.csr_matrix(shared @ stack.seen.T @ images.T).toarray().astype(float),
         together=(images @ images.T).toarray(),
@@ -75,7 +75,7 @@ def gather(stack: segment_stack.Stack, runs: np.ndarray) -> Evidence:
     )
 
 
-def cluster(evidence: Evidence) -> np.ndarray:
+def cluster(evidence: TrackletOverlaps) -> np.ndarray:
     """Join tracklets to objects.
 
     Returns:
@@ -96,7 +96,7 @@ def cluster(evidence: Evidence) -> np.ndarray:
     return rank[labels]
 
 
-def _mutual(evidence: Evidence) -> np.ndarray:
+def _mutual(evidence: TrackletOverlaps) -> np.ndarray:
     """Mask of tracklet pairs that are mutual best matches in each other's view. [T, T] bool"""
     ious = np.where(evidence.together > 0, 0.0, evidence.common / np.maximum(evidence.union, 1e-9))
     views, at = np.unique(evidence.views, return_inverse=True)
@@ -104,7 +104,7 @@ def _mutual(evidence: Evidence) -> np.ndarray:
     return (ious > 0) & (ious >= best[:, at]) & (ious >= best[:, at].T)
 
 
-def _usual(evidence: Evidence, mutual: np.ndarray) -> np.ndarray:
+def _usual(evidence: TrackletOverlaps, mutual: np.ndarray) -> np.ndarray:
     """Usual IoU of tracklets of one object between the views of any two tracklets. [T, T]"""
     views, at = np.unique(evidence.views, return_inverse=True)
     rows, columns = np.nonzero(mutual)
@@ -124,7 +124,7 @@ def _usual(evidence: Evidence, mutual: np.ndarray) -> np.ndarray:
     return table[at[:, None], at[None, :]]
 
 
-def _hints(evidence: Evidence, mutual: np.ndarray) -> np.ndarray:
+def _hints(evidence: TrackletOverlaps, mutual: np.ndarray) -> np.ndarray:
     """Factors on the affinity for equal and different ids, estimated within a view and between views. [T, T]"""
     equal = evidence.ids[:, None] == evidence.ids[None]
     within = evidence.views[:, None] == evidence.views[None]
@@ -144,7 +144,7 @@ def _hints(evidence: Evidence, mutual: np.ndarray) -> np.ndarray:
     return factors
 
 
-def _join(common: np.ndarray, expected: np.ndarray, evidence: Evidence) -> np.ndarray:
+def _join(common: np.ndarray, expected: np.ndarray, evidence: TrackletOverlaps) -> np.ndarray:
     """Join the best pair of groups until none is good enough; groups seen side by side stay apart. [T]"""
     count = len(common)
     common, expected, together = common.copy(), expected.copy(), evidence.together.copy()
@@ -178,7 +178,7 @@ def _join(common: np.ndarray, expected: np.ndarray, evidence: Evidence) -> np.nd
             value[row] = table[row, best[row]]
 
 
-def _absorb(evidence: Evidence, labels: np.ndarray) -> np.ndarray:
+def _absorb(evidence: TrackletOverlaps, labels: np.ndarray) -> np.ndarray:
     """Join groups to a larger group that contains them if fewer than half of its images show both.
 
     This undoes splits by the tracker. Two objects that a tracker sometimes merges behave the opposite way: they are

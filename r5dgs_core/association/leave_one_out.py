@@ -45,7 +45,7 @@ class Overlaps:
         return self.common / np.maximum(self.segments[:, None], 1e-9)
 
 
-def cast(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> sparse.csr_matrix:
+def cast(stack: segment_stack.SegmentStack, labels: np.ndarray, count: int) -> sparse.csr_matrix:
     """Sum the weights of segments by object.
 
     Args:
@@ -60,7 +60,7 @@ def cast(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> sparse.c
     return sparse.csr_matrix((member @ stack.weights).T)
 
 
-def overlaps(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> Iterator[Overlaps]:
+def overlaps(stack: segment_stack.SegmentStack, labels: np.ndarray, count: int) -> Iterator[Overlaps]:
     """Yield the leave-one-out overlaps of each image; arguments as in `cast`."""
     ends = np.searchsorted(stack.images, np.arange(len(stack.views) + 1))
     for start, stop, (seen, shares) in zip(ends, ends[1:], left_out(stack, labels, count), strict=False):
@@ -74,7 +74,7 @@ def overlaps(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> Iter
 
 
 def left_out(
-    stack: segment_stack.Stack, labels: np.ndarray, count: int
+    stack: segment_stack.SegmentStack, labels: np.ndarray, count: int
 ) -> Iterator[tuple[np.ndarray, sparse.csr_matrix]]:
     """Yield the objects of each image's Gaussians by the votes of all other images; arguments as in `cast`.
 

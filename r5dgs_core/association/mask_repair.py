@@ -211,7 +211,7 @@ def summary(done: Repair) -> dict[str, Any]:
     }
 
 
-def switches(done: Repair) -> list[associate.Row]:
+def switches(done: Repair) -> list[associate.SegmentResult]:
     """Segments that were relabelled or became unknown, the largest first."""
     changed = [row for row in done.result.rows if row.done != "kept"]
     return sorted(changed, key=lambda row: -row.pixels)

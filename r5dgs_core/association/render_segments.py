@@ -11,7 +11,7 @@ from ..data import masks as id_masks
 from ..masks import videos
 from ..playback import scene_player
 from ..raster import RasterSettings
-from ..render import scene_renderer, segment_weights
+from ..render import posed_scene, scene_renderer, segment_weights
 from ..scene.scene import Scene
 from . import segment_stack
 
@@ -41,7 +41,7 @@ def draw(
     number = {which: k for k, which in enumerate(dict.fromkeys(video_of.values()))}
     drawn = []
     for done, (view, mask) in enumerate(zip(views, masks, strict=True)):
-        posed = scene_renderer.pose_frame(scene, scene_player.frame(scene, view.t))
+        posed = posed_scene.pose_frame(scene, scene_player.frame(scene, view.t))
         gaussians = scene_renderer.PosedGaussians(posed)
         ids, segments, pixels = np.unique(mask, return_inverse=True, return_counts=True)
         known = ids != id_masks.UNKNOWN

@@ -9,7 +9,7 @@ import numpy as np
 from ..data import dataset as datasets
 from ..playback import scene_player
 from ..raster import RasterSettings, rasterize_splats
-from ..render import scene_renderer
+from ..render import posed_scene, scene_renderer
 from ..scene.scene import Scene
 from . import associate, mending, segment_stack
 
@@ -41,7 +41,7 @@ def mend(
         if not mending.lacks(found, image):
             yield mending.relabel(mask, images[image].ids, found.ids[image])
             continue
-        posed = scene_renderer.PosedGaussians(scene_renderer.pose_frame(scene, scene_player.frame(scene, view.t)))
+        posed = scene_renderer.PosedGaussians(posed_scene.pose_frame(scene, scene_player.frame(scene, view.t)))
         # Gaussians outside the image's bag cannot occlude.
         drawn = rasterize_splats(
             posed.means[seen],

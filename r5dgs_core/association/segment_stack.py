@@ -63,7 +63,7 @@ def from_pixels(
 
 
 @dataclass(frozen=True)
-class Stack:
+class SegmentStack:
     """The segments of all images, concatenated. I images.
 
     Attributes:
@@ -88,7 +88,7 @@ class Stack:
     seen: sparse.csr_matrix
 
 
-def stack(bags: Sequence[ImageBags]) -> Stack:
+def stack(bags: Sequence[ImageBags]) -> SegmentStack:
     """Concatenate the segments of all images.
 
     A Gaussian rarely has the same weight in two images. Its common weight is the geometric mean sqrt(v_i v_j) of its
@@ -111,7 +111,7 @@ def stack(bags: Sequence[ImageBags]) -> Stack:
         shared.append(rows)
         at = np.flatnonzero(total).astype(np.int32)
         seen.append(sparse.csr_matrix((root[at], at, [0, len(at)]), (1, count)))
-    return Stack(
+    return SegmentStack(
         ids=np.concatenate([image.ids for image in bags]),
         images=images,
         views=np.array([image.view for image in bags]),

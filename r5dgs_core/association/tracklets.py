@@ -15,7 +15,7 @@ from . import segment_stack
 FAINTEST = 0.02  # minimum IoU of consecutive segments of a tracklet
 
 
-def link(stack: segment_stack.Stack) -> np.ndarray:
+def link(stack: segment_stack.SegmentStack) -> np.ndarray:
     """Assign segments to tracklets.
 
     A segment continues the last segment with its id in its view if both are mutual best matches among the objects of
@@ -52,7 +52,7 @@ def link(stack: segment_stack.Stack) -> np.ndarray:
     return runs
 
 
-def ious(stack: segment_stack.Stack, rows: np.ndarray, others: np.ndarray) -> np.ndarray:
+def ious(stack: segment_stack.SegmentStack, rows: np.ndarray, others: np.ndarray) -> np.ndarray:
     """IoU of segments of two images over the weight that both images show. [s], [t] -> [s, t]"""
     if not len(rows) or not len(others):
         return np.zeros((len(rows), len(others)))
@@ -63,7 +63,7 @@ def ious(stack: segment_stack.Stack, rows: np.ndarray, others: np.ndarray) -> np
     return common / np.maximum(seen_a + seen_b.T - common, 1e-9)
 
 
-def _rows_of(stack: segment_stack.Stack) -> list[np.ndarray]:
+def _rows_of(stack: segment_stack.SegmentStack) -> list[np.ndarray]:
     """Segments of each image, without background."""
     objects = np.flatnonzero(stack.ids > 0)
     ends = np.searchsorted(stack.images[objects], np.arange(len(stack.views) + 1))

@@ -14,7 +14,7 @@ import numpy as np
 from ..config.sections.needs import NeedsSection
 from ..motion import rotations
 from ..scene.scene import Classifier, MotionGroup
-from ..train.observed_motion import Moves
+from ..train.observed_motion import RegroupCounts
 from .draft import Context, Draft, Need
 
 STILL_QUAT = rotations.identity()
@@ -72,7 +72,7 @@ def decide(
     bases: int,
     classified: bool,
     residuals: Need,
-    moves: Moves | None = None,
+    moves: RegroupCounts | None = None,
     wanted: NeedsSection | None = None,
 ) -> tuple[Need, ...]:
     """Return the needs table of a baked scene.
@@ -119,7 +119,7 @@ def decide(
     return tuple(need.overridden(getattr(wanted, need.name)) for need in rows)
 
 
-def _summary(moves: Moves | None) -> str:
+def _summary(moves: RegroupCounts | None) -> str:
     """Summary of the regrouping, for the reason of its row."""
     if moves is None:
         return "each Gaussian moves with its initial group"

@@ -117,7 +117,7 @@ def _train(plan: Plan, case: Case, progress: Progress) -> None:
     cases.write_record(case, {"sittings": [*before, {"status": None}]})
     log_path = case.beside(".log")
 
-    def note(sitting: process.Sitting) -> None:
+    def note(sitting: process.TrainingProcess) -> None:
         values = {key: getattr(sitting, key) for key in ("status", *cases.COSTS)}
         cases.write_record(case, {"sittings": [*before, values]})
 

@@ -17,7 +17,7 @@ from .. import atomic_files, strict_json
 from ..config import config as configs
 from ..data import dataset as datasets
 from ..errors import CheckpointError, ConfigError
-from ..playback import scene_player
+from ..playback import modes
 from ..train import checkpoint
 from . import variants as kinds
 
@@ -35,7 +35,7 @@ class Plan:
         out: Folder of the benchmark.
         variants: Names from `variants.VARIANTS`.
         seeds: Seeds of training.
-        modes: Playback modes from `scene_player.every`; modes without data in a scene are skipped.
+        modes: Playback modes from `modes.every`; modes without data in a scene are skipped.
         preset: Named training settings.
         config_path: TOML configuration; overrides the preset.
         overrides: ``section.key=value``; override both.
@@ -45,7 +45,7 @@ class Plan:
     out: Path
     variants: tuple[str, ...] = kinds.DEFAULT_VARIANTS
     seeds: tuple[int, ...] = (0,)
-    modes: tuple[str, ...] = scene_player.MODES
+    modes: tuple[str, ...] = modes.MODES
     preset: str | None = None
     config_path: Path | None = None
     overrides: tuple[str, ...] = ()
@@ -97,7 +97,7 @@ def make(plan: Plan) -> list[Case]:
         DatasetError: A data set cannot be read, or two have the same name.
         CheckpointError: A run folder is damaged, or its run was trained on other data.
     """
-    every_mode = scene_player.every()
+    every_mode = modes.every()
     for name, given, known in (("--variants", plan.variants, kinds.VARIANTS), ("--modes", plan.modes, every_mode)):
         if not given:
             raise ConfigError(f"{name}: expected at least one of {', '.join(known)}")

@@ -28,7 +28,7 @@ STOPPED = 130
 
 
 @dataclass(frozen=True)
-class Sitting:
+class TrainingProcess:
     """One training process.
 
     Attributes:
@@ -52,8 +52,8 @@ def train(
     arguments: Sequence[str],
     log_path: Path,
     progress: Callable[[dict[str, Any]], None],
-    ended: Callable[[Sitting], None],
-) -> Sitting:
+    ended: Callable[[TrainingProcess], None],
+) -> TrainingProcess:
     """Run ``r5dgs ARGUMENTS --progress json`` in a separate process and wait for it.
 
     On an exception, such as KeyboardInterrupt, the process gets SIGTERM, saves its state and ends; the exception is
@@ -127,7 +127,9 @@ def _event(line: str) -> dict[str, Any]:
     return event if isinstance(event, dict) and "event" in event else {}
 
 
-def _end(process: subprocess.Popen[str], began: float, log_path: Path, start: int, peaks: dict[str, Any]) -> Sitting:
+def _end(
+    process: subprocess.Popen[str], began: float, log_path: Path, start: int, peaks: dict[str, Any]
+) -> TrainingProcess:
     """Wait for the process and return its status and cost."""
     cpu = None
     if hasattr(os, "wait4"):
@@ -140,7 +142,7 @@ def _end(process: subprocess.Popen[str], began: float, log_path: Path, start: in
         log.seek(start)
         lines = log.read().decode(errors="replace").split("\n")
     complaint = next((line.strip() for line in reversed(lines) if line.strip()), "")
-    return Sitting(
+    return TrainingProcess(
         status=process.returncode,
         complaint=complaint.removeprefix("r5dgs: "),
         cpu_seconds=None if cpu is None else round(cpu, 3),
@@ -150,7 +152,7 @@ def _end(process: subprocess.Popen[str], began: float, log_path: Path, start: in
     )
 
 
-def reason(sitting: Sitting) -> str:
+def reason(sitting: TrainingProcess) -> str:
     """Return the reason why a process failed, in one line."""
     if sitting.status < 0:
         name = signal.Signals(-sitting.status).name

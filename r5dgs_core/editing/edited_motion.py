@@ -14,14 +14,14 @@ import numpy as np
 
 from ..motion import fit_drawn_curve, models, rotations
 from ..motion.models import MotionModel
-from ..playback import affine_transform, scene_player
+from ..playback import affine_transform, group_dynamics
 from ..scene.scene import MotionGroup, Scene
 from . import piece_clusters
-from .piece_clusters import Cluster, Motion
+from .piece_clusters import Cluster, PieceMotion
 
 
 @dataclass(frozen=True, kw_only=True)
-class Moved(Cluster):
+class MovedCluster(Cluster):
     """A cluster with its new motion group.
 
     Attributes:
@@ -79,7 +79,7 @@ def _turned_model(model: MotionModel, parent: np.ndarray) -> MotionModel:
 
 
 def _track(
-    sampled: Motion, pivot: np.ndarray, known: np.ndarray, reach: float, allowed: float
+    sampled: PieceMotion, pivot: np.ndarray, known: np.ndarray, reach: float, allowed: float
 ) -> tuple[np.ndarray, bool]:
     """Poses of a group at the knots, relative to the new bind state.
 
@@ -101,7 +101,7 @@ def _track(
     return poses, False
 
 
-def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[str]) -> list[Moved]:
+def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[str]) -> list[MovedCluster]:
     """Determine track and model of every cluster.
 
     Args:
@@ -113,7 +113,7 @@ def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[
     Returns:
         The clusters in the same order.
     """
-    quats, moves = scene_player.knots(scene)
+    quats, moves = group_dynamics.knots(scene)
     known = np.concatenate([quats, moves], axis=-1)
     courses = [_course(scene, cluster, known) for cluster in found]
     later = np.asarray(times[len(scene.tracks.times) :], np.float64) - scene.t_max
@@ -130,7 +130,7 @@ def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[
                 ]
                 groups[cluster.id] = _go_on(scene, cluster, course, leaders, later, notes)
     return [
-        Moved(
+        MovedCluster(
             cluster.pieces,
             cluster.source,
             cluster.motion,

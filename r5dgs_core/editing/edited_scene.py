@@ -15,7 +15,7 @@ from ..playback import group_dynamics
 from ..scene.lookup_table import Table
 from ..scene.scene import MotionGroup, Scene, SceneObject
 from . import edited_gaussians, edited_motion, piece_clusters
-from .edited_motion import Moved
+from .edited_motion import MovedCluster
 from .piece_clusters import Piece
 
 __all__ = ("Piece", "edit")
@@ -89,7 +89,7 @@ def _objects(scene: Scene, table: Mapping[int, SceneObject], object_ids: np.ndar
 
 
 def _groups(
-    clusters: Sequence[Moved],
+    clusters: Sequence[MovedCluster],
     scene: Scene,
     objects: tuple[SceneObject, ...],
     kept: np.ndarray,

@@ -53,7 +53,7 @@ class Piece:
 
 
 @dataclass(frozen=True)
-class Motion:
+class PieceMotion:
     """A rigid motion relative to t_max, sampled at T times.
 
     Attributes:
@@ -89,7 +89,7 @@ class Cluster:
 
     pieces: list[Piece]
     source: MotionGroup
-    motion: Motion
+    motion: PieceMotion
     id: int = 0
 
     @property
@@ -108,7 +108,7 @@ def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cl
     """
     last = len(scene.tracks.times) - 1
     pinned = scene.groups[0]
-    still = Motion(rotations.identity(1), np.eye(3)[None], np.zeros((1, 3)))
+    still = PieceMotion(rotations.identity(1), np.eye(3)[None], np.zeros((1, 3)))
     found: list[Cluster] = [Cluster([], pinned, still)]
     for piece in pieces:
         source = scene.groups[piece.motion_id] if 0 < piece.motion_id < len(scene.groups) else pinned
@@ -143,16 +143,16 @@ def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cl
     return [replace(cluster, id=number) for number, cluster in enumerate(found)]
 
 
-def _since_bind(matrices: np.ndarray, bind: int) -> Motion:
+def _since_bind(matrices: np.ndarray, bind: int) -> PieceMotion:
     """Motion P of the maps M, given the index of t_max. [T, 4, 4]"""
     maps = matrices @ np.linalg.inv(matrices[bind])
     quats = rotations.rotmats_to_quats(affine_transform.nearest_rotation(maps[:, :3, :3]))
     quats[bind] = (1.0, 0, 0, 0)
     maps[bind] = np.eye(4)
-    return Motion(quats, maps[:, :3, :3], maps[:, :3, 3])
+    return PieceMotion(quats, maps[:, :3, :3], maps[:, :3, 3])
 
 
-def _apart(motion: Motion, other: Motion, reach: float) -> np.ndarray:
+def _apart(motion: PieceMotion, other: PieceMotion, reach: float) -> np.ndarray:
     """Upper bound of the distance between two motions of points within ``reach`` of the origin. [T]"""
     turned = np.linalg.norm(motion.linears - other.linears, axis=(-2, -1))
     return np.linalg.norm(motion.shifts - other.shifts, axis=-1) + reach * turned

@@ -14,7 +14,7 @@ from ..data.dataset import GroundTruth
 from ..evaluation import ground_truth_poses, metrics
 from ..motion import free_top, models, rigid_fit
 from ..motion_fit import candidates, model_selection, noise
-from ..playback import group_dynamics, scene_player
+from ..playback import group_dynamics, modes, scene_player
 from ..scene.scene import MotionGroup, Scene
 from .report_rows import Row, spread
 
@@ -27,7 +27,7 @@ _LEAST_MOMENT = 1e-6  # added to the inertia, which is singular for collinear me
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedMethod:
     """One model fitted to every body.
 
     Attributes:
@@ -76,12 +76,12 @@ def _of_modes(
     }
     calls: dict[str, Callable[[], object]] = {}
     for mode, player in players.items():
-        by_groups = scene_player.split(mode)[0] == "rigid"
+        by_groups = modes.split(mode)[0] == "rigid"
         calls[mode] = (lambda p=player: p.group_poses(last)) if by_groups else (lambda p=player: p.frame(last))
     timed = timing.take(calls, rounds)
     rows = []
     for mode, player in players.items():
-        if scene_player.split(mode)[0] == "rigid":
+        if modes.split(mode)[0] == "rigid":
             predicted, method, note = _group_motion(player, bodies, times), "group poses", ""
         else:
             predicted, method = _member_motion(scene, player, bodies, times), "rigid fit to moved Gaussians"
@@ -110,7 +110,7 @@ def _of_models(
     sets = {
         name: [model_of(body, fit) for body, fit in zip(bodies, some.fits, strict=True)] for name, some in found.items()
     }
-    stacks = {name: models.Stack(some) for name, some in sets.items()}
+    stacks = {name: models.MotionStack(some) for name, some in sets.items()}
     timed = timing.take({name: lambda s=stack: s.poses(float(taus[-1])) for name, stack in stacks.items()}, rounds)
     rows = []
     for name, some in found.items():
@@ -127,11 +127,11 @@ def _of_models(
     return rows + band, absent
 
 
-def fit_all(scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], names: tuple[str, ...] | None) -> Fitted:
+def fit_all(scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], names: tuple[str, ...] | None) -> FittedMethod:
     """Fit the tracks of the bodies as baking does, choosing from ``names``."""
     started = time.process_time()
     fits = tuple(fit_group(scene, body.group, names) if body.group.role == "body" else None for body in bodies)
-    return Fitted(fits, 1e3 * (time.process_time() - started))
+    return FittedMethod(fits, 1e3 * (time.process_time() - started))
 
 
 def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -> model_selection.Fit:
@@ -237,7 +237,7 @@ def errors(
 
 
 def _band(
-    bodies: tuple[ground_truth_poses.Body, ...], chosen: Fitted, times: np.ndarray, taus: np.ndarray
+    bodies: tuple[ground_truth_poses.Body, ...], chosen: FittedMethod, times: np.ndarray, taus: np.ndarray
 ) -> tuple[list[Row], list[str]]:
     """Return the share of errors outside the 95 % band, over bodies and times within reach of the band.
 

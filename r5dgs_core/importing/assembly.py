@@ -14,7 +14,7 @@ import numpy as np
 from ..motion import models, rotations
 from ..scene import scene
 from ..scene.scene import Classifier, Dynamics, Gaussians, MotionGroup, Residuals, Scene, SceneObject, Tracks
-from .foreign_run import Foreign, State
+from .foreign_run import ForeignRun, State
 
 CHUNK = 16384  # rows per evaluation at all knots; bounds the memory
 STILL = 1e-4  # maximum motion of a Gaussian's ellipsoid that is dropped, as a share of the scene's extent
@@ -23,7 +23,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class Motion:
+class ImportedMotion:
     """Observed motion of N Gaussians of which R move. S knots.
 
     Attributes:
@@ -43,7 +43,9 @@ class Motion:
     dynamics: np.ndarray | None
 
 
-def sample(foreign: Foreign, times: np.ndarray, tolerance: float, progress: Progress | None = None) -> Motion:
+def sample(
+    foreign: ForeignRun, times: np.ndarray, tolerance: float, progress: Progress | None = None
+) -> ImportedMotion:
     """Evaluate the deformation at the knots.
 
     Args:
@@ -69,7 +71,9 @@ def sample(foreign: Foreign, times: np.ndarray, tolerance: float, progress: Prog
             progress(rows.stop, count)
     moved, offsets, turns, growths = (np.concatenate(parts) for parts in zip(*kept, strict=True))
     bind = State(*(np.concatenate([getattr(b, name) for b in binds]) for name in ("means", "quats", "log_scales")))
-    return Motion(bind, moved.astype(np.int32), offsets, turns, growths, np.concatenate(dynamics) if dynamics else None)
+    return ImportedMotion(
+        bind, moved.astype(np.int32), offsets, turns, growths, np.concatenate(dynamics) if dynamics else None
+    )
 
 
 def _relative(states: list[State], bind: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -92,7 +96,7 @@ def _reach(bind: State, offsets: np.ndarray, turns: np.ndarray, growths: np.ndar
     return (np.linalg.norm(offsets, axis=-1) + size * angle + stretch).max(-1, initial=0.0)
 
 
-def make_scene(foreign: Foreign, motion: Motion | None, times: np.ndarray, **rest) -> Scene:
+def make_scene(foreign: ForeignRun, motion: ImportedMotion | None, times: np.ndarray, **rest) -> Scene:
     """Assemble the scene.
 
     Args:
@@ -145,7 +149,7 @@ def make_scene(foreign: Foreign, motion: Motion | None, times: np.ndarray, **res
     )
 
 
-def classify(foreign: Foreign) -> tuple[np.ndarray, Classifier | None]:
+def classify(foreign: ForeignRun) -> tuple[np.ndarray, Classifier | None]:
     """Assign each Gaussian to the class with its highest score, and reduce the classifier to the classes that occur.
 
     Returns:

@@ -13,7 +13,7 @@ import torch
 from ..formats import ply
 from ..motion import rotations
 from . import networks, weights
-from .foreign_run import SPLATTING_NEAR, Foreign, State
+from .foreign_run import SPLATTING_NEAR, ForeignRun, State
 from .run_folder import RunFolder
 
 _SMALLEST = 1e-12  # minimum standard deviation, if exp(s) + ds vanishes, world units
@@ -21,7 +21,7 @@ _ROUNDING = 1e-14  # share of the trace below which off-diagonal elements are ro
 _SWEEPS = 8  # Jacobi converges quadratically; float64 needs far fewer for 3 x 3
 
 
-def read(run: RunFolder) -> Foreign:
+def read(run: RunFolder) -> ForeignRun:
     """Read the Gaussians and their deformation network."""
     splats = ply.read(run.ply)
     network = networks.read_deform(weights.load(run.weights("deform.pth")))
@@ -35,7 +35,7 @@ def read(run: RunFolder) -> Foreign:
         scales = np.exp(splats.log_scales[rows].astype(np.float64)) + change.scales.double().numpy()
         return State(moved, *principal_axes(quats, scales))
 
-    return Foreign("deformable_3dgs", splats, SPLATTING_NEAR, state=state)
+    return ForeignRun("deformable_3dgs", splats, SPLATTING_NEAR, state=state)
 
 
 def principal_axes(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

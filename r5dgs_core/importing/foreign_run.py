@@ -33,7 +33,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Foreign:
+class ForeignRun:
     """A loaded run of another project.
 
     Attributes:

@@ -18,7 +18,7 @@ from ..errors import CheckpointError
 from ..formats import ply
 from ..motion import rotations
 from . import networks, weights
-from .foreign_run import TRACE_NEAR, Foreign, State, twisted_state
+from .foreign_run import TRACE_NEAR, ForeignRun, State, twisted_state
 from .run_folder import RunFolder
 from .trace import about_centers
 
@@ -28,7 +28,7 @@ STILL_TIMES = tuple(k / 100 for k in range(75))
 STILL_DISTANCE = 0.01  # world units
 
 
-def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
+def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> ForeignRun:
     """Read the Gaussians, the code field and both networks.
 
     Args:
@@ -83,7 +83,7 @@ def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
     def dynamics(rows: slice, means: np.ndarray, t: float) -> np.ndarray:
         return np.where(resting(rows.start, rows.stop)[0][:, None], 0.0, rates(rows, means, t))
 
-    return Foreign("freegave", splats, TRACE_NEAR, state, dynamics, t_max)
+    return ForeignRun("freegave", splats, TRACE_NEAR, state, dynamics, t_max)
 
 
 def _check(velocity: weights.Weights, network: networks.VelocityNetwork, patterns: int) -> None:

@@ -6,11 +6,11 @@ from ..errors import CheckpointError
 from ..formats import ply
 from ..scene.scene import IDENTITY_DIM
 from . import weights
-from .foreign_run import SPLATTING_NEAR, Foreign
+from .foreign_run import SPLATTING_NEAR, ForeignRun
 from .run_folder import RunFolder
 
 
-def read(run: RunFolder) -> Foreign:
+def read(run: RunFolder) -> ForeignRun:
     """Read the Gaussians, and the classifier if there is one.
 
     Raises:
@@ -18,7 +18,7 @@ def read(run: RunFolder) -> Foreign:
     """
     splats = ply.read(run.ply)
     if "classifier.pth" not in run.files:
-        return Foreign("3dgs", splats, SPLATTING_NEAR)
+        return ForeignRun("3dgs", splats, SPLATTING_NEAR)
     loaded = weights.load(run.weights("classifier.pth"))
     if splats.identities is None or splats.identities.shape[1] != IDENTITY_DIM:
         found = "none" if splats.identities is None else str(splats.identities.shape[1])
@@ -27,4 +27,6 @@ def read(run: RunFolder) -> Foreign:
         )
     weight = loaded.tensor("weight", (None, IDENTITY_DIM, 1, 1))
     bias = loaded.tensor("bias", (weight.shape[0],))
-    return Foreign("gaussian_grouping", splats, SPLATTING_NEAR, classifier=(weight[:, :, 0, 0].numpy(), bias.numpy()))
+    return ForeignRun(
+        "gaussian_grouping", splats, SPLATTING_NEAR, classifier=(weight[:, :, 0, 0].numpy(), bias.numpy())
+    )

@@ -18,7 +18,7 @@ from ..errors import CheckpointError, ConfigError
 from ..scene import cameras, sh_color, validation
 from ..scene.scene import Scene
 from . import assembly, cameras_json, deformable, freegave, gaussian_splatting, run_folder, trace, weights
-from .foreign_run import Foreign
+from .foreign_run import ForeignRun
 from .run_folder import RunFolder
 
 MOST_KNOTS = 10_000  # limit without --knots
@@ -58,7 +58,7 @@ class Options:
             raise ConfigError(f"--world {self.world}: expected one of {', '.join(cameras.WORLD_TO_BLENDER)}")
 
 
-def read(run: RunFolder, t_max: float | None = None) -> Foreign:
+def read(run: RunFolder, t_max: float | None = None) -> ForeignRun:
     """Read a run folder with the reader of its layout.
 
     Args:
@@ -136,7 +136,7 @@ def _among_cameras(scene: Scene, folder: Path) -> Scene:
     )
 
 
-def _times(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: Options) -> np.ndarray:
+def _times(run: RunFolder, foreign: ForeignRun, dataset: Dataset | None, options: Options) -> np.ndarray:
     """Knots, the last at t_max. [S]"""
     t_max = foreign.t_max
     if t_max is None:
@@ -157,7 +157,7 @@ def _times(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: O
     return np.concatenate([seen if len(seen) else [0.0], [t_max]])
 
 
-def _extent(foreign: Foreign) -> float:
+def _extent(foreign: ForeignRun) -> float:
     """Diagonal of the box that contains the middle 98 % of the centres, as in `Scene.extent`."""
     if len(foreign.splats.means) == 0:
         return 1.0
@@ -165,7 +165,7 @@ def _extent(foreign: Foreign) -> float:
     return max(float(np.linalg.norm(high - low)), 1e-12)
 
 
-def _world(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: Options) -> str:
+def _world(run: RunFolder, foreign: ForeignRun, dataset: Dataset | None, options: Options) -> str:
     """World axes: from the user or the data set; else Blender's for runs trained on Blender data, else COLMAP's."""
     if options.world is not None:
         return options.world

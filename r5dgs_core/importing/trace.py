@@ -15,13 +15,13 @@ from ..errors import CheckpointError
 from ..formats import ply
 from ..motion import rotations
 from . import networks, weights
-from .foreign_run import TRACE_NEAR, Foreign, State, twisted_state
+from .foreign_run import TRACE_NEAR, ForeignRun, State, twisted_state
 from .run_folder import RunFolder
 
 TWIST = 12  # numbers: v, w and their rates
 
 
-def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
+def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> ForeignRun:
     """Read the Gaussians and both networks.
 
     Args:
@@ -58,7 +58,7 @@ def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
                 twists = field.pattern_shares(field.codes(torch.from_numpy(splats.means[rows]))) @ patterns
         return about_centers(twists.double().numpy(), means)
 
-    return Foreign("trace", splats, TRACE_NEAR, state, dynamics, t_max)
+    return ForeignRun("trace", splats, TRACE_NEAR, state, dynamics, t_max)
 
 
 def squash(raw: Tensor) -> Tensor:

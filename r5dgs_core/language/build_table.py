@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import errors
-from ..scene.lookup_table import Table, View
+from ..scene.lookup_table import EmbeddingSource, Table
 from ..scene.scene import Scene, SceneObject
 from ..search import english, object_search
 from . import best_views, calibration, common_nouns
@@ -27,7 +27,7 @@ Progress = Callable[[str, int, int], None]  # called with the stage, the number 
 
 
 @dataclass(frozen=True)
-class Made:
+class SceneWithTable:
     """A scene with a lookup table.
 
     Attributes:
@@ -44,7 +44,7 @@ class _Views:
     """Embeddings of one object [V, D] and their sources; thresholds are not set yet."""
 
     embeddings: np.ndarray
-    sources: tuple[View, ...]
+    sources: tuple[EmbeddingSource, ...]
 
 
 def make(
@@ -54,7 +54,7 @@ def make(
     *,
     backend: str = "auto",
     progress: Progress | None = None,
-) -> Made:
+) -> SceneWithTable:
     """Add a lookup table to a scene, replacing an existing one.
 
     Args:
@@ -82,7 +82,7 @@ def make(
         )
     nouns = encoder_base.embed_phrases(encoder, common_nouns.words())
     vocabulary, embeddings = _vocabulary(items, words, encoder, nouns)
-    return Made(_assembled(scene, encoder, found, nouns, vocabulary, embeddings), tuple(notes))
+    return SceneWithTable(_assembled(scene, encoder, found, nouns, vocabulary, embeddings), tuple(notes))
 
 
 def _from_words(
@@ -95,7 +95,7 @@ def _from_words(
         phrases = [word for word in dict.fromkeys(phrases) if not _NUMBERED.match(word.strip())]
         if phrases:
             found[item.id] = _Views(
-                encoder_base.embed_phrases(encoder, phrases), tuple(View(phrase, 0.0) for phrase in phrases)
+                encoder_base.embed_phrases(encoder, phrases), tuple(EmbeddingSource(phrase, 0.0) for phrase in phrases)
             )
         else:
             nameless.append(item.name)
@@ -121,7 +121,7 @@ def _from_pictures(
             both = [encoder.embed_images(list(side)) for side in zip(*shown, strict=True)]
             found[item.id] = _Views(
                 encoder_base.unit(np.mean(both, axis=0)),
-                tuple(View(each.camera.name, 0.0, each.t, each.box) for each in own),
+                tuple(EmbeddingSource(each.camera.name, 0.0, each.t, each.box) for each in own),
             )
         else:
             unseen.append(item.name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .. import errors
+from ..scene import stored_embeddings
 from ..scene.lookup_table import EncoderCard
 from ..scene.scene import Scene
 from ..search import object_search
@@ -32,7 +33,7 @@ def unanswered(
     scene: Scene, text: str, encoder: encoder_base.Encoder | None = None, threshold: float = object_search.THRESHOLD
 ) -> list[str]:
     """Phrases of a text that no object matches; arguments as in `find`."""
-    meanings = object_search.Meanings.of(scene)
+    meanings = stored_embeddings.StoredEmbeddings.of(scene)
     return object_search.unanswered(object_search.labels_of(scene), text, threshold, meanings, _embed(scene, encoder))
 
 
@@ -47,7 +48,7 @@ def check(stored: EncoderCard, asked: EncoderCard, place: str) -> None:
 
 def unknown(scene: Scene, text: str) -> list[str]:
     """Phrases of a text that need an encoder, because they are neither names nor stored words."""
-    return object_search.unknown(object_search.labels_of(scene), text, object_search.Meanings.of(scene))
+    return object_search.unknown(object_search.labels_of(scene), text, stored_embeddings.StoredEmbeddings.of(scene))
 
 
 def _embed(scene: Scene, encoder: encoder_base.Encoder | None) -> object_search.Embed | None:

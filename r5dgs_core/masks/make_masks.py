@@ -48,7 +48,7 @@ class MaskBackend(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Made:
+class MaskingResult:
     """Result of `make`.
 
     Attributes:
@@ -77,7 +77,7 @@ def make(
     *,
     overwrite: bool = False,
     progress: Progress | None = None,
-) -> Made:
+) -> MaskingResult:
     """Write a mask for each view, ``FOLDER/<view name>.png``, and their description (`mask_notes`).
 
     Finished videos are skipped. An interrupted run loses only the current video.
@@ -123,7 +123,7 @@ def make(
 
 def check(
     views: Sequence[datasets.View], backend: MaskBackend, folder: Path, *, progress: Progress | None = None
-) -> Made:
+) -> MaskingResult:
     """Read all existing masks of a folder without writing; see `make`."""
     count, every = _Count(), videos.of(views)
     found = {
@@ -176,9 +176,9 @@ def _labelled(
         yield video, mask_notes.Video(tuple(images), tuple(sorted(seen - {0, masks.UNKNOWN})))
 
 
-def _made(notes: mask_notes.MaskNotes, folder: Path, kept: int, count: _Count) -> Made:
+def _made(notes: mask_notes.MaskNotes, folder: Path, kept: int, count: _Count) -> MaskingResult:
     ids = [video.ids for video in notes.videos.values()]
-    return Made(
+    return MaskingResult(
         folder=folder,
         images=sum(len(video.images) for video in notes.videos.values()),
         videos=len(notes.videos),

@@ -1,4 +1,4 @@
-"""Mask backends that read existing masks: any folder (`Precomputed`), or a capture from Blender (`Captured`)."""
+"""Mask backends that read existing masks: a folder (`PrecomputedMasks`), or a capture of Blender (`CapturedMasks`)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..data.annotations import OBJECTS, read_objects
 from .videos import Video
 
 
-class Precomputed:
+class PrecomputedMasks:
     """Existing masks in a folder: ids of 8 or 16 bits, palettes, or one flat colour per object.
 
     A mask has the path of its image, or the image's file name in the folder itself.
@@ -74,7 +74,7 @@ class Precomputed:
             report((k + 1) / len(video.views))
 
 
-class Captured(Precomputed):
+class CapturedMasks(PrecomputedMasks):
     """Object index masks rendered by the extension's capture: exact, complete, with a name for every id.
 
     Args:

@@ -90,8 +90,8 @@ class GroupMotion:
         return models_of(self._scene, self._source)
 
     @functools.cached_property
-    def _future(self) -> models.Stack:
-        return models.Stack(
+    def _future(self) -> models.MotionStack:
+        return models.MotionStack(
             [STATIC if g.follows is not None else m for g, m in zip(self._scene.groups, self.models, strict=True)]
         )
 

@@ -27,14 +27,8 @@ from ..motion import cubic_curves, quaternion_columns, rotations
 from ..scene.scene import Scene
 from . import group_dynamics, posing
 from .group_dynamics import knots
-from .modes import MODES, VARIANTS, every, split
-from .posing import move_points, rest_factors, turn_quats
+from .modes import every, split
 from .residuals import Literal, OwnMotion, Residuals, unexplained
-
-__all__ = (
-    "MODES", "VARIANTS", "Frame", "Player", "available", "every", "frame", "group_poses", "knot_slopes", "knots",
-    "modes", "move_points", "pose", "rest_factors", "sh_rotations", "split", "turn_quats",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from typing import Any, BinaryIO, TypeGuard
 import numpy as np
 
 from .. import errors, strict_json
-from ..playback.instance import Instance, Sky
 from ..scene import cameras
 from ..scene.cameras import Camera
+from ..scene.instance import Instance, Sky
 from ..search import prompts
 
 MOST_LINE = 512 << 20  # bytes per request; edited points are large

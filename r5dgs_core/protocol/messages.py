@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..playback.instance import Instance, Sky
 from ..scene.cameras import Camera
+from ..scene.instance import Instance, Sky
 from . import fields
 
 VERSION = 4  # of the protocol; the worker reports it in its answer to "hello"

@@ -12,13 +12,13 @@ from ..raster import rasterize
 from ..raster.settings import RasterSettings
 from ..scene import cameras
 from ..scene.cameras import Camera
-from . import scene_renderer
+from . import posed_scene, scene_renderer
 
 CHANNELS = 11  # groups per pass: three as colour, the rest as features; bounds the memory
 
 
 def shares(
-    posed: scene_renderer.PosedScene,
+    posed: posed_scene.PosedScene,
     groups: np.ndarray,  # [N]
     camera: Camera,
     *,

@@ -14,11 +14,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..playback.instance import Instance, Sky
 from ..raster import backends, rasterize
 from ..raster.backend import StaticLayer
 from ..raster.settings import RasterSettings, RenderOutput
 from ..scene.cameras import Camera
+from ..scene.instance import Instance, Sky
 from ..scene.scene import NEAR_PLANE, Scene
 from . import coverage, posed_scene, scene_renderer
 
@@ -40,7 +40,7 @@ class Stage:
         self.ms_motion = 0.0
         self._lock = threading.Lock()
         self._scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
-        self._gathered = scene_renderer.gather(self._scenes)
+        self._gathered = posed_scene.gather(self._scenes)
         self._shown: tuple | None = None  # camera, background, ranges and tints of the last frame
         self._places: list[np.ndarray] = []  # first pose of each instance
         self._moving: set[int] = set()
@@ -59,7 +59,7 @@ class Stage:
         """Render ranges of the scenes' Gaussians, each transformed by its own matrix.
 
         Args:
-            instances: As for `scene_renderer.pose_instances`; compared one by one with those of the last frame.
+            instances: As for `posed_scene.pose_instances`; compared one by one with those of the last frame.
             camera: The camera, in the world of the picture.
             sky: Sky behind everything; None for black.
             near: Near plane: Gaussians whose centre has a smaller depth are culled. None for the smallest near plane of
@@ -73,14 +73,14 @@ class Stage:
             ``holdout`` is their share of each pixel; alpha, depth and ids describe the other instances only.
 
         Raises:
-            ValueError: As for `scene_renderer.pose_instances`.
+            ValueError: As for `posed_scene.pose_instances`.
         """
         with self._lock:
             try:
                 return self._render(instances, camera, sky, near, distance)
             except ValueError:
                 self._shown = None
-                scene_renderer.pose_instances(self._gathered, instances)  # raises again, with the caller's numbering
+                posed_scene.pose_instances(self._gathered, instances)  # raises again, with the caller's numbering
                 raise
 
     def coverage(
@@ -241,14 +241,14 @@ class Stage:
         depth = _mean(found.features[..., 0], alpha)
         return RenderOutput(found.color, alpha, depth, None, ids, holdout)
 
-    def _pose(self, instances: Sequence[Instance]) -> scene_renderer.PosedScene:
+    def _pose(self, instances: Sequence[Instance]) -> posed_scene.PosedScene:
         start = time.perf_counter()
-        posed = scene_renderer.pose_instances(self._gathered, instances)
+        posed = posed_scene.pose_instances(self._gathered, instances)
         self.ms_motion += 1e3 * (time.perf_counter() - start)
         return posed
 
 
-def _depths(posed: scene_renderer.PosedScene, camera: Camera, distance: float) -> np.ndarray:
+def _depths(posed: posed_scene.PosedScene, camera: Camera, distance: float) -> np.ndarray:
     """Depths of centres minus ``distance``, computed in float64. [N, 1] float32"""
     depths = (posed.means + posed.origin) @ camera.T_cam_world[2, :3] + (camera.T_cam_world[2, 3] - distance)
     return np.asarray(depths[:, None], np.float32)

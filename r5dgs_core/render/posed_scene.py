@@ -12,15 +12,15 @@ import numpy as np
 
 from ..motion import quaternion_columns, rotations
 from ..playback import affine_transform, posing, scene_player
-from ..playback.instance import Instance
 from ..playback.residuals import Residuals
+from ..scene.instance import Instance
 from ..scene.scene import Scene
 
 MANY = 16  # shortest run of equal instances whose rows are gathered
 
 
 @dataclass(frozen=True)
-class Gathered:
+class JoinedScenes:
     """The Gaussians of several scenes, concatenated. S scenes.
 
     Attributes:
@@ -48,7 +48,7 @@ class Gathered:
     harmonics_turn: tuple[bool, ...]
 
 
-def gather(scenes: Sequence[Scene]) -> Gathered:
+def gather(scenes: Sequence[Scene]) -> JoinedScenes:
     """Concatenate the Gaussians of scenes. A single scene is not copied."""
     lit = any(scene.shading is not None for scene in scenes)
     bases = max((scene.gaussians.sh.shape[1] for scene in scenes), default=1)
@@ -66,7 +66,7 @@ def gather(scenes: Sequence[Scene]) -> Gathered:
             else np.zeros((len(scene.gaussians.means), 3), np.float32)
         )
 
-    return Gathered(
+    return JoinedScenes(
         means=stacked([scene.gaussians.means for scene in scenes], (3,)),
         quats=stacked([scene.gaussians.quats for scene in scenes], (4,)),
         log_scales=stacked([scene.gaussians.log_scales for scene in scenes], (3,)),
@@ -75,7 +75,7 @@ def gather(scenes: Sequence[Scene]) -> Gathered:
         sh=stacked([padded(scene.gaussians.sh) for scene in scenes], (bases, 3)),
         starts=(0, *(int(stop) for stop in np.cumsum([len(scene.gaussians.means) for scene in scenes]))),
         shading=stacked([vectors(scene) for scene in scenes], (3,)) if lit else None,
-        shading_rest=stacked([scene_player.rest_factors(scene) for scene in scenes], ()) if lit else None,
+        shading_rest=stacked([posing.rest_factors(scene) for scene in scenes], ()) if lit else None,
         lights=tuple(
             None if scene.shading is None else np.asarray(scene.shading.light, np.float64) for scene in scenes
         ),
@@ -135,7 +135,7 @@ def pose_frame(scene: Scene, frame: scene_player.Frame) -> PosedScene:
     )
 
 
-def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> PosedScene:
+def pose_instances(scene: Scene | JoinedScenes, instances: Sequence[Instance]) -> PosedScene:
     """Transform ranges of the Gaussians of one or several scenes, each by its own matrix.
 
     Ranges may repeat or be left out. Rotations, translations and uniform scales are exact. Under any other linear map
@@ -152,7 +152,7 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
     Raises:
         ValueError: A range leaves its scene, a matrix is singular or not finite, or a tint is negative.
     """
-    given = scene if isinstance(scene, Gathered) else gather([scene])
+    given = scene if isinstance(scene, JoinedScenes) else gather([scene])
     ranges = [_rows(given, index, instance) for index, instance in enumerate(instances)]
     total = sum(instance.count for instance in instances)
     means, quats, log_scales = (np.empty((total, width), np.float32) for width in (3, 4, 3))
@@ -162,7 +162,7 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
         instance = instances[index]
         linear, offset = affine(instance.matrix, index)
         to = slice(filled, filled + (part.stop - part.start if isinstance(part, slice) else len(part)))
-        scene_player.move_points(given.means[part], linear, offset, means[to])
+        posing.move_points(given.means[part], linear, offset, means[to])
         affine_transform.map_shapes(linear, given.quats[part], given.log_scales[part], quats[to], log_scales[to])
         light = given.lights[instance.scene]
         rotation = _rotation(instance, index, linear, light)
@@ -208,7 +208,7 @@ def _rotation(instance: Instance, index: int, linear: np.ndarray, light: np.ndar
 
 @dataclass(frozen=True)
 class _Bent:
-    """Gaussians with residuals, in the bind state: rows in the `Gathered` arrays [R], indices within the part [R],
+    """Gaussians with residuals, in the bind state: rows in the `JoinedScenes` arrays [R], indices within the part [R],
     offsets [R, 3], resulting rotations, unit wxyz [R, 4], residual rotations [R, 4] and residuals of the log scales
     [R, 3]."""
 
@@ -220,7 +220,7 @@ class _Bent:
     growths: np.ndarray
 
 
-def bends(given: Gathered, instance: Instance) -> bool:
+def bends(given: JoinedScenes, instance: Instance) -> bool:
     """Return True if an instance contains Gaussians with residuals."""
     if instance.t is None or not 0 <= instance.scene < len(given.residuals):
         return False
@@ -228,7 +228,7 @@ def bends(given: Gathered, instance: Instance) -> bool:
     return bool(np.searchsorted(rows, instance.start) < np.searchsorted(rows, instance.start + instance.count))
 
 
-def _bent(given: Gathered, instance: Instance, part: slice | np.ndarray) -> _Bent | None:
+def _bent(given: JoinedScenes, instance: Instance, part: slice | np.ndarray) -> _Bent | None:
     if instance.t is None:
         return None
     residuals = given.residuals[instance.scene]()
@@ -280,7 +280,7 @@ def affine(matrix: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"instance {index}: {error}; hide the object instead") from error
 
 
-def _rows(given: Gathered, index: int, instance: Instance) -> tuple[int, int]:
+def _rows(given: JoinedScenes, index: int, instance: Instance) -> tuple[int, int]:
     """First gathered row of an instance, and the one past its last."""
     if not 0 <= instance.scene < len(given.starts) - 1:
         raise ValueError(f"instance {index}: expected a scene below {len(given.starts) - 1}, got {instance.scene}")
@@ -309,7 +309,7 @@ def _take(array: np.ndarray, ranges: Sequence[tuple[int, int]]) -> np.ndarray:
     return np.concatenate([array[:0], *(array[start:stop] for start, stop in ranges)])
 
 
-def _shading(given: Gathered, rows: slice | np.ndarray, turns: np.ndarray, light: np.ndarray | None) -> np.ndarray:
+def _shading(given: JoinedScenes, rows: slice | np.ndarray, turns: np.ndarray, light: np.ndarray | None) -> np.ndarray:
     """Shading factors of rotated rows under a light; one rotation [3, 3], or one per row [n, 3, 3]. [n] float32"""
     if given.shading is None or given.shading_rest is None or light is None:
         return np.ones(len(given.means[rows]), np.float32)

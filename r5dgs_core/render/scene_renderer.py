@@ -17,12 +17,7 @@ from ..scene import cameras, sh_color
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from . import posed_scene
-from .posed_scene import Gathered, Instance, PosedScene, gather, pose_frame, pose_instances
-
-__all__ = (
-    "Gathered", "Instance", "PosedGaussians", "PosedScene", "behind", "colors", "gather", "in_world_of", "pose_frame",
-    "pose_instances", "render_frame", "sky",
-)  # fmt: skip
+from .posed_scene import PosedScene
 
 
 def render_frame(
@@ -49,7 +44,7 @@ def render_frame(
     Returns:
         Colour (not clamped at 1), alpha, depth, features and object ids, arrays.
     """
-    posed = pose_frame(scene, pose) if isinstance(pose, scene_player.Frame) else pose
+    posed = posed_scene.pose_frame(scene, pose) if isinstance(pose, scene_player.Frame) else pose
     if isinstance(background, str):
         if background != "scene":
             raise ValueError(f"background: expected 'scene', None or an array, got {background!r}")

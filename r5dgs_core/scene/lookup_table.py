@@ -38,7 +38,7 @@ class EncoderCard:
 
 
 @dataclass(frozen=True)
-class View:
+class EmbeddingSource:
     """Source of one embedding of an object.
 
     Attributes:
@@ -70,7 +70,7 @@ class Table:
 
     encoder: EncoderCard
     canonical: tuple[str, ...]
-    views: tuple[tuple[View, ...], ...]
+    views: tuple[tuple[EmbeddingSource, ...], ...]
     thresholds: tuple[float | None, ...]
     margin: float
     pooling: str

@@ -20,7 +20,7 @@ from .. import atomic_files, errors, findings, strict_json
 from . import array_shapes, format_features, scene_json, validation
 from .archive import Archive, Header, most_content
 from .scene import DTYPES, EMBEDDINGS, Scene, grouped
-from .stored_embeddings import Meanings
+from .stored_embeddings import StoredEmbeddings
 
 FORMAT = "r5dgs scene"
 JSON_MEMBER = "scene.json"
@@ -90,7 +90,7 @@ def is_exact(path: str | Path) -> bool:
     return any(header.dtype == "<f4" for header in headers.values())
 
 
-def read_meanings(path: str | Path) -> Meanings | None:
+def read_meanings(path: str | Path) -> StoredEmbeddings | None:
     """Read only the stored embeddings of a scene; returns None if it has none. Raises as `read` does."""
     place = str(path)
     with Archive(Path(path)) as archive:
@@ -105,7 +105,9 @@ def read_meanings(path: str | Path) -> Meanings | None:
     objects, words = arrays["embeddings"], arrays["vocabulary_embeddings"]
     if objects is None or words is None:
         return None
-    return Meanings(ids, objects, vocabulary, words, table, arrays["canonical_embeddings"], arrays["view_embeddings"])
+    return StoredEmbeddings(
+        ids, objects, vocabulary, words, table, arrays["canonical_embeddings"], arrays["view_embeddings"]
+    )
 
 
 def _warn_of_lost_detail(scene: Scene, path: str | Path) -> None:

@@ -13,7 +13,7 @@ from ..motion.models import MotionModel
 from . import history_json
 from .cameras import Camera
 from .json_row import Row
-from .lookup_table import POOLINGS, EncoderCard, Table, View
+from .lookup_table import POOLINGS, EmbeddingSource, EncoderCard, Table
 from .scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 
 
@@ -149,8 +149,8 @@ def _read_camera(row: Row) -> Camera:
     return findings.UNREAD if any(entry is findings.UNREAD for entry in entries.values()) else Camera(**entries)
 
 
-def _read_view(row: Row) -> View:
-    return View(
+def _read_view(row: Row) -> EmbeddingSource:
+    return EmbeddingSource(
         box=None if row.lacks("box") else row.floats("box", 4),
         source=row.get("source", str),
         threshold=row.get("threshold", float),
@@ -220,7 +220,7 @@ def _table_tree(found: Table) -> dict[str, Any]:
     }
 
 
-def _view_tree(view: View) -> dict[str, Any]:
+def _view_tree(view: EmbeddingSource) -> dict[str, Any]:
     place = {} if view.box is None else {"box": [float(edge) for edge in view.box]}
     when = {} if view.t is None else {"t": float(view.t)}
     return {"source": view.source, "threshold": float(view.threshold), **when, **place}

@@ -14,7 +14,7 @@ from .scene import Scene
 
 
 @dataclass(frozen=True)
-class Meanings:
+class StoredEmbeddings:
     """Stored embeddings of a scene, for finding objects by words other than their names.
 
     Attributes:
@@ -36,7 +36,7 @@ class Meanings:
     view_embeddings: np.ndarray | None = None
 
     @classmethod
-    def of(cls, scene: Scene) -> Meanings | None:
+    def of(cls, scene: Scene) -> StoredEmbeddings | None:
         """Return the embeddings of a scene, or None if it stores none."""
         if scene.embeddings is None or scene.vocabulary_embeddings is None:
             return None

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..scene.stored_embeddings import Meanings
+from ..scene.stored_embeddings import StoredEmbeddings
 
 UNCALIBRATED = 0.25  # threshold for a file without encoder metadata
 PASS = 0.5  # score at the threshold
@@ -26,7 +26,7 @@ _BESIDE = 0.4  # maximum score of an object far below the best match
 
 
 @dataclass(frozen=True)
-class Meant:
+class EmbeddingMatch:
     """Match of one object with a phrase.
 
     Attributes:
@@ -42,7 +42,7 @@ class Meant:
     relevancy: float | None
 
 
-def ask(meanings: Meanings, query: np.ndarray) -> list[Meant]:
+def ask(meanings: StoredEmbeddings, query: np.ndarray) -> list[EmbeddingMatch]:
     """Score each object that has an embedding against a phrase, best first.
 
     An object whose cosine is more than the table's margin below the best one does not match.
@@ -64,7 +64,7 @@ def relevancy(cosine: float, canonical: np.ndarray, scale: float) -> float:
     return float(1.0 / (1.0 + np.exp(min(-scale * (cosine - float(np.max(canonical))), _MOST_EXPONENT))))
 
 
-def _answer(meanings: Meanings, row: int, query: np.ndarray) -> Meant | None:
+def _answer(meanings: StoredEmbeddings, row: int, query: np.ndarray) -> EmbeddingMatch | None:
     """Best match among an object's embeddings, or None if it has none. query: float64"""
     rows, thresholds = _rows(meanings, row)
     if not len(rows):
@@ -76,7 +76,7 @@ def _answer(meanings: Meanings, row: int, query: np.ndarray) -> Meant | None:
     if table is not None and canonical is not None and len(canonical):
         found = relevancy(cosine, canonical @ rows[best], table.encoder.scale)
     spread = _SPREAD if table is None else table.margin
-    return Meant(meanings.object_ids[row], _score(above, spread), cosine, found)
+    return EmbeddingMatch(meanings.object_ids[row], _score(above, spread), cosine, found)
 
 
 def _score(above: float, spread: float) -> float:
@@ -85,7 +85,7 @@ def _score(above: float, spread: float) -> float:
     return PASS + (_BEST - PASS) * (1 - share) if above >= 0 else PASS * share
 
 
-def _rows(meanings: Meanings, row: int) -> tuple[np.ndarray, np.ndarray]:
+def _rows(meanings: StoredEmbeddings, row: int) -> tuple[np.ndarray, np.ndarray]:
     """Embeddings to compare for an object and their thresholds; empty if it has none. [R, D], [R]"""
     table, views = meanings.table, meanings.view_embeddings
     if table is None:

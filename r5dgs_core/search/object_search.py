@@ -16,7 +16,7 @@ import numpy as np
 
 from .. import errors
 from ..scene.scene import Scene
-from ..scene.stored_embeddings import Meanings
+from ..scene.stored_embeddings import StoredEmbeddings
 from . import embedding_search as stored
 from . import english, prompts, spelling
 
@@ -75,7 +75,7 @@ def search(scene: Scene, text: str, threshold: float = THRESHOLD, embed: Embed |
     Raises:
         ConfigError: An excluded phrase has no match.
     """
-    labels, meanings = labels_of(scene), Meanings.of(scene)
+    labels, meanings = labels_of(scene), StoredEmbeddings.of(scene)
     check_exclusions(labels, text, not_excluded(labels, text, threshold, meanings, embed))
     return search_labels(labels, text, threshold, meanings, embed)
 
@@ -84,7 +84,7 @@ def search_labels(
     labels: Sequence[Label],
     text: str,
     threshold: float = THRESHOLD,
-    meanings: Meanings | None = None,
+    meanings: StoredEmbeddings | None = None,
     embed: Embed | None = None,
 ) -> list[Match]:
     """Same as `search`, on names and aliases, and on stored embeddings if given.
@@ -107,7 +107,7 @@ def unanswered(
     labels: Sequence[Label],
     text: str,
     threshold: float = THRESHOLD,
-    meanings: Meanings | None = None,
+    meanings: StoredEmbeddings | None = None,
     embed: Embed | None = None,
 ) -> list[str]:
     """Wanted phrases without a match; arguments as for `search_labels`."""
@@ -119,7 +119,7 @@ def not_excluded(
     labels: Sequence[Label],
     text: str,
     threshold: float = THRESHOLD,
-    meanings: Meanings | None = None,
+    meanings: StoredEmbeddings | None = None,
     embed: Embed | None = None,
 ) -> list[str]:
     """Excluded phrases without a match; arguments as for `search_labels`."""
@@ -147,7 +147,7 @@ def is_nothing(labels: Sequence[Label], text: str) -> bool:
     return bool(english.words_of(text)) and not prompt.wanted and not prompt.everything
 
 
-def unknown(labels: Sequence[Label], text: str, meanings: Meanings | None) -> list[str]:
+def unknown(labels: Sequence[Label], text: str, meanings: StoredEmbeddings | None) -> list[str]:
     """Phrases that need an encoder: no name matches them completely and no stored word has an embedding for them."""
     prompt = _parsed(labels, text)
     return [
@@ -215,7 +215,7 @@ def _matches(
     labels: Sequence[Label],
     phrases: Sequence[tuple[str, list[str]]],
     threshold: float,
-    meanings: Meanings | None,
+    meanings: StoredEmbeddings | None,
     embed: Embed | None,
 ) -> list[Match]:
     """Matches of any of the phrases with a score of at least ``threshold``."""
@@ -224,7 +224,7 @@ def _matches(
 
 
 def _phrase_matches(
-    labels: Sequence[Label], phrase: str, wish: list[str], meanings: Meanings | None, embed: Embed | None
+    labels: Sequence[Label], phrase: str, wish: list[str], meanings: StoredEmbeddings | None, embed: Embed | None
 ) -> list[Match]:
     """All matches of one phrase, regardless of score."""
     named = _named(labels, wish)
@@ -243,7 +243,7 @@ def _phrase_matches(
     return [*named, *(_by_meaning(one, word) for one in meant)]
 
 
-def _by_meaning(one: stored.Meant, phrase: str) -> Match:
+def _by_meaning(one: stored.EmbeddingMatch, phrase: str) -> Match:
     why = f"meaning of {phrase!r} ({one.cosine:.2f})"
     return Match(one.object_id, one.score, why, one.cosine, one.relevancy)
 

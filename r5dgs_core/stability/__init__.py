@@ -53,7 +53,7 @@ _CAPTION = (
 
 
 @dataclass(frozen=True)
-class Row:
+class CaseResult:
     """Result of a case.
 
     Attributes:
@@ -83,14 +83,14 @@ class Row:
     message: str = ""
 
 
-def run(cases: Iterable[Case] | None = None, progress: Callable[[int], None] | None = None) -> list[Row]:
+def run(cases: Iterable[Case] | None = None, progress: Callable[[int], None] | None = None) -> list[CaseResult]:
     """Measure cases. A case that raises an error fails with its message; the others still run.
 
     Args:
         cases: Cases to run; None for all.
         progress: Called with the number of finished cases.
     """
-    rows: list[Row] = []
+    rows: list[CaseResult] = []
     for case in CASES if cases is None else cases:
         rows.append(_measured(case))
         if progress is not None:
@@ -98,7 +98,7 @@ def run(cases: Iterable[Case] | None = None, progress: Callable[[int], None] | N
     return rows
 
 
-def _measured(case: Case) -> Row:
+def _measured(case: Case) -> CaseResult:
     message, start = "", 0.0
     # Warnings of the core are expected in extreme cases; only the value decides.
     with logged(), warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -120,7 +120,7 @@ def _measured(case: Case) -> Row:
     if seconds > MOST_SECONDS:
         message = message or f"took {seconds:.1f} s of processor time, expected at most {MOST_SECONDS:g}"
     passed = bool(value <= case.tolerance) and seconds <= MOST_SECONDS  # NaN does not pass
-    return Row(
+    return CaseResult(
         case.topic,
         case.name,
         case.method,
@@ -135,7 +135,7 @@ def _measured(case: Case) -> Row:
     )
 
 
-def make(rows: Sequence[Row]) -> Table:
+def make(rows: Sequence[CaseResult]) -> Table:
     """Return the rows as a rich table."""
     table = Table(title="stability", title_justify="left", caption=_CAPTION, caption_justify="left")
     table.add_column("case", overflow="fold")
@@ -160,7 +160,7 @@ def _plain(text: str) -> str:
     return text.replace("[", r"\[")
 
 
-def summary(rows: Sequence[Row]) -> str:
+def summary(rows: Sequence[CaseResult]) -> str:
     """Return the number of passed cases, the failed ones and the time, as text."""
     failed = [row for row in rows if not row.passed]
     seconds = sum(row.seconds for row in rows)
@@ -168,7 +168,7 @@ def summary(rows: Sequence[Row]) -> str:
     return text + "".join(f"\nfailed: {row.topic}: {row.name}" for row in failed)
 
 
-def to_json(rows: Sequence[Row]) -> dict[str, Any]:
+def to_json(rows: Sequence[CaseResult]) -> dict[str, Any]:
     """Return the rows as JSON types; non-finite numbers become "nan", "inf" and "-inf"."""
     return {
         "passed": sum(row.passed for row in rows),
@@ -182,7 +182,7 @@ def _number(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write(rows: Sequence[Row], path: Path) -> Path:
+def write(rows: Sequence[CaseResult], path: Path) -> Path:
     """Write the rows as JSON; returns ``path``.
 
     Raises:

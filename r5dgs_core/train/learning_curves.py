@@ -20,7 +20,7 @@ SHARE = 0.02  # maximum share of the run's time for plots
 PANELS = (("loss", "loss", "log"), ("val_psnr", "held-out views, dB", "linear"), ("gaussians", "Gaussians", "linear"))
 
 
-class Curves:
+class LearningCurves:
     """Learning curves in a run folder, redrawn from time to time. A failure to draw is logged as a warning.
 
     Args:

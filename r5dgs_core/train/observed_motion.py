@@ -63,7 +63,7 @@ class PointMotion:
 
 
 @dataclass(frozen=True)
-class Moves:
+class RegroupCounts:
     """Counts of Gaussians that regrouping moved to another group.
 
     Attributes:
@@ -109,4 +109,4 @@ class ObservedMotion:
     motion_ids: np.ndarray | None = None
     points: PointMotion | None = None
     smooth: bool = False
-    moves: Moves | None = None
+    moves: RegroupCounts | None = None

@@ -16,7 +16,7 @@ NETWORKS = ("field", "trd")
 APPEARANCE = ("log_scales", "sh", "sh_rest", "opacity_logits", "background")
 
 
-class Rates:
+class LearningRates:
     """Learning rates by the part of a parameter's name before the first dot.
 
     Args:
@@ -48,7 +48,7 @@ class Rates:
         return base * (max(factor, rates.decay_floor_appearance) if name in APPEARANCE else factor)
 
 
-def make(gaussians: Mapping[str, Tensor], others: Mapping[str, Tensor], rates: Rates) -> torch.optim.Adam:
+def make(gaussians: Mapping[str, Tensor], others: Mapping[str, Tensor], rates: LearningRates) -> torch.optim.Adam:
     """Return the optimizer of the Gaussians' parameters, and of all others that require a gradient."""
     groups = [(name, p, 1e-15) for name, p in gaussians.items()]
     groups += [(name, p, 1e-8) for name, p in others.items() if p.requires_grad]

@@ -20,7 +20,7 @@ from ..config.config import Config
 from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted, TrainingError
 from ..render import warm_up
-from ..time_left import Phase, Timed
+from ..time_left import Phase, TimedProgress
 from . import checkpoint, checkpoint_content, finish, interrupt, learning_curves, probe, step_log
 from .identity import packed_masks
 from .representations.representation import TRACKS
@@ -55,7 +55,7 @@ def train(
             step.
         go_on: Command that resumes this run, for messages; by default a call of ``r5dgs train``.
         progress: Called with a dictionary per event (docs/reference/run_folder.md#progress). If it is a
-            `Timed`, its estimate of the time left also counts phases that the caller has added.
+            `TimedProgress`, its estimate of the time left also counts phases that the caller has added.
 
     Returns:
         The run.
@@ -73,7 +73,7 @@ def train(
             if stack.enter_context(folder_lock.hold(folder)):  # no other process is writing to these files
                 checkpoint.remove_leftovers(folder)
 
-        timed = progress if isinstance(progress, Timed) else Timed(progress or (lambda event: None))
+        timed = progress if isinstance(progress, TimedProgress) else TimedProgress(progress or (lambda event: None))
         return _train(dataset_root, folder, config, resume, overwrite, go_on, timed, claim)
 
 
@@ -84,7 +84,7 @@ def _train(
     resume: bool,
     overwrite: bool,
     go_on: str | None,
-    progress: Timed,
+    progress: TimedProgress,
     claim: Callable[[], None],
 ) -> checkpoint.Run:
     """Implementation of `train`; ``claim`` locks the folder."""
@@ -129,7 +129,7 @@ def _train(
         began -= state.seconds
     step_log.clean_up(folder / checkpoint.LOG_FILE, trainer.iteration)
     began_cpu = step_log.processor_start(folder / checkpoint.LOG_FILE, began_cpu)
-    pictures = learning_curves.Curves(run.folder)
+    pictures = learning_curves.LearningCurves(run.folder)
     _plan(trainer, progress)
     _optimise(trainer, run, began, began_cpu, go_on, progress, probe, pictures)
     with interrupt.at_once(f"stopped after the last step, before the labels; continue with: {go_on}"):
@@ -159,7 +159,7 @@ def _open(
 
 
 def _found_masks(
-    dataset: datasets.Dataset, config: Config, state: checkpoint.Checkpoint | None, progress: Timed
+    dataset: datasets.Dataset, config: Config, state: checkpoint.Checkpoint | None, progress: TimedProgress
 ) -> list[np.ndarray] | None:
     """Return masks of moving objects for data without masks: those of the checkpoint, or newly discovered ones."""
     if state is None:
@@ -174,7 +174,7 @@ def _found_masks(
     return packed_masks.unpack(state.tensors[packed_masks.NAME], sizes) if packed_masks.NAME in state.tensors else None
 
 
-def _plan(trainer: Trainer, progress: Timed) -> None:
+def _plan(trainer: Trainer, progress: TimedProgress) -> None:
     """Add the remaining phases of training to the estimate of the time left."""
     config, estimate = trainer.config, progress.estimate
     estimate.finish("discovery")  # `object_discovery.NAME`, without importing its networks
@@ -226,9 +226,9 @@ def _optimise(
     began: float,
     began_cpu: float | None,
     go_on: str,
-    progress: Timed,
+    progress: TimedProgress,
     probe: probe.Probe | None,
-    pictures: learning_curves.Curves,
+    pictures: learning_curves.LearningCurves,
 ) -> None:
     """Take the remaining steps, and write the log and checkpoints.
 

@@ -84,7 +84,7 @@ class Trainer:
         self.identity = joint_identity.joint(self.views, classes, config)
         if self.identity is not None:
             self.identity.begin(self.gaussians)
-        self.rates = optimizers.Rates(config, {} if self.identity is None else self.identity.rates)
+        self.rates = optimizers.LearningRates(config, {} if self.identity is None else self.identity.rates)
         self.iteration = 0
         self.running_loss = math.nan
         view_times = np.array([train_views.nearest_knot(self.times, v.t) for v in self.views])
@@ -95,7 +95,7 @@ class Trainer:
         self.growth = gradient.make(config, self._conditions(), len(self.gaussians))
         self._targets: dict[int, Tensor] = {}
 
-    def _start(self, views: Sequence[train_views.TrainView], motion: type[Representation]) -> initialize.Start:
+    def _start(self, views: Sequence[train_views.TrainView], motion: type[Representation]) -> initialize.InitialState:
         """Return the initial state. Raises DatasetError if no Gaussian can be placed."""
         config, dataset = self.config, self.dataset
         rng = np.random.default_rng(config.train.seed)

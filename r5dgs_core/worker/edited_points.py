@@ -13,9 +13,9 @@ import numpy as np
 from .. import errors
 from ..editing import point_edits
 from ..editing.point_edits import Place, PointEdit
-from ..playback.instance import Instance
 from ..protocol import fields
 from ..protocol.messages import RenderRequest
+from ..scene.instance import Instance
 from ..scene.scene import Scene
 
 Places = dict[tuple[int, str], Place]  # by scene number and edit key

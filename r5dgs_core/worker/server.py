@@ -39,13 +39,14 @@ from .. import __version__, errors
 from ..language import query
 from ..language.encoders import encoder_base, registry
 from ..playback import scene_player
-from ..playback.instance import Instance
 from ..protocol import answers as wire
 from ..protocol import fields, messages
+from ..render import posed_scene
 from ..scene import quality, scene_file
+from ..scene.instance import Instance
 from ..scene.scene import Scene
 from . import edited_points
-from .warming import Warming
+from .warming import WarmUpThread
 
 NEEDED = ("numba",)
 
@@ -59,7 +60,7 @@ class Server:
         warming: Thread to wait for before the first picture.
     """
 
-    def __init__(self, warming: Warming | None = None) -> None:
+    def __init__(self, warming: WarmUpThread | None = None) -> None:
         self._warming = warming
         self._scenes: dict[tuple[str, int, int], Scene] = {}  # by path, time and size of the file; in load order
         self._failed: dict[tuple[str, int, int], str] = {}  # stamp and error of the last unreadable file
@@ -202,7 +203,7 @@ class Server:
         started = time.perf_counter()
         if wanted.scene not in self._players:
             self._players[wanted.scene] = scene_player.Player(scene)
-        pose = scene_renderer.pose_frame(scene, self._players[wanted.scene].frame(t, wanted.camera.center))
+        pose = posed_scene.pose_frame(scene, self._players[wanted.scene].frame(t, wanted.camera.center))
         ms_motion = 1e3 * (time.perf_counter() - started)
         output = scene_renderer.render_frame(
             scene,
@@ -277,7 +278,7 @@ def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:
     Args:
         requests: Stream of JSON lines.
         answers: Stream for the responses.
-        warm: Load the rasterizer after the first response; see `Warming`.
+        warm: Load the rasterizer after the first response; see `WarmUpThread`.
 
     Returns:
         True if the rasterizer is still loading.
@@ -292,7 +293,7 @@ def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:
         with contextlib.suppress(OSError, ValueError):  # the client has closed the stream
             send(event)
 
-    warming = Warming(tell) if warm else None
+    warming = WarmUpThread(tell) if warm else None
     server = Server(warming)
     while True:
         number = None

@@ -10,7 +10,7 @@ from typing import Any
 from .. import errors
 
 
-class Warming:
+class WarmUpThread:
     """Background thread that loads or compiles the rasterizer's kernels.
 
     Args:

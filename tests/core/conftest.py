@@ -18,9 +18,9 @@ from tests.support import pictures, scenes, tiny_datasets
 @pytest.fixture(scope="session", autouse=True)
 def no_plots():
     """Train without plots of learning curves, which take a third of a tiny run; returns the function left out."""
-    update = learning_curves.Curves.update
+    update = learning_curves.LearningCurves.update
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning_curves.Curves, "update", lambda self, *, finished=False: None)
+        patch.setattr(learning_curves.LearningCurves, "update", lambda self, *, finished=False: None)
         yield update
 
 
@@ -68,7 +68,7 @@ def shared_starts():
 @pytest.fixture
 def plots(no_plots, monkeypatch):
     """Training plots its learning curves, as it does for users."""
-    monkeypatch.setattr(learning_curves.Curves, "update", no_plots)
+    monkeypatch.setattr(learning_curves.LearningCurves, "update", no_plots)
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r5dgs_core.time_left import SETTLED, Phase, Timed, TimeLeft
+from r5dgs_core.time_left import SETTLED, Phase, TimedProgress, TimeLeft
 
 
 def simulate(parts, every=50, seed=None):
@@ -121,7 +121,7 @@ def test_nothing_is_shown_before_the_first_measurement():
 
 def test_the_number_of_units_in_an_event_replaces_the_planned_one():
     now, shown = [0.0], []
-    report = Timed(shown.append, clock=lambda: now[0])
+    report = TimedProgress(shown.append, clock=lambda: now[0])
     report.estimate.add(Phase("evaluate", 1000, 2.0))
     for k in range(1, 5):
         now[0] += 3

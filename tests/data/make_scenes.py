@@ -15,7 +15,7 @@ import numpy as np
 
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.scene import scene_file
-from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
+from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, Table
 from r5dgs_core.scene.scene import Scene
 from tests.support.scenes import T_MAX, TIMES, make_scene
 
@@ -61,7 +61,7 @@ def words() -> Scene:
     rng = np.random.default_rng(2)
     rows = len(scene.objects)
     unit = rotations.normalize(rng.normal(size=(rows + 3, 2, 8)))
-    seen, said = View("orbit_0.30", 0.21, 0.25, (13.0, 26.0, 43.0, 65.0)), View("a mug", 0.3)
+    seen, said = EmbeddingSource("orbit_0.30", 0.21, 0.25, (13.0, 26.0, 43.0, 65.0)), EmbeddingSource("a mug", 0.3)
     views = tuple((seen, said) if item.id > 0 else () for item in scene.objects)
     return dataclasses.replace(
         scene.with_arrays(

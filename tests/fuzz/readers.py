@@ -26,8 +26,8 @@ from r5dgs_core.language.encoders import encoder_base
 from r5dgs_core.playback import scene_info, scene_player
 from r5dgs_core.raster import rasterize
 from r5dgs_core.render import scene_renderer
-from r5dgs_core.scene import cameras, quality, scene_file
-from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
+from r5dgs_core.scene import cameras, quality, scene_file, stored_embeddings
+from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, Table
 from r5dgs_core.scene.scene import Scene
 from r5dgs_core.search import embedding_search, object_search
 from r5dgs_core.train import checkpoint
@@ -82,7 +82,10 @@ def rich_scene(seed: int = 0, **changes: Any) -> Scene:
     table = Table(
         EncoderCard("clip", "tiny", "0" * 64, 4, ("{}", "a {}")),
         ("thing", "stuff"),
-        tuple((View("orbit", 0.2, 0.5, (0.0, 0.0, 9.0, 9.0)), View("a word", 0.2)) for _ in range(count)),
+        tuple(
+            (EmbeddingSource("orbit", 0.2, 0.5, (0.0, 0.0, 9.0, 9.0)), EmbeddingSource("a word", 0.2))
+            for _ in range(count)
+        ),
         tuple(0.2 for _ in range(count)),
         0.05,
         "max",
@@ -153,7 +156,7 @@ def use_scene(scene: Scene, path: Path) -> None:
                 small = cameras.crop(camera, (camera.width - SIDE) // 2, (camera.height - SIDE) // 2, SIDE, SIDE)
                 output = scene_renderer.render_frame(scene, frame, small, backend="reference")
                 assert np.isfinite(output.color).all() and np.isfinite(output.alpha).all(), "picture is not finite"
-        stored = embedding_search.Meanings.of(scene)
+        stored = stored_embeddings.StoredEmbeddings.of(scene)
         if stored is not None:
             embedding_search.ask(stored, stored.vocabulary_embeddings[0] if len(stored.vocabulary) else np.zeros(0))
         object_search.search(scene, "mug")

@@ -10,7 +10,7 @@ from ... import errors, folder_lock, input_paths, strict_json, user_settings
 from .. import object_captions, options
 
 if TYPE_CHECKING:
-    from ...language.build_table import Made
+    from ...language.build_table import SceneWithTable
     from ...language.encoders.encoder_base import Encoder
     from ...scene.scene import Scene
 
@@ -104,7 +104,7 @@ def run_lookup(
     return made.scene
 
 
-def _print_summary(made: Made, path: Path, encoder: Encoder) -> None:
+def _print_summary(made: SceneWithTable, path: Path, encoder: Encoder) -> None:
     table, card = made.scene.lookup, encoder.card
     count = 0 if table is None else sum(threshold is not None for threshold in table.thresholds)
     print(f"{path}: {count} objects and {len(made.scene.vocabulary)} words by {card.kind} {card.name}")

@@ -15,7 +15,7 @@ from .. import inputs, options
 if TYPE_CHECKING:
     from ...data.dataset import Dataset
     from ...data.views import View
-    from ...masks.make_masks import Made
+    from ...masks.make_masks import MaskingResult
 
 NAME = "masks"
 SHORT = "make or check the masks of the training images"
@@ -97,7 +97,7 @@ class Options:
         return {name: value for name in names if (value := getattr(self, name)) is not None}
 
 
-def run_masks(data: Path, *, progress_kind: str = "none", **fields: Any) -> Made:
+def run_masks(data: Path, *, progress_kind: str = "none", **fields: Any) -> MaskingResult:
     """Write masks of the training images; if source and output are the same folder, check them instead.
 
     Args:
@@ -150,12 +150,14 @@ def _maker(dataset: Dataset, given: Options) -> Any:
     from ...masks import mask_folders
 
     if given.backend == "blender":
-        return mask_folders.Captured(given.source or dataset.root, dataset.train)
+        return mask_folders.CapturedMasks(given.source or dataset.root, dataset.train)
     source = given.source or dataset.root / datasets.MASKS
-    return mask_folders.Precomputed(source, dataset.train, given.unknown)
+    return mask_folders.PrecomputedMasks(source, dataset.train, given.unknown)
 
 
-def _make(views: Sequence[View], maker: Any, folder: Path, in_place: bool, overwrite: bool, progress: Any) -> Made:
+def _make(
+    views: Sequence[View], maker: Any, folder: Path, in_place: bool, overwrite: bool, progress: Any
+) -> MaskingResult:
     """Make masks, or check them if they are in place."""
     from ...masks import make_masks
 
@@ -214,7 +216,7 @@ def _check(given: Options) -> None:
             raise errors.UsageError(f"{option} {value}: expected a share from 0 to 1")
 
 
-def _summary(made: Made, wanted: int, in_place: bool, root: Path) -> str:
+def _summary(made: MaskingResult, wanted: int, in_place: bool, root: Path) -> str:
     """Return the summary of the masks and the next step."""
     from ...data import dataset as datasets
     from ...data import mask_notes

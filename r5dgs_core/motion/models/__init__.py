@@ -3,7 +3,7 @@
 import importlib
 
 from .base import BLOCKS, Block, MotionKind, Rates, clocks
-from .evaluation import Stack, curve, evaluate, evaluate_all, evaluate_with_rates, kinks, steps_needed
+from .evaluation import MotionStack, curve, evaluate, evaluate_all, evaluate_with_rates, kinks, steps_needed
 from .motion_model import FIELDS, KINDS, RATES, SCALARS, VECTORS, MotionModel, Unit
 
 MENU_NUMBERS = {
@@ -39,7 +39,7 @@ __all__ = [
     "MotionKind",
     "MotionModel",
     "Rates",
-    "Stack",
+    "MotionStack",
     "Unit",
     "clocks",
     "curve",

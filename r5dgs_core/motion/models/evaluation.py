@@ -31,15 +31,15 @@ def evaluate(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, n
 
 
 def evaluate_all(models: Sequence[MotionModel], tau: float) -> tuple[np.ndarray, np.ndarray]:
-    """Evaluate G models at one time, vectorised over the models. For many times, keep a `Stack`.
+    """Evaluate G models at one time, vectorised over the models. For many times, keep a `MotionStack`.
 
     Returns:
         Unit quaternions wxyz [G, 4] and displacements [G, 3].
     """
-    return Stack(models).poses(tau)
+    return MotionStack(models).poses(tau)
 
 
-class Stack:
+class MotionStack:
     """Several motions, evaluated together at any time. Time-independent quantities are precomputed."""
 
     def __init__(self, models: Sequence[MotionModel]):

@@ -75,7 +75,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _backward(
-    state: forward.Pass, plan: forward.Plan, inputs, results, d_image, d_alpha, d_depth, with_geometry
+    state: forward.ForwardState, plan: forward.Plan, inputs, results, d_image, d_alpha, d_depth, with_geometry
 ):  # fmt: skip
     """Gradients of means, quats, scales, opacities and channels, and the gradient norms for densification [N]."""
     means, quats, scales, opacities, channels = (to_array(t) for t in inputs[:5])

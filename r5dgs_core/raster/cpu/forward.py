@@ -44,7 +44,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Pass:
+class ForwardState:
     """State of the forward pass for the backward pass, never exposed."""
 
     geometry: np.ndarray
@@ -176,7 +176,7 @@ def _kinds_per_tile(segments: np.ndarray) -> np.ndarray:
 
 def rasterize(
     arrays: Sequence[np.ndarray], background: np.ndarray | None, plan: Plan, with_state: bool, with_slots: bool = True
-) -> tuple[Pass | None, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[ForwardState | None, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Project, sort, assign and blend means, quats, scales, opacities and channels.
 
     Returns:
@@ -207,7 +207,7 @@ def rasterize(
     )  # fmt: skip
     state = None
     if with_state:
-        state = Pass(
+        state = ForwardState(
             geometry, depths, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, slot_starts, transmittance,
             last_pairs,
         )  # fmt: skip

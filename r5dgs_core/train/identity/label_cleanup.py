@@ -27,7 +27,7 @@ from ..observed_motion import GroupTrack
 
 log = logging.getLogger(__name__)
 
-CHANGES = "label_changes"  # name of the counts in a checkpoint, in the order of `Changes`
+CHANGES = "label_changes"  # name of the counts in a checkpoint, in the order of `LabelChanges`
 
 NEIGHBOURS = 8
 OWN = 4.0  # weight of a Gaussian's own votes relative to its neighbourhood
@@ -45,7 +45,7 @@ AT_ONCE = 1 << 16  # Gaussians per block; bounds memory
 
 
 @dataclass(frozen=True)
-class Changes:
+class LabelChanges:
     """Counts of changed labels by cause.
 
     Attributes:
@@ -68,7 +68,7 @@ def clean(
     opacities: np.ndarray,
     going: np.ndarray | None = None,
     moving: np.ndarray | None = None,
-) -> tuple[np.ndarray, Changes]:
+) -> tuple[np.ndarray, LabelChanges]:
     """Clean labels by neighbours, motion and outlier removal.
 
     An object never loses all its Gaussians, and nearly transparent Gaussians never join an object. No label changes if
@@ -87,7 +87,7 @@ def clean(
     """
     start, count = labels.astype(np.int64), votes.shape[1]
     if len(votes) < 2 or count < 2:
-        return start, Changes(gaussians=len(votes))
+        return start, LabelChanges(gaussians=len(votes))
     width = min(NEIGHBOURS, len(points) - 1) + 1
     distances, nearest = map(np.asarray, spatial.KDTree(points).query(points, width))
     votes = votes.astype(np.float32)
@@ -97,7 +97,7 @@ def clean(
     measured = sure[1:][np.isfinite(sure[1:])]
     if len(measured) and np.median(measured) < AGREED:
         log.warning("masks contradict each other about the objects: labels are not cleaned")
-        return start, Changes(gaussians=len(votes))
+        return start, LabelChanges(gaussians=len(votes))
     shares /= np.where(np.isnan(sure), 1.0, np.maximum(sure, AGREED)).astype(np.float32)
     shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1e-9)
     trust = total / (total + DOUBT)
@@ -113,7 +113,7 @@ def clean(
     changed = found != start
     apart = changed & (found != settled)
     by_motion, outliers = int((changed & ~apart & motion).sum()), int(apart.sum())
-    return found, Changes(int(changed.sum()) - by_motion - outliers, by_motion, outliers, len(votes))
+    return found, LabelChanges(int(changed.sum()) - by_motion - outliers, by_motion, outliers, len(votes))
 
 
 def certainty(
@@ -144,10 +144,10 @@ def certainty(
 
 
 def changes_of(tensors: Mapping[str, Any]) -> dict[str, int] | None:
-    """Return the counts in a checkpoint by the names of `Changes`; None if labels were not cleaned."""
+    """Return the counts in a checkpoint by the names of `LabelChanges`; None if labels were not cleaned."""
     if CHANGES not in tensors:
         return None
-    names = [field.name for field in dataclasses.fields(Changes)]
+    names = [field.name for field in dataclasses.fields(LabelChanges)]
     return dict(zip(names, map(int, tensors[CHANGES]), strict=True))
 
 

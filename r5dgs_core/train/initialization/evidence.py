@@ -18,7 +18,7 @@ from scipy import ndimage
 from ...data import masks
 from ...scene import cameras
 from ..train_views import TrainView, camera_key, nearest_knot, spread
-from .triangulation import Places
+from .triangulation import ObjectPositions
 
 TEXTURE = 0.1  # change of colour per radian (root mean square) that makes rotation observable
 STIFFEST = 100.0  # factor on the smoothness of a track if nothing is visible
@@ -29,7 +29,7 @@ FEWEST_FRAMES, MOST_FRAMES = 2, 15  # frames of a camera for the colours without
 
 
 @dataclass(frozen=True)
-class Evidence:
+class BodyEvidence:
     """Evidence on each body at each time.
 
     Attributes:
@@ -43,7 +43,7 @@ class Evidence:
     absent: np.ndarray
 
 
-def gather(views: Sequence[TrainView], places: Places, times: np.ndarray) -> Evidence:
+def gather(views: Sequence[TrainView], places: ObjectPositions, times: np.ndarray) -> BodyEvidence:
     """Gather the evidence from all views.
 
     Args:
@@ -52,7 +52,7 @@ def gather(views: Sequence[TrainView], places: Places, times: np.ndarray) -> Evi
         times: The observed times. [S]
     """
     stiff = shift_stiffness(places.evidence)
-    return Evidence(stiff, turn_stiffness(views, places, times), absent(views, places, times))
+    return BodyEvidence(stiff, turn_stiffness(views, places, times), absent(views, places, times))
 
 
 def shift_stiffness(evidence: np.ndarray) -> np.ndarray:
@@ -60,7 +60,7 @@ def shift_stiffness(evidence: np.ndarray) -> np.ndarray:
     return 1 / np.maximum(evidence, 1 / STIFFEST)
 
 
-def turn_stiffness(views: Sequence[TrainView], places: Places, times: np.ndarray) -> np.ndarray:
+def turn_stiffness(views: Sequence[TrainView], places: ObjectPositions, times: np.ndarray) -> np.ndarray:
     """Return the smoothness of rotations about each axis, in world axes: the identity if texture determines rotation.
 
     The change of the image with rotation is estimated for a ball in the body's place, with the texture inside its mask.
@@ -119,7 +119,7 @@ def _change_per_turn(part: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, in
     return slopes.T @ slopes / 3, int(inside.sum())
 
 
-def absent(views: Sequence[TrainView], places: Places, times: np.ndarray) -> np.ndarray:
+def absent(views: Sequence[TrainView], places: ObjectPositions, times: np.ndarray) -> np.ndarray:
     """Find the times at which an object is absent although cameras see its place and nothing hides it.
 
     At such a time no mask shows the object. In most views, the pixels at its expected place have the colours that the
@@ -183,7 +183,7 @@ def _ids(view: TrainView, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return view.mask[rows, columns]
 
 
-def _usual_colors(views: Sequence[TrainView], places: Places) -> np.ndarray:
+def _usual_colors(views: Sequence[TrainView], places: ObjectPositions) -> np.ndarray:
     """Return the mean colour of each object over all masks. [M, 3]"""
     total, count = np.zeros((len(places.object_ids), 3)), np.zeros(len(places.object_ids))
     for view in views:

@@ -48,7 +48,7 @@ class FirstTracks:
 
 
 @dataclass(frozen=True)
-class Start:
+class InitialState:
     """Initial state of training.
 
     Attributes:
@@ -65,11 +65,11 @@ class Start:
     gaussians: Gaussians
     tracks: FirstTracks
     object_ids: np.ndarray
-    places: triangulation.Places
+    places: triangulation.ObjectPositions
     first_time: int
     plane: tuple[np.ndarray, float] | None
     sky: np.ndarray | None
-    evidence: evidence.Evidence
+    evidence: evidence.BodyEvidence
 
 
 def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
@@ -103,7 +103,7 @@ def start(
     find_sky: bool,
     rng: np.random.Generator,
     cloud: tuple[np.ndarray, np.ndarray] | None = None,
-) -> Start:
+) -> InitialState:
     """Create the initial Gaussians and tracks.
 
     Args:
@@ -152,7 +152,7 @@ def start(
     tracks = FirstTracks(times, centers, translations, casters, None if plane is None else plane[0], slope)
     ids = np.concatenate([[0], places.object_ids])
     seen = evidence.gather(views, places, times)
-    return Start(gaussians, tracks, ids, places, first, plane, placed.sky, seen)
+    return InitialState(gaussians, tracks, ids, places, first, plane, placed.sky, seen)
 
 
 def _warn(views: Sequence[TrainView], motion: type[Representation]) -> None:
@@ -171,7 +171,7 @@ def _warn(views: Sequence[TrainView], motion: type[Representation]) -> None:
 def _bodies(
     views: Sequence[TrainView],
     times: np.ndarray,
-    places: triangulation.Places,
+    places: triangulation.ObjectPositions,
     first: int,
     init: InitSection,
     rng: np.random.Generator,
@@ -200,7 +200,7 @@ def _bodies(
 def _background(
     views: Sequence[TrainView],
     backgrounds: Sequence[background_images.BackgroundImage],
-    placed: plane_sweep.Placed,
+    placed: plane_sweep.BackgroundPoints,
     init: InitSection,
     rng: np.random.Generator,
     cloud: tuple[np.ndarray, np.ndarray] | None,
@@ -223,7 +223,7 @@ def _background(
 
 
 def supporting_plane(
-    background: np.ndarray, places: triangulation.Places, eyes: np.ndarray, rng: np.random.Generator
+    background: np.ndarray, places: triangulation.ObjectPositions, eyes: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, float] | None:
     """Fit the plane that carries the objects: most background points, with objects and cameras on one side.
 
@@ -271,7 +271,7 @@ def _at_once(views: Sequence[TrainView], times: np.ndarray, knot: int) -> Sequen
     return then if len({camera_key(v.camera) for v in then}) >= FEWEST_EYES else views
 
 
-def _first_time(places: triangulation.Places, count: int) -> int:
+def _first_time(places: triangulation.ObjectPositions, count: int) -> int:
     """Return the time at which most objects are well visible; of similar ones the middle one, to minimise drift."""
     if len(places.object_ids) == 0:
         return 0

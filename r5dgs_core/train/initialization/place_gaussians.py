@@ -23,7 +23,7 @@ SCALES = (0.005, 0.2)  # limits of the initial standard deviations
 
 
 @dataclass(frozen=True)
-class Points:
+class SeedPoints:
     """Points that become Gaussians.
 
     Attributes:
@@ -43,7 +43,7 @@ class Points:
     quats: np.ndarray
 
 
-def solid(clouds: Sequence[tuple[np.ndarray, np.ndarray, int]], opacity: float) -> Points:
+def solid(clouds: Sequence[tuple[np.ndarray, np.ndarray, int]], opacity: float) -> SeedPoints:
     """Return isotropic Gaussians with the spacing of their neighbours as size, over all clouds.
 
     Args:
@@ -51,7 +51,7 @@ def solid(clouds: Sequence[tuple[np.ndarray, np.ndarray, int]], opacity: float) 
         opacity: Opacity of all of them.
     """
     means = np.concatenate([where for where, _, _ in clouds])
-    return Points(
+    return SeedPoints(
         means,
         np.concatenate([shade for _, shade, _ in clouds]),
         np.concatenate([np.full(len(where), group) for where, _, group in clouds]),
@@ -69,7 +69,7 @@ def shadow(
     group: int,
     count: int,
     rng: np.random.Generator,
-) -> Points:
+) -> SeedPoints:
     """Return faint, flat, dark Gaussians in the shadow of a body on the plane.
 
     Args:
@@ -87,7 +87,7 @@ def shadow(
     jitter += (lift - jitter @ normal)[:, None] * normal
     size = np.full((count, 3), 0.25 * radius)
     size[:, 2] = SHADOW_THICKNESS
-    return Points(
+    return SeedPoints(
         shadows.cast(center, light, plane) + jitter,
         np.zeros((count, 3)),
         np.full(count, group),
@@ -97,7 +97,7 @@ def shadow(
     )
 
 
-def gaussians_of(parts: Sequence[Points], sh_degree: int) -> Gaussians:
+def gaussians_of(parts: Sequence[SeedPoints], sh_degree: int) -> Gaussians:
     """Return the canonical Gaussians of all parts, in their order."""
     means, colors, labels, opacities, log_scales, quats = (
         np.concatenate([getattr(part, name) for part in parts])

@@ -34,7 +34,7 @@ CONFIRMATIONS = 2  # other cameras that must agree on a depth
 
 
 @dataclass(frozen=True)
-class Placed:
+class BackgroundPoints:
     """Background points [P, 3], their colours [P, 3], and coefficients of the sky [9, 3] or None."""
 
     points: np.ndarray
@@ -142,7 +142,7 @@ class Sweep:
 
     def place(
         self, count: int, plane: tuple[np.ndarray, float] | None, find_sky: bool, rng: np.random.Generator
-    ) -> Placed:
+    ) -> BackgroundPoints:
         """Draw background points and fit the sky.
 
         Rays on which the supporting plane is as good as the best depth are placed on the plane: within the region in
@@ -159,7 +159,7 @@ class Sweep:
             At most ``count`` points; none without parallax or if everything is sky.
         """
         if not self.rays:
-            return Placed(np.zeros((0, 3)), np.zeros((0, 3)), None)
+            return BackgroundPoints(np.zeros((0, 3)), np.zeros((0, 3)), None)
         eyes = [np.broadcast_to(self.backgrounds[r.image].camera.center, r.directions.shape) for r in self.rays]
         origin = _flatten(eyes)
         direction, color = _flatten([r.directions for r in self.rays]), _flatten([r.colors for r in self.rays])
@@ -184,10 +184,10 @@ class Sweep:
         points = points[usable]
         coefficients = found[0] if found is not None else None
         if len(points) == 0:
-            return Placed(np.zeros((0, 3)), np.zeros((0, 3)), coefficients)
+            return BackgroundPoints(np.zeros((0, 3)), np.zeros((0, 3)), coefficients)
         weights = 1 / (0.02 + cost[usable])
         chosen = rng.choice(len(points), min(count, len(points)), replace=False, p=weights / weights.sum())
-        return Placed(points[chosen], color[usable][chosen], coefficients)
+        return BackgroundPoints(points[chosen], color[usable][chosen], coefficients)
 
     def _confirmed(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Mask of points at whose depth other cameras found a surface, too. [P] bool

@@ -18,7 +18,7 @@ from scipy import ndimage
 from ..train_views import TrainView, camera_key, nearest_knot
 from .background_images import BackgroundImage
 from .plane_sweep import plane_axes
-from .triangulation import Places
+from .triangulation import ObjectPositions
 from .visual_hull import pixel_indices
 
 CANDIDATES = 400
@@ -38,7 +38,7 @@ class Light:
 def find_light(
     views: Sequence[TrainView],
     backgrounds: Sequence[BackgroundImage],
-    places: Places,
+    places: ObjectPositions,
     times: np.ndarray,
     plane: tuple[np.ndarray, float],
     rng: np.random.Generator,

@@ -32,7 +32,7 @@ ROUNDS = 5
 
 
 @dataclass(frozen=True)
-class Places:
+class ObjectPositions:
     """Positions of the objects over time.
 
     Attributes:
@@ -66,7 +66,7 @@ class _Sighting:
     whole: bool
 
 
-def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> Places:
+def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> ObjectPositions:
     """Locate every object at every observed time.
 
     Args:
@@ -107,7 +107,7 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> P
     peak = visibility.max(axis=1, keepdims=True) if m else visibility
     shown = measured | (from_two & (evidence >= MOST_OF_IT))
     visibility = visibility / np.maximum(peak, 1e-12)
-    return Places(ids, centers, measured, visibility, radii, np.minimum(evidence, 1.0), shown)
+    return ObjectPositions(ids, centers, measured, visibility, radii, np.minimum(evidence, 1.0), shown)
 
 
 def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> dict[int, list[_Sighting]]:

@@ -34,7 +34,7 @@ from ...scene import sh_color
 from ...scene.cameras import Camera
 from ..observed_motion import ObservedMotion
 from . import field_fitting, field_to_groups, fused_posing, gating, rigidity, shading
-from .field_motion import Clock, Motion
+from .field_motion import Clock, FieldMotion
 from .representation import FIELD, Representation
 
 log = logging.getLogger(__name__)
@@ -43,7 +43,7 @@ HORIZON = 14 / 15  # default horizon as a share of the observed span (0.70 of 0.
 
 
 @dataclass(frozen=True)
-class Moved:
+class MovedGaussians:
     """State of the moved Gaussians at a time.
 
     Attributes:
@@ -62,7 +62,7 @@ class Moved:
 
 
 class FieldRepresentation(Representation):
-    """Gaussians moved one by one by `Motion`, with shading that depends on their rotations.
+    """Gaussians moved one by one by `FieldMotion`, with shading that depends on their rotations.
 
     Args:
         tracks: Initial tracks by the masks, or trained tracks; the field may be fitted to them.
@@ -79,7 +79,7 @@ class FieldRepresentation(Representation):
         self._config = config
         self._tracks = tracks
         self._first = first
-        self._last: Moved | None = None
+        self._last: MovedGaussians | None = None
         self._iteration = config.field.warm_up  # a field that is not in training is past the warm-up
 
     @property
@@ -158,12 +158,12 @@ class FieldRepresentation(Representation):
         groups = gating.bodies_of(ids, tracks, field_fitting.ALONE)
         field_fitting.fit_trd(self.motion, means, groups, trd_steps, self._config.field.twist, draw)
 
-    def move(self, gaussians: Gaussians, t: float, draw: torch.Generator | None = None) -> Moved:
-        """Return the movers at a time: with ``draw`` by a random path through field and TRD, else by `Motion.at`."""
+    def move(self, gaussians: Gaussians, t: float, draw: torch.Generator | None = None) -> MovedGaussians:
+        """Return the movers at a time: with ``draw`` by a random path of field and TRD, else by `FieldMotion.at`."""
         rows = self.movers(gaussians)
         before = gaussians.params["means"].detach()[rows]
         deltas = self._train_path(before, t, draw) if draw is not None else self.motion.at(before, t)
-        return Moved(rows, before, deltas.offsets, deltas.quats, deltas.log_scales)
+        return MovedGaussians(rows, before, deltas.offsets, deltas.quats, deltas.log_scales)
 
     def _train_path(self, means: Tensor, t: float, draw: torch.Generator) -> deformation.Deltas:
         motion, h = self.motion, self.motion.step
@@ -261,7 +261,7 @@ class FieldRepresentation(Representation):
         )
 
 
-def _motion_of(times: np.ndarray, config: Config) -> Motion:
+def _motion_of(times: np.ndarray, config: Config) -> FieldMotion:
     """Return untrained networks with the clock of the observed times."""
     section = config.field
     first, last = float(times[0]), float(times[-1])
@@ -277,7 +277,7 @@ def _motion_of(times: np.ndarray, config: Config) -> Motion:
     if section.width:
         field_shape = replace(field_shape, width=section.width)
         trd_shape = replace(trd_shape, width=section.width)
-    return Motion(
+    return FieldMotion(
         deformation.DeformationField(field_shape, generator),
         TRD(trd_shape, generator),
         clock,
@@ -288,7 +288,7 @@ def _motion_of(times: np.ndarray, config: Config) -> Motion:
     )
 
 
-def _parameters(motion: Motion) -> dict[str, Tensor]:
+def _parameters(motion: FieldMotion) -> dict[str, Tensor]:
     """Weights of both networks by ``field.NAME`` and ``trd.NAME``."""
     named: dict[str, Tensor] = {f"field.{n}": p for n, p in motion.field.named_parameters()}
     named.update({f"trd.{n}": p for n, p in motion.trd.named_parameters()})
@@ -296,7 +296,7 @@ def _parameters(motion: Motion) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def _load(motion: Motion, tensors: dict[str, Tensor]) -> None:
+def _load(motion: FieldMotion, tensors: dict[str, Tensor]) -> None:
     for name, parameter in _parameters(motion).items():
         if name not in tensors or tensors[name].shape != parameter.shape:
             raise CheckpointError(f"the checkpoint's '{name}': expected a tensor of shape {list(parameter.shape)}")

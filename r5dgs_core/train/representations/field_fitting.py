@@ -15,7 +15,7 @@ from torch import Tensor
 from ...model.tracks import Tracks
 from ...model.trd import MotionState
 from ...motion import rotations
-from .field_motion import Motion
+from .field_motion import FieldMotion
 from .rigidity import QUAT_WEIGHT
 
 ROWS = 512  # Gaussians per step of a fit
@@ -42,7 +42,13 @@ def _sample(count: int, generator: torch.Generator) -> Tensor:
 
 
 def fit_field(
-    motion: Motion, means: Tensor, groups: Tensor, tracks: Tracks, first: int, steps: int, generator: torch.Generator
+    motion: FieldMotion,
+    means: Tensor,
+    groups: Tensor,
+    tracks: Tracks,
+    first: int,
+    steps: int,
+    generator: torch.Generator,
 ) -> None:
     """Fit the field to the motion of the tracks, relative to the knot at which the Gaussians are canonical.
 
@@ -84,7 +90,7 @@ def fit_field(
 
 
 def fit_trd(
-    motion: Motion, means: Tensor, groups: Tensor, steps: int, twist: float, generator: torch.Generator
+    motion: FieldMotion, means: Tensor, groups: Tensor, steps: int, twist: float, generator: torch.Generator
 ) -> None:
     """Fit the TRD to the motion of the field over intervals of about one step, forwards and backwards.
 
@@ -123,7 +129,7 @@ def fit_trd(
 
 
 def cross_twist(
-    motion: Motion,
+    motion: FieldMotion,
     begin: Tensor,
     goal: Tensor,
     state: MotionState,

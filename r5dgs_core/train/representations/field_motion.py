@@ -34,7 +34,7 @@ class Clock:
         return (t - self.origin) / self.scale
 
 
-class Motion:
+class FieldMotion:
     """Deformation field and TRD with their common clock.
 
     Args:

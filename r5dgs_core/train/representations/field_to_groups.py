@@ -19,7 +19,7 @@ from ...scene.splats import to_opacities
 from ..observed_motion import GroupTrack, ObservedMotion, PointMotion
 from . import regrouping as regroup
 from . import shading
-from .field_motion import Motion
+from .field_motion import FieldMotion
 
 SHADOW_RIDGE = 0.05  # ridge weight of the projection in the fit of a shadow's map / mean square of the caster's motion
 
@@ -32,7 +32,7 @@ def knots(times: np.ndarray, horizon: float) -> np.ndarray:
 
 @torch.no_grad()
 def observed_motion(
-    motion: Motion,
+    motion: FieldMotion,
     gaussians: dict[str, Tensor],
     movers: Tensor,
     labels: np.ndarray,
@@ -89,7 +89,7 @@ def observed_motion(
 
 
 def _sample(
-    motion: Motion, gaussians: dict[str, Tensor], movers: Tensor, at: np.ndarray
+    motion: FieldMotion, gaussians: dict[str, Tensor], movers: Tensor, at: np.ndarray
 ) -> tuple[PointMotion, np.ndarray]:
     """Return the states of the movers at the knots, and their rotations at the horizon since the canonical state.
 

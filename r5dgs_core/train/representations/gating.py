@@ -20,7 +20,7 @@ from ...config.config import Config
 from ...model.gaussians import Gaussians
 from ...model.tracks import Tracks
 from ...motion import rotations
-from .field_motion import Motion
+from .field_motion import FieldMotion
 
 TURN = 0.1  # weight of differences of quaternions and log scales relative to distances in normalised units
 SMOOTH = 1e-3  # smoothing of the distance from rest near 0, normalised units
@@ -105,7 +105,7 @@ class Rest:
 
 
 @torch.no_grad()
-def rest(motion: Motion, means: Tensor, log_scales: Tensor, times: np.ndarray) -> Rest:
+def rest(motion: FieldMotion, means: Tensor, log_scales: Tensor, times: np.ndarray) -> Rest:
     """Return the mean state of Gaussians over some times, and their deviation from it.
 
     Args:
@@ -128,7 +128,7 @@ def rest(motion: Motion, means: Tensor, log_scales: Tensor, times: np.ndarray) -
 
 
 @torch.no_grad()
-def settle(gaussians: Gaussians, rows: Tensor, motion: Motion, times: np.ndarray, limit: float) -> Tensor:
+def settle(gaussians: Gaussians, rows: Tensor, motion: FieldMotion, times: np.ndarray, limit: float) -> Tensor:
     """Freeze Gaussians at rest in their mean state, in place.
 
     Args:

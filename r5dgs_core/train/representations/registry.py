@@ -33,7 +33,7 @@ def configured(config: Config, still: bool = False) -> type[Representation]:
     return by_name(STILL if still else config.train.representation)
 
 
-def make(motion: type[Representation], start: initialize.Start, config: Config) -> Representation:
+def make(motion: type[Representation], start: initialize.InitialState, config: Config) -> Representation:
     """Create the initial representation: the configured one, or tracks if a field starts from them.
 
     Args:

@@ -20,7 +20,7 @@ from scipy import spatial
 
 from ...motion import rotations
 from ...playback import visibility
-from ..observed_motion import GroupTrack, Moves
+from ..observed_motion import GroupTrack, RegroupCounts
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ def tidy(
     opacities: np.ndarray,
     fit: Callable[[np.ndarray], list[GroupTrack]],
     made_for: np.ndarray | None = None,
-) -> tuple[np.ndarray, list[GroupTrack], Moves]:
+) -> tuple[np.ndarray, list[GroupTrack], RegroupCounts]:
     """Regroup Gaussians and refit the groups until no Gaussian changes its group.
 
     Args:
@@ -65,7 +65,7 @@ def tidy(
     roles = np.array([group.role for group in groups])[went]
     bodies, shadows, rest = (int((roles == role).sum()) for role in ("body", "shadow", "pinned"))
     resting = sum(group.role == "shadow" and not np.any(group.follow_matrix) for group in groups)
-    moves = Moves(bodies, shadows, rest, resting, len(ids))
+    moves = RegroupCounts(bodies, shadows, rest, resting, len(ids))
     log.info("%d of %d moving Gaussians joined another group than that of their object", moves.moved, moves.moving)
     return ids, groups, moves
 

@@ -39,7 +39,7 @@ class StillRepresentation(Representation):
 
     name, moves = STILL, False
 
-    def __init__(self, start: initialize.Start):
+    def __init__(self, start: initialize.InitialState):
         self.centers = torch.from_numpy(start.tracks.centers.astype(np.float32))
         self.time = float(start.tracks.times[-1])
 

@@ -37,7 +37,7 @@ class TracksRepresentation(Representation):
 
     name, takes_residuals = TRACKS, True
 
-    def __init__(self, start: initialize.Start, config: Config):
+    def __init__(self, start: initialize.InitialState, config: Config):
         self.tracks = first_tracks(start.tracks)
         self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
         self._places = start.places

@@ -15,8 +15,9 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.playback import scene_player
-from r5dgs_core.render import scene_renderer
+from r5dgs_core.render import posed_scene, scene_renderer
 from r5dgs_core.scene import cameras, quality, scene_file
+from r5dgs_core.scene.instance import Instance
 from tests.support import layouts, patience, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -138,8 +139,8 @@ def test_hidden_objects_are_left_out_and_moved_ones_are_moved(blender, loaded, s
     for obj in by_name.values():
         if obj.r5dgs.role == "CLOUD" and obj.name not in ("mug", "background"):
             # At t_max anchor and parent inverse cancel, so only the cloud's own matrix remains.
-            instances.append(scene_renderer.Instance(obj.r5dgs.start, obj.r5dgs.count, np.array(obj.matrix_basis)))
-    expected = core_picture(scene, scene_renderer.pose_instances(scene, instances))
+            instances.append(Instance(obj.r5dgs.start, obj.r5dgs.count, np.array(obj.matrix_basis)))
+    expected = core_picture(scene, posed_scene.pose_instances(scene, instances))
     everything = core_picture(scene, scene_player.frame(scene, scene.t_max))
     shown = preview(blender)
     assert psnr(shown, expected) > 45 and psnr(everything, expected) < 30
@@ -154,11 +155,11 @@ def test_a_duplicate_is_drawn_twice_and_a_deleted_cloud_not_at_all(blender, load
     copy.matrix_basis = Matrix.Translation((0.0, 0.0, 0.6))
     blender.data.objects.remove(loaded.all_objects["mug"])
     instances = [
-        scene_renderer.Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_basis))
+        Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_basis))
         for o in loaded.all_objects
         if o.r5dgs.role == "CLOUD"
     ]
-    assert psnr(preview(blender), core_picture(scene, scene_renderer.pose_instances(scene, instances))) > 45
+    assert psnr(preview(blender), core_picture(scene, posed_scene.pose_instances(scene, instances))) > 45
 
 
 def test_moving_the_whole_scene_with_its_camera_changes_nothing(blender, loaded):

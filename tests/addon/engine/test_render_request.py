@@ -10,6 +10,7 @@ from r5dgs_core.data import images
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import incremental_renderer, scene_renderer
 from r5dgs_core.scene import cameras, scene_file
+from r5dgs_core.scene.instance import Instance
 from tests.support import motions, scenes, tiny_datasets
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -65,7 +66,7 @@ def affine(linear, translation=(0, 0, 0)):
 
 def everything(scene, matrix, number=0):
     """All clouds of a scene, with world and bind state moved by a matrix; both give the same positions at t_max."""
-    return scene_renderer.Instance(0, len(scene.gaussians.means), matrix, number, matrix)
+    return Instance(0, len(scene.gaussians.means), matrix, number, matrix)
 
 
 def core_color(several, instances, camera, sky=None):
@@ -175,9 +176,7 @@ def test_a_copy_outside_its_collection_belongs_to_its_scene(blender, picture, ki
     blender.context.scene.collection.objects.link(copy)
     copy.matrix_basis = Matrix.Translation((0.0, 0.0, 0.4))
     seen, arrays = drawn(blender, picture)
-    extra = scene_renderer.Instance(
-        apple.r5dgs.start, apple.r5dgs.count, affine(W) @ affine(np.eye(3), (0, 0, 0.4)), 0, affine(W)
-    )
+    extra = Instance(apple.r5dgs.start, apple.r5dgs.count, affine(W) @ affine(np.eye(3), (0, 0, 0.4)), 0, affine(W))
     expected = core_color(
         scene, [everything(scene, affine(W)), extra], seen.camera, incremental_renderer.Sky(0, affine(W))
     )
@@ -210,7 +209,7 @@ def test_a_tint_recolours_a_cloud(blender, picture, kitchen):
     for obj in collection.all_objects:
         if obj.r5dgs.role == "CLOUD":
             tint = (0.2, 1.0, 0.5) if obj == mug else None
-            instances.append(scene_renderer.Instance(obj.r5dgs.start, obj.r5dgs.count, affine(W), 0, affine(W), tint))
+            instances.append(Instance(obj.r5dgs.start, obj.r5dgs.count, affine(W), 0, affine(W), tint))
     assert psnr(arrays["color"], core_color(scene, instances, seen.camera)) > 45
 
 
@@ -224,7 +223,7 @@ def test_points_that_were_deleted_are_not_drawn(blender, picture, kitchen):
     seen, arrays = drawn(blender, picture, sky=False)
     rows = np.setdiff1d(np.arange(len(scene.gaussians.means)), np.arange(start, start + count)[~keep])
     cuts = np.flatnonzero(np.diff(rows) != 1) + 1
-    parts = [scene_renderer.Instance(int(part[0]), len(part), affine(W), 0, affine(W)) for part in np.split(rows, cuts)]
+    parts = [Instance(int(part[0]), len(part), affine(W), 0, affine(W)) for part in np.split(rows, cuts)]
     assert psnr(arrays["color"], core_color(scene, parts, seen.camera)) > 45
 
 

@@ -9,8 +9,9 @@ import pytest
 from r5dgs_core.cli.commands import export as export_command
 from r5dgs_core.formats import ply
 from r5dgs_core.playback import scene_player
-from r5dgs_core.render import scene_renderer
+from r5dgs_core.render import posed_scene, scene_renderer
 from r5dgs_core.scene import cameras, scene_file, sh_color
+from r5dgs_core.scene.instance import Instance
 from r5dgs_core.scene.splats import Splats
 from tests.support import scenes
 
@@ -67,7 +68,7 @@ def edit(bpy, collection):
 
 def render(splats, scene, camera, backend="reference"):
     """The core's picture of the Gaussians of a file, over the scene's sky."""
-    posed = scene_renderer.PosedScene(
+    posed = posed_scene.PosedScene(
         splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh,
         np.zeros(len(splats.means), np.int32), np.eye(3)[None], np.zeros(len(splats.means), np.int64), None,
     )  # fmt: skip
@@ -83,12 +84,12 @@ def psnr(a, b):
 def shown(scene, collection, camera):
     """The core's picture of the edited scene, computed with maps of the bind state."""
     instances = [
-        scene_renderer.Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_world, np.float64), world=WORLD_4)
+        Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_world, np.float64), world=WORLD_4)
         for o in collection.all_objects
         if o.r5dgs.role == "CLOUD" and o.visible_get()
     ]
     background = sh_color.dc_to_rgb(scene.background_sh[0])
-    pose = scene_renderer.pose_instances(scene, instances)
+    pose = posed_scene.pose_instances(scene, instances)
     return np.clip(scene_renderer.render_frame(scene, pose, camera, background=background).color, 0, 1)
 
 

@@ -8,7 +8,7 @@ import pytest
 from r5dgs_core.data import images
 from r5dgs_core.formats import ply
 from r5dgs_core.playback import affine_transform
-from r5dgs_core.render import scene_renderer
+from r5dgs_core.render import posed_scene, scene_renderer
 from r5dgs_core.scene import scene_file
 from tests.support import scenes
 
@@ -145,7 +145,7 @@ def export(bpy, folder, obj):
 def picture_of(splats, scene, view):
     """The core's picture of the Gaussians of a file. [H, W, 3]"""
     count = len(splats.means)
-    posed = scene_renderer.PosedScene(
+    posed = posed_scene.PosedScene(
         splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh,
         np.zeros(count, np.int32), np.eye(3)[None], np.zeros(count, np.int64), None,
     )  # fmt: skip

@@ -195,7 +195,7 @@ def test_an_override_of_a_missing_library_reads_nothing_beside_it(blender, blend
     blender.ops.wm.open_mainfile(filepath=str(folder / "overriding.blend"))
     own = next(one for one in blender.data.collections if one.r5dgs.is_scene)
     assert own.override_library is not None
-    assert trust.find(own) == trust.Found(asked=scene_path)
+    assert trust.find(own) == trust.SceneFileSearch(asked=scene_path)
 
 
 def test_a_file_that_cannot_be_read_is_read_once_until_it_changes(blender, blend, trust, scene_path, reads, caplog):

@@ -13,7 +13,7 @@ def evidence(objects: list[int], views: list[int], overlap: float, ids: list[int
     objects, views = np.array(objects), np.array(views)
     iou = np.where(objects[:, None] == objects[None], overlap, noise * overlap)
     seen = np.full(iou.shape, 100.0 * 100)
-    return clustering.Evidence(
+    return clustering.TrackletOverlaps(
         common=2 * seen * iou / (1 + iou),
         seen=seen,
         together=np.where(views[:, None] == views[None], 10.0, 0.0),

@@ -125,7 +125,7 @@ def test_the_tiny_scene_needs_the_features_that_it_shows(baked):
 
 
 EVERYTHING = {"travel": 1.0, "turn": 1.0, "shading": 0.1, "sky": 9, "bases": 4, "shadow": True, "bent": 3}
-EVERYTHING["moves"] = observed_motion.Moves(3, moving=9)
+EVERYTHING["moves"] = observed_motion.RegroupCounts(3, moving=9)
 NAMES = [field.name for field in dataclasses.fields(config.NeedsSection)]
 
 
@@ -217,9 +217,9 @@ def test_bake_accepts_only_overrides_of_needs(trained, tmp_path):
 
 
 def test_the_table_lists_regrouped_gaussians():
-    row = table(moves=observed_motion.Moves(3, 2, 1, 1, 60))["regrouping"]
+    row = table(moves=observed_motion.RegroupCounts(3, 2, 1, 1, 60))["regrouping"]
     assert (row["value"], row["decision"]) == (6, "on")
     for part in ("of 60", "3 went to another body", "2 to a shadow", "1 to rest", "1 shadows rest"):
         assert part in row["reason"]
-    assert table(moves=observed_motion.Moves(moving=60))["regrouping"]["decision"] == "off"
+    assert table(moves=observed_motion.RegroupCounts(moving=60))["regrouping"]["decision"] == "off"
     assert table()["regrouping"]["decision"] == "off"

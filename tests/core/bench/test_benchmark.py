@@ -16,7 +16,7 @@ from r5dgs_core.config import presets
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import CheckpointError, ConfigError, DatasetError, Interrupted, TrainingError
 from r5dgs_core.evaluation import evaluate
-from r5dgs_core.playback import scene_player
+from r5dgs_core.playback import modes, scene_player
 from r5dgs_core.render import machine
 from r5dgs_core.scene import scene_file
 from r5dgs_core.train import checkpoint
@@ -127,7 +127,7 @@ def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path
 
     monkeypatch.setattr(bake, "bake", with_dynamics)
     result = benchmark.run_bench(plan_for(tiny, plan.out), progress_kind="none")["results"]
-    assert [record["mode"] for record in result] == list(scene_player.MODES)
+    assert [record["mode"] for record in result] == list(modes.MODES)
     assert result[0] == before[0], "what was measured before stays"
     # Motion past t_max stops in the modes that read the dynamics, which are none; up to t_max all modes are the same.
     rigid, hybrid, standard, literal = (record["splits"] for record in result)
@@ -322,7 +322,7 @@ def test_a_process_reports_its_own_memory_and_error(tmp_path):
     ("status", "complaint", "words"), [(-9, "", "SIGKILL"), (-11, "", "SIGSEGV"), (3, "", "status 3"), (1, "no", "no")]
 )
 def test_the_end_of_a_process_is_described(status, complaint, words):
-    assert words in process.reason(process.Sitting(status, complaint, 1.0, 1.0, None, None))
+    assert words in process.reason(process.TrainingProcess(status, complaint, 1.0, 1.0, None, None))
 
 
 def test_playing_draws_each_camera_in_the_order_of_time(baked, tiny, monkeypatch):

@@ -26,7 +26,7 @@ from r5dgs_core.evaluation import evaluate, scene_summary
 from r5dgs_core.playback import modes
 from r5dgs_core.raster import compilation
 from r5dgs_core.scene import scene_file
-from r5dgs_core.time_left import Timed
+from r5dgs_core.time_left import TimedProgress
 from r5dgs_core.train import checkpoint
 from tests.support import pages, tiny_datasets
 from tests.support.command_line import complaint
@@ -337,7 +337,9 @@ def test_a_stopped_demo_prints_the_command_that_continues_it(small_demo, tmp_pat
 
     @contextlib.contextmanager
     def stopping(kind):
-        yield Timed(lambda event: signal.raise_signal(signal.SIGINT) if moment.items() <= event.items() else None)
+        yield TimedProgress(
+            lambda event: signal.raise_signal(signal.SIGINT) if moment.items() <= event.items() else None
+        )
 
     with monkeypatch.context() as patch:
         patch.setattr(progress, "make", stopping)

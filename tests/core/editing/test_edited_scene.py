@@ -10,7 +10,7 @@ from r5dgs_core.editing.edited_scene import Piece
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import row_runs, scene_file, validation
-from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
+from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, Table
 from tests.support.scenes import make_scene
 
 TURN = rotations.quats_to_rotmats(rotations.normalize(np.array([0.3, -0.5, 0.7, 0.2])))
@@ -88,7 +88,7 @@ def rich_scene(**options):
     turns[:, -1] = (1, 0, 0, 0)
     named = sum(item.id >= 0 for item in scene.objects)
     units = rotations.normalize(random.normal(size=(len(scene.objects), 8))).astype(np.float32)
-    views = tuple((View("obs0", 0.1 * row, 0.5, (0, 0, 9, 9)),) for row in range(len(scene.objects)))
+    views = tuple((EmbeddingSource("obs0", 0.1 * row, 0.5, (0, 0, 9, 9)),) for row in range(len(scene.objects)))
     card, limits = EncoderCard("clip", "tiny", "ab" * 32, 8, ("{}",)), tuple(map(float, range(len(views))))
     return dataclasses.replace(
         scene.with_arrays(

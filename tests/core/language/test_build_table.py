@@ -12,7 +12,7 @@ from r5dgs_core.cli.commands import lookup
 from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.language import best_views, build_table, calibration, common_nouns, query
 from r5dgs_core.language.encoders import encoder_base, registry
-from r5dgs_core.scene import cameras, scene_file
+from r5dgs_core.scene import cameras, scene_file, stored_embeddings
 from r5dgs_core.scene.lookup_table import EncoderCard
 from r5dgs_core.search import embedding_search, object_search
 from tests.support import encoder_folders
@@ -269,7 +269,7 @@ def test_tiny_encoders_run_through_all_stages(kind, seen, tmp_path):
     fresh = encoder_base.embed_phrases(encoder, ["teapot"])[0]
     row = object_search.vocabulary_row(stored.vocabulary, ["teapot"])
     np.testing.assert_allclose(stored.vocabulary_embeddings[row], fresh, atol=2e-3)
-    same = embedding_search.ask(object_search.Meanings.of(stored), fresh)
+    same = embedding_search.ask(stored_embeddings.StoredEmbeddings.of(stored), fresh)
     assert len(same) == (4 if kind == "sentences" else 3)
 
 

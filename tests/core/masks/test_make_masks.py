@@ -213,9 +213,9 @@ def test_contradictory_options_are_refused(tiny, options, message):
 def test_a_folder_without_masks_is_named(tiny, tmp_path):
     views = datasets.read(tiny.root).train
     with pytest.raises(errors.DatasetError, match=r"expected masks such as train/r_000\.png"):
-        mask_folders.Precomputed(tmp_path, views)
+        mask_folders.PrecomputedMasks(tmp_path, views)
     with pytest.raises(errors.DatasetError, match="expected a folder of masks"):
-        mask_folders.Precomputed(tmp_path / "gone", views)
+        mask_folders.PrecomputedMasks(tmp_path / "gone", views)
 
 
 def test_old_masks_are_removed_if_the_backend_does_not_make_them(copied, tmp_path):

@@ -35,7 +35,7 @@ def test_it_is_the_spread_of_sampled_motions(model):
         if model.frequency:
             shifts["frequency"] = model.frequency + draw[-1]
         drawn_models.append(replace(model, covariance=None, covariance_names=(), **shifts))
-    stack = models.Stack(drawn_models)
+    stack = models.MotionStack(drawn_models)
     for tau in (0.2, 0.6):
         quat, center = models.evaluate(model, tau)
         quats, centers = stack.poses(tau)

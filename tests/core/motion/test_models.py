@@ -76,7 +76,7 @@ def test_batches_of_models_equal_single_models(tau):
 def test_far_in_the_future_twists_agree_with_keys(tau):
     rates = {"velocity": [1, 0, 0], "acceleration": [0, 1, 0]}
     twist = MotionModel("world_twist", **rates, angular_velocity=[5, 0, 0], angular_acceleration=[0, 5, 0])
-    stack = models.Stack([twist])
+    stack = models.MotionStack([twist])
     quat, displacement = models.evaluate(twist, tau)
     quats, displacements = stack.poses(tau)
     assert rotations.angle_between(quats[0], quat) < 1e-8

@@ -32,7 +32,7 @@ assert np.allclose(contact, 0) and np.allclose(rotations.quats_to_rotvecs(quats)
 assert not moves[0].any() and wheel.turns and not wheel.is_static
 ahead, behind = (models.evaluate(wheel, tau[1:] + h)[1] for h in (1e-6, -1e-6))
 assert np.allclose((ahead - behind) / 2e-6, speeds[1:], atol=1e-6)
-stack = models.Stack([models.STATIC, wheel, dataclasses.replace(wheel, angular_velocity=2 * w)])
+stack = models.MotionStack([models.STATIC, wheel, dataclasses.replace(wheel, angular_velocity=2 * w)])
 assert np.allclose(stack.poses(tau[5])[1], [np.zeros(3), moves[5], models.evaluate(wheel, 2 * tau[5])[1]])
 
 # File and edits.

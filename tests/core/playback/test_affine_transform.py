@@ -11,6 +11,7 @@ from r5dgs_core.motion import rotations
 from r5dgs_core.playback import affine_transform, residuals, scene_player
 from r5dgs_core.render import posed_scene, scene_renderer
 from r5dgs_core.scene import sh_color, spherical_harmonics
+from r5dgs_core.scene.instance import Instance
 from r5dgs_core.scene.splats import Splats
 from tests.support.scenes import make_scene
 
@@ -91,7 +92,7 @@ def test_a_placed_range_has_the_colours_that_the_renderer_gives_it(tint):
     scene = make_scene(n=200, sh_degree=3, shading=True)
     matrix, start, count = matrix_of(0.6 * TURN), 60, 120
     placed = affine_transform.place(scene, start, count, matrix, tint=tint)
-    posed = scene_renderer.pose_instances(scene, [scene_renderer.Instance(start, count, matrix)])
+    posed = posed_scene.pose_instances(scene, [Instance(start, count, matrix)])
     wanted = scene_renderer.colors(posed, scene.cameras[0]) * (1 if tint is None else np.array(tint))
     towards = placed.means - scene.cameras[0].center
     seen = sh_color.to_rgb(placed.sh.astype(np.float64), towards / np.linalg.norm(towards, axis=-1, keepdims=True))

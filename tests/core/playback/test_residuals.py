@@ -9,7 +9,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.motion import cubic_curves, rotations, se3
-from r5dgs_core.playback import group_dynamics, residuals, scene_info, scene_player
+from r5dgs_core.playback import group_dynamics, modes, residuals, scene_info, scene_player
 from r5dgs_core.scene import row_runs, scene_file
 from r5dgs_core.scene.scene import Scene
 from tests.support.scenes import T_MAX, TIMES, make_scene
@@ -138,7 +138,7 @@ def twisted() -> Scene:
     return twisting(make_scene(300, shadows=False))
 
 
-@pytest.mark.parametrize("mode", scene_player.every())
+@pytest.mark.parametrize("mode", modes.every())
 def test_all_modes_meet_at_t_max_and_agree_before_it(twisted, mode):
     scene = twisted
     assert mode in scene_player.modes(scene)
@@ -161,7 +161,7 @@ def test_bodies_of_one_twist_move_alike_in_all_modes(twisted, source):
         assert rotations.angle_between(since, own.turned_quats).max() < 2e-3
 
 
-@pytest.mark.parametrize("mode", [mode for mode in scene_player.every() if mode.startswith("rigid/")])
+@pytest.mark.parametrize("mode", [mode for mode in modes.every() if mode.startswith("rigid/")])
 def test_sources_move_every_group_rigidly_for_long(twisted, mode):
     scene = twisted
     player, t = scene_player.Player(scene, mode), T_MAX + 4.0
@@ -241,7 +241,7 @@ def test_the_first_gaussian_of_a_scene_can_represent_a_body_in_the_literal_form(
 
 def test_scenes_without_canonical_centres_lack_the_literal_form():
     scene = twisting(make_scene(60)).with_arrays(canonical_means=None)
-    assert {scene_player.split(mode)[0] for mode in scene_player.modes(scene)} == {"rigid", "hybrid", "standard"}
+    assert {modes.split(mode)[0] for mode in scene_player.modes(scene)} == {"rigid", "hybrid", "standard"}
 
 
 def test_a_mode_without_data_is_refused():

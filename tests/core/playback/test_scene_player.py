@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import cubic_curves, models, rotations
-from r5dgs_core.playback import posing, scene_player
+from r5dgs_core.playback import group_dynamics, modes, posing, scene_player
 from r5dgs_core.scene import cameras, row_runs, validation
 from tests.support.scenes import T_MAX, make_scene
 
@@ -60,7 +60,7 @@ def test_keys_at_the_knots_reproduce_playback(scene):
     """Blender's Bezier keys with handles at a third are cubic Hermite curves: `cubic_curves.evaluate` is their
     rule.
     """
-    quats, displacements = scene_player.knots(scene)
+    quats, displacements = group_dynamics.knots(scene)
     quat_slopes, slopes = scene_player.knot_slopes(scene)
     times = np.linspace(0, T_MAX, 131)
     for g in range(len(scene.groups)):
@@ -222,15 +222,15 @@ def test_frames_do_not_depend_on_earlier_frames_of_the_player(scene):
 
 
 def test_modes_have_one_spelling_and_a_default_variant(scene):
-    assert scene_player.split("rigid") == ("rigid", "fitted") == scene_player.split("rigid/fitted")
-    assert scene_player.split("rigid_paper") == ("rigid_paper", "pinned")
-    assert scene_player.split("hybrid/kabsch") == ("hybrid", "kabsch")
-    assert scene_player.split("standard") == ("standard", "")
+    assert modes.split("rigid") == ("rigid", "fitted") == modes.split("rigid/fitted")
+    assert modes.split("rigid_paper") == ("rigid_paper", "pinned")
+    assert modes.split("hybrid/kabsch") == ("hybrid", "kabsch")
+    assert modes.split("standard") == ("standard", "")
     assert scene_player.modes(scene) == ("rigid",)
-    assert len(set(scene_player.every())) == len(scene_player.every()) == 5 + 5 + 1 + 2
+    assert len(set(modes.every())) == len(modes.every()) == 5 + 5 + 1 + 2
     for mode in ("wobbly", "rigid/mean", "rigid/", "standard/fitted", "", None):
         with pytest.raises(ValueError, match="mode: expected one of"):
-            scene_player.split(mode)
+            modes.split(mode)
 
 
 def test_unknown_modes_and_times_are_refused(scene):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.playback.instance import Instance, Sky
 from r5dgs_core.protocol import answers, messages
+from r5dgs_core.scene.instance import Instance, Sky
 from tests.support import scenes
 
 CAMERA = scenes.orbit_camera(0.4)

@@ -8,6 +8,7 @@ import torch
 
 from r5dgs_core.raster import backends, compilation, rasterize, rasterizer, shade
 from r5dgs_core.raster.cpu import forward
+from r5dgs_core.render import posed_scene
 from r5dgs_core.scene import sh_color
 from r5dgs_core.scene.cameras import Camera
 from tests.support import scenes, splats
@@ -255,7 +256,7 @@ def test_without_numba_scenes_keep_their_colours(monkeypatch):
     from r5dgs_core.render import scene_renderer
 
     scene, camera = scenes.make_scene(300, sh_degree=3), scenes.orbit_camera(0.4)
-    posed = scene_renderer.pose_frame(scene, scene_player.frame(scene, 1.1))
+    posed = posed_scene.pose_frame(scene, scene_player.frame(scene, 1.1))
     fused = scene_renderer.colors(posed, camera)
     monkeypatch.setattr(backends, "MODULES", {"reference": "reference"})
     np.testing.assert_allclose(scene_renderer.colors(posed, camera), fused, atol=2e-6)

@@ -5,14 +5,14 @@ import pytest
 
 from r5dgs_core.playback import scene_player
 from r5dgs_core.raster import RasterSettings
-from r5dgs_core.render import coverage, scene_renderer
+from r5dgs_core.render import coverage, posed_scene, scene_renderer
 from tests.support import scenes
 
 
 @pytest.fixture(scope="module")
 def posed():
     scene = scenes.make_scene(n=500, objects=4, seed=3)
-    return scene, scene_renderer.pose_frame(scene, scene_player.frame(scene, 0.4))
+    return scene, posed_scene.pose_frame(scene, scene_player.frame(scene, 0.4))
 
 
 def shares(posed, groups, ranks):

@@ -9,8 +9,8 @@ from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.raster import RasterSettings, rasterize_splats
 from r5dgs_core.raster.cpu import static_layer
-from r5dgs_core.render import incremental_renderer, scene_renderer
-from r5dgs_core.render.scene_renderer import Instance
+from r5dgs_core.render import incremental_renderer, posed_scene, scene_renderer
+from r5dgs_core.scene.instance import Instance
 from tests.core.render.test_scene_renderer import group_instances, matrix
 from tests.support import scenes
 
@@ -38,7 +38,7 @@ def made(monkeypatch):
 
 def assert_shows(theatre, scene, instances, camera, sky=True):
     found = theatre.render(instances, camera, sky=incremental_renderer.Sky() if sky else None)
-    posed = scene_renderer.pose_instances(scene, instances)
+    posed = posed_scene.pose_instances(scene, instances)
     owners = np.repeat(np.arange(len(instances), dtype=np.int32), [instance.count for instance in instances])
     posed = dataclasses.replace(posed, object_ids=owners)
     expected = scene_renderer.render_frame(scene, posed, camera, background="scene" if sky else None)
@@ -139,7 +139,7 @@ def test_two_scenes_are_sorted_by_depth_in_one_picture(pair, made):
         shown = together(pair, t)
         found = theatre.render(shown, CAMERA, sky=incremental_renderer.Sky(1, world))
         parts = [
-            scene_renderer.pose_instances(scene, [dataclasses.replace(one, scene=0) for one in shown if one.scene == k])
+            posed_scene.pose_instances(scene, [dataclasses.replace(one, scene=0) for one in shown if one.scene == k])
             for k, scene in enumerate((lit, plain))
         ]
         gaussians = [scene_renderer.PosedGaussians(posed) for posed in parts]
@@ -157,9 +157,9 @@ def test_two_scenes_are_sorted_by_depth_in_one_picture(pair, made):
 
 def test_a_light_rotates_with_its_world_and_not_with_moving_objects(pair):
     lit, _, world = pair
-    still = scene_renderer.pose_instances(lit, group_instances(lit, 0.3))
+    still = posed_scene.pose_instances(lit, group_instances(lit, 0.3))
     turned = [Instance(one.start, one.count, world @ one.matrix, 0, world) for one in group_instances(lit, 0.3)]
-    found = scene_renderer.pose_instances(lit, turned)
+    found = posed_scene.pose_instances(lit, turned)
     np.testing.assert_allclose(found.shading_factor, still.shading_factor, atol=1e-6)
     assert np.abs(still.shading_factor - 1).max() > 1e-2
 
@@ -295,7 +295,7 @@ def test_depths_may_count_from_before_a_far_camera(pair):
         seen = found.alpha > 0
         np.testing.assert_allclose(found.depth[seen], plain.depth[seen] - far, atol=0.02)  # float32 at 1e4
         assert (found.depth[~seen] == 0).all() and seen.any()
-        depths = scene_renderer.pose_instances(lit, parts).means @ CAMERA.T_cam_world[2, :3] + CAMERA.T_cam_world[2, 3]
+        depths = posed_scene.pose_instances(lit, parts).means @ CAMERA.T_cam_world[2, :3] + CAMERA.T_cam_world[2, 3]
         assert depths.min() - 1e-4 < found.depth[seen].min() and found.depth[seen].max() < depths.max() + 1e-4
 
 
@@ -304,8 +304,8 @@ def test_many_ranges_give_the_picture_of_their_instances(bending, t):
     world = matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2))
     starts = [*range(0, 300, 7), *range(20, 100, 5)]
     stretches = [Instance(start, 4, world, 0, world, (0.5, 1.0, 1.0), t) for start in starts]
-    found = scene_renderer.pose_instances(bending, stretches)
-    parts = [scene_renderer.pose_instances(bending, [one]) for one in stretches]
+    found = posed_scene.pose_instances(bending, stretches)
+    parts = [posed_scene.pose_instances(bending, [one]) for one in stretches]
     for name in ("means", "quats", "log_scales", "shading_factor", "sh", "object_ids"):
         expected = np.concatenate([getattr(part, name) for part in parts])
         np.testing.assert_allclose(getattr(found, name), expected, atol=1e-6, err_msg=name)

@@ -9,9 +9,9 @@ import torch
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.raster import RasterSettings
-from r5dgs_core.render import scene_renderer
-from r5dgs_core.render.scene_renderer import Instance
+from r5dgs_core.render import posed_scene, scene_renderer
 from r5dgs_core.scene import row_runs
+from r5dgs_core.scene.instance import Instance
 from r5dgs_core.train import background
 from tests.support import scenes
 
@@ -54,12 +54,12 @@ def group_instances(scene, t):
 @pytest.mark.parametrize("t", [0.0, 0.31, scenes.T_MAX, 0.93])
 def test_instances_at_the_groups_poses_render_like_playback(scene, t):
     played = image(scene, scene_player.frame(scene, t))
-    posed = image(scene, scene_renderer.pose_instances(scene, group_instances(scene, t)))
+    posed = image(scene, posed_scene.pose_instances(scene, group_instances(scene, t)))
     np.testing.assert_allclose(posed, played, atol=TOLERANCE)
 
 
 def test_identity_instances_are_the_bind_state(scene):
-    posed = scene_renderer.pose_instances(scene, whole(scene, np.eye(4)))
+    posed = posed_scene.pose_instances(scene, whole(scene, np.eye(4)))
     np.testing.assert_array_equal(posed.means, scene.gaussians.means)
     np.testing.assert_allclose(posed.quats, scene.gaussians.quats, atol=1e-6)
     np.testing.assert_array_equal(posed.log_scales, scene.gaussians.log_scales)
@@ -73,9 +73,9 @@ def test_moving_scene_and_camera_together_changes_nothing(scene):
     moved_world = transform @ camera_world
     moved_world[:3, :3] /= 1.7
     moved = dataclasses.replace(CAMERA, T_cam_world=np.linalg.inv(moved_world))
-    still = image(unshaded, scene_renderer.pose_instances(unshaded, whole(unshaded, np.eye(4))))
+    still = image(unshaded, posed_scene.pose_instances(unshaded, whole(unshaded, np.eye(4))))
     np.testing.assert_allclose(
-        image(unshaded, scene_renderer.pose_instances(unshaded, whole(unshaded, transform)), moved),
+        image(unshaded, posed_scene.pose_instances(unshaded, whole(unshaded, transform)), moved),
         still,
         atol=TOLERANCE,
     )
@@ -86,7 +86,7 @@ def test_shapes_follow_any_linear_map(scene):
     for linear in (rng.normal(size=(3, 3)), np.diag([-1.0, 1, 1]), np.diag([2.0, 1, 0.5])):
         transform = np.eye(4)
         transform[:3, :3] = linear
-        posed = scene_renderer.pose_instances(scene, whole(scene, transform))
+        posed = posed_scene.pose_instances(scene, whole(scene, transform))
         before, after = (
             covariances(scene.gaussians.quats, scene.gaussians.log_scales),
             covariances(posed.quats, posed.log_scales),
@@ -104,8 +104,8 @@ def covariances(quats, log_scales):
 def test_a_mirrored_object_looks_mirrored(scene):
     unshaded = dataclasses.replace(scene, shading=None)
     camera = scenes.orbit_camera(0.0, 40, 40)  # looks along -x: mirroring y mirrors the picture
-    mirrored = scene_renderer.pose_instances(unshaded, whole(unshaded, np.diag([1.0, -1, 1, 1])))
-    still = scene_renderer.pose_instances(unshaded, whole(unshaded, np.eye(4)))
+    mirrored = posed_scene.pose_instances(unshaded, whole(unshaded, np.diag([1.0, -1, 1, 1])))
+    still = posed_scene.pose_instances(unshaded, whole(unshaded, np.eye(4)))
     np.testing.assert_allclose(
         image(unshaded, mirrored, camera), image(unshaded, still, camera)[:, ::-1], atol=TOLERANCE
     )
@@ -115,7 +115,7 @@ def test_an_empty_selection_leaves_the_sky(scene):
     sky = np.zeros((4, 3), np.float32)
     sky[0], sky[2] = [0.4, 0.2, 0.1], [0.3, 0.3, 0.3]  # brighter upwards
     scene = scene.with_arrays(background_sh=sky)
-    output = scene_renderer.render_frame(scene, scene_renderer.pose_instances(scene, []), CAMERA)
+    output = scene_renderer.render_frame(scene, posed_scene.pose_instances(scene, []), CAMERA)
     np.testing.assert_allclose(output.color, scene_renderer.sky(scene, CAMERA), atol=1e-6)
     assert float(output.alpha.max()) == 0
     assert scene_renderer.sky(scene, CAMERA)[0].mean() > scene_renderer.sky(scene, CAMERA)[-1].mean() + 0.01
@@ -125,10 +125,10 @@ def test_an_omitted_range_is_not_drawn_and_a_repeated_range_is_drawn_twice(scene
     body = scene.object(1)
     here, there = np.eye(4), matrix(translation=(0, 0, 0.5))
     ids = scene_renderer.render_frame(
-        scene, scene_renderer.pose_instances(scene, [Instance(body.start, body.count, here)]), CAMERA
+        scene, posed_scene.pose_instances(scene, [Instance(body.start, body.count, here)]), CAMERA
     ).ids
     assert set(np.unique(ids)) <= {-1, 1}
-    twice = scene_renderer.pose_instances(scene, [Instance(body.start, body.count, m) for m in (here, there)])
+    twice = posed_scene.pose_instances(scene, [Instance(body.start, body.count, m) for m in (here, there)])
     assert len(twice.means) == 2 * body.count
     moved = twice.means[body.count :] - twice.means[: body.count]
     np.testing.assert_allclose(moved, [[0, 0, 0.5]] * body.count, atol=1e-6)
@@ -138,7 +138,7 @@ def test_an_omitted_range_is_not_drawn_and_a_repeated_range_is_drawn_twice(scene
 def test_every_array_takes_the_same_rows(scene, cuts):
     """Ranges from each cut to the next larger one: all of the scene, with gaps, overlaps and empty ones."""
     ranges = [(a, b) for a, b in zip(cuts, cuts[1:], strict=False) if a <= b]
-    posed = scene_renderer.pose_instances(scene, [Instance(a, b - a, np.eye(4)) for a, b in ranges])
+    posed = posed_scene.pose_instances(scene, [Instance(a, b - a, np.eye(4)) for a, b in ranges])
     rows = np.concatenate([np.arange(0), *(np.arange(a, b) for a, b in ranges)])
     for name in ("means", "log_scales", "opacity_logits", "sh", "object_ids"):
         np.testing.assert_array_equal(getattr(posed, name), scene.arrays()[name][rows])
@@ -147,7 +147,7 @@ def test_every_array_takes_the_same_rows(scene, cuts):
 
 
 def test_black_and_given_backgrounds(scene):
-    nothing = scene_renderer.pose_instances(scene, [])
+    nothing = posed_scene.pose_instances(scene, [])
     assert np.all(image(scene, nothing, background=None) == 0)
     np.testing.assert_allclose(image(scene, nothing, background=np.array([0.1, 0.2, 0.3]))[5, 5], [0.1, 0.2, 0.3])
     with pytest.raises(ValueError, match="background"):
@@ -167,7 +167,7 @@ def test_black_and_given_backgrounds(scene):
 )
 def test_impossible_instances_are_refused(scene, instance, message):
     with pytest.raises(ValueError, match=message):
-        scene_renderer.pose_instances(scene, [instance])
+        posed_scene.pose_instances(scene, [instance])
 
 
 @pytest.mark.parametrize("bases", [1, 4, 9])
@@ -201,9 +201,7 @@ def test_negative_colours_and_shading_never_add_light(scene):
     factor = 1 + ((np.swapaxes(rotmats, 1, 2) @ dark.shading.light - dark.shading.light) * dark.shading.vectors).sum(-1)
     assert ((rgb < 0).any(-1) & (factor < 0)).any()
     expected = np.maximum(rgb, 0) * np.maximum(factor, 0)[:, None]
-    np.testing.assert_allclose(
-        scene_renderer.colors(scene_renderer.pose_frame(dark, frame), CAMERA), expected, atol=1e-4
-    )
+    np.testing.assert_allclose(scene_renderer.colors(posed_scene.pose_frame(dark, frame), CAMERA), expected, atol=1e-4)
 
 
 def moved_away(scene, shift):

@@ -39,8 +39,8 @@ drawn, body = incremental_renderer.Stage(scene), scene.object(2)
 for x in (0.0, 0.1, 0.2, 0.3):
     moved = np.eye(4)
     moved[0, 3] = x
-    whole = scene_renderer.Instance(0, body.start, np.eye(4))
-    drawn.render([whole, scene_renderer.Instance(body.start, body.count, moved)], scene.cameras[0])
+    whole = Instance(0, body.start, np.eye(4))
+    drawn.render([whole, Instance(body.start, body.count, moved)], scene.cameras[0])
 run.train(Path(sys.argv[2]), Path(sys.argv[3]), config.load(None, sys.argv[4:]))
 print(compilation.compiled())
 """

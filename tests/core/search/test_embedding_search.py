@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from r5dgs_core import errors
 from r5dgs_core.playback import scene_info
 from r5dgs_core.scene import scene_file, scene_json
-from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
-from r5dgs_core.scene.stored_embeddings import Meanings
+from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, Table
+from r5dgs_core.scene.stored_embeddings import StoredEmbeddings
 from r5dgs_core.search import embedding_search, object_search
 from tests.support.scenes import make_scene
 
@@ -33,11 +33,11 @@ def around(cosine, axis=0):
 def table_of(rows, thresholds, *, margin=2.0, pooling="mean", views=None):
     """Meanings of objects 1, 2, ... with an embedding each; the canonical phrase is the last axis."""
     rows = np.asarray(rows, float)
-    own = [((View("said", t),) if t is not None else ()) for t in thresholds] if views is None else views[0]
+    own = [((EmbeddingSource("said", t),) if t is not None else ()) for t in thresholds] if views is None else views[0]
     stored = rows[:, None] if views is None else views[1]
     table = Table(CARD, ("object",), tuple(own), tuple(thresholds), margin, pooling)
     ids = tuple(range(1, len(rows) + 1))
-    return Meanings(ids, rows, ("sphere",), np.eye(4)[:1], table, np.eye(4)[3:], stored)
+    return StoredEmbeddings(ids, rows, ("sphere",), np.eye(4)[:1], table, np.eye(4)[3:], stored)
 
 
 @given(cosines, st.lists(cosines, min_size=1, max_size=5), st.floats(1, 50))
@@ -95,7 +95,7 @@ def test_scores_below_thresholds_fail_and_objects_without_embedding_are_skipped(
 
 
 def test_the_best_view_or_the_mean_of_the_views_decides():
-    views = ((View("mug", 0.5), View("a blue mug", 0.5)),)
+    views = ((EmbeddingSource("mug", 0.5), EmbeddingSource("a blue mug", 0.5)),)
     stored = np.stack([around(0.9), around(0.1)])[None]
     mean = unit(*stored[0].mean(0))
     best = table_of([mean], [0.5], pooling="max", views=(views, stored))
@@ -159,7 +159,9 @@ def rich():
     bare = [item.id <= 0 for item in scene.objects]
     vectors[bare] = 0
     views = tuple(
-        () if empty else (View("obs0", 0.2, 0.1, (1, 2, 30.5, 40)), View("obs1", 0.3, 0.7, (0, 0, 9, 9)))
+        ()
+        if empty
+        else (EmbeddingSource("obs0", 0.2, 0.1, (1, 2, 30.5, 40)), EmbeddingSource("obs1", 0.3, 0.7, (0, 0, 9, 9)))
         for empty in bare
     )
     card = dataclasses.replace(CARD, kind="clip", scale=12.5)

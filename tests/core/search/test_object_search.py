@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r5dgs_core import errors
+from r5dgs_core.scene import stored_embeddings
 from r5dgs_core.search import english, object_search, prompts, spelling
 from tests.support.scenes import make_scene
 
@@ -276,7 +277,7 @@ def test_numbers_are_ignored_unless_they_are_part_of_a_name():
 
 
 def test_embeddings_match_after_labels_were_renamed():
-    meanings = object_search.Meanings((1, 2), np.eye(2), ("sphere",), np.array([[1.0, 0.0]]))
+    meanings = stored_embeddings.StoredEmbeddings((1, 2), np.eye(2), ("sphere",), np.array([[1.0, 0.0]]))
     labels = [object_search.Label(1, "planet"), object_search.Label(2, "desk")]
     assert [m.object_id for m in object_search.search_labels(labels, "spheres", meanings=meanings)] == [1]
     assert object_search.search_labels(labels[1:], "spheres", meanings=meanings) == []

@@ -196,7 +196,7 @@ def test_rows_are_valid_json_for_all_values(tmp_path):
     read = json.loads(path.read_text(), parse_constant=pytest.fail)
     assert (read["passed"], read["failed"]) == (1, 1)
     assert (read["rows"][0]["measured"], read["rows"][0]["trace_rk2"]) == ("inf", "nan")
-    assert set(read["rows"][1]) == {field.name for field in dataclasses.fields(stability.Row)}
+    assert set(read["rows"][1]) == {field.name for field in dataclasses.fields(stability.CaseResult)}
 
 
 def test_the_exit_code_follows_the_rows(monkeypatch, tmp_path, capsys):

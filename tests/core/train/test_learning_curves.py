@@ -25,7 +25,7 @@ def size(png):
 
 def write_log(folder, rows, tail=""):
     (folder / checkpoint.LOG_FILE).write_text("".join(json.dumps(row) + "\n" for row in rows) + tail)
-    return learning_curves.Curves(folder)
+    return learning_curves.LearningCurves(folder)
 
 
 def test_each_measured_curve_has_a_panel():

@@ -7,8 +7,9 @@ import pytest
 
 from r5dgs_core.editing import point_edits
 from r5dgs_core.editing.point_edits import PointEdit
-from r5dgs_core.render import scene_renderer
+from r5dgs_core.render import posed_scene, scene_renderer
 from r5dgs_core.scene import scene_file
+from r5dgs_core.scene.instance import Instance
 from tests.core.worker.test_server import CAMERA, CAMERA_JSON, load, talk
 from tests.support import scenes
 
@@ -58,7 +59,7 @@ def test_edited_points_are_drawn_with_unedited_rows(path, scene):
     whole = {"scene": 0, "start": 100, "count": 50, "matrix": EYE}
     extended, (place,) = point_edits.extend(scene, [edit])
     rows = ((100, 50, np.eye(4)), (place.start, place.count, place.matrix))
-    pose = scene_renderer.pose_instances(extended, [scene_renderer.Instance(*one) for one in rows])
+    pose = posed_scene.pose_instances(extended, [Instance(*one) for one in rows])
     expected = scene_renderer.render_frame(scene, pose, CAMERA, background=None).color
     *_, (header, arrays) = talk(load(path), points("a", a=edit), picture(whole, entry("a")))
     assert header["ok"], header

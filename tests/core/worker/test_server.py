@@ -17,8 +17,9 @@ from r5dgs_core.language.encoders import encoder_base, registry
 from r5dgs_core.playback import scene_player
 from r5dgs_core.protocol import messages
 from r5dgs_core.raster import compilation
-from r5dgs_core.render import incremental_renderer, scene_renderer, warm_up
+from r5dgs_core.render import incremental_renderer, posed_scene, scene_renderer, warm_up
 from r5dgs_core.scene import scene_file
+from r5dgs_core.scene.instance import Instance
 from r5dgs_core.worker import server as worker_server
 from tests.core.render.test_scene_renderer import matrix
 from tests.support import encoder_folders, scenes
@@ -85,7 +86,7 @@ def test_instances_are_moved_and_other_gaussians_are_not_drawn(path):
     body = scene.object(2)
     matrix = np.eye(4)
     matrix[:3, 3] = [0.2, 0, 0.3]
-    posed = scene_renderer.pose_instances(scene, [scene_renderer.Instance(body.start, body.count, matrix)])
+    posed = posed_scene.pose_instances(scene, [Instance(body.start, body.count, matrix)])
     expected = scene_renderer.render_frame(scene, posed, CAMERA, background=None)
     instances = [{"start": body.start, "count": body.count, "matrix": matrix.tolist()}]
     request = {"command": "render", "camera": CAMERA_JSON, "instances": instances}
@@ -103,7 +104,7 @@ def test_scenes_loaded_together_are_in_one_picture(path, tmp_path):
     request["sky"] = {"scene": 1, "matrix": world.tolist()}
     both = [scene_file.read(path), scene_file.read(other)]
     expected = incremental_renderer.Stage(both).render(
-        [scene_renderer.Instance(20, 60, world, 1, world, (0.5, 1.0, 2.0)), scene_renderer.Instance(0, 200, np.eye(4))],
+        [Instance(20, 60, world, 1, world, (0.5, 1.0, 2.0)), Instance(0, 200, np.eye(4))],
         CAMERA,
         sky=incremental_renderer.Sky(1, world),
     )
@@ -237,7 +238,7 @@ def test_an_announced_warm_up_that_fails_reports_the_reason(monkeypatch, capsys,
     monkeypatch.setattr(warm_up, "warm_up", fail)
     monkeypatch.setattr(compilation, "compiled", lambda: compiled)
     events = []
-    warm = worker_server.Warming(events.append)
+    warm = worker_server.WarmUpThread(events.append)
     warm.start()
     warm.wait()
     assert not warm.busy and "no space left" in capsys.readouterr().err

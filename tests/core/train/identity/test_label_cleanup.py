@@ -71,14 +71,14 @@ def test_strong_votes_are_never_overruled():
     going, moving = truth, np.ones(4, bool)
     found, changes = label_cleanup.clean(weights, said, points, opacities, going, moving)
     np.testing.assert_array_equal(found, said)
-    assert changes == label_cleanup.Changes(gaussians=len(truth))
+    assert changes == label_cleanup.LabelChanges(gaussians=len(truth))
 
 
 def test_objects_that_touch_keep_their_border_and_thin_ones_survive():
     points, truth, opacities = scene()
     found, changes = label_cleanup.clean(votes_for(truth, 0.7), truth, points, opacities)
     np.testing.assert_array_equal(found, truth)
-    assert changes == label_cleanup.Changes(gaussians=len(truth))
+    assert changes == label_cleanup.LabelChanges(gaussians=len(truth))
 
 
 def test_masks_that_sometimes_miss_an_object_do_not_shrink_it():
@@ -100,7 +100,7 @@ def test_masks_that_contradict_each_other_change_nothing():
     weights[np.arange(len(truth)), truth] += 0.2 * PIXELS
     found, changes = label_cleanup.clean(weights, truth, points, opacities, truth, np.ones(4, bool))
     np.testing.assert_array_equal(found, truth)
-    assert changes == label_cleanup.Changes(gaussians=len(truth))
+    assert changes == label_cleanup.LabelChanges(gaussians=len(truth))
 
 
 def test_unseen_gaussians_take_the_surrounding_label():

@@ -11,7 +11,7 @@ from r5dgs_core.train import train_views
 from r5dgs_core.train.initialization import background_images, initialize, plane_sweep, triangulation
 from tests.support import scenes
 
-NO_PLACES = triangulation.Places(
+NO_PLACES = triangulation.ObjectPositions(
     np.zeros(0, np.int64),
     np.zeros((0, 1, 3)),
     np.zeros((0, 1), bool),

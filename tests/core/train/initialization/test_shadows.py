@@ -28,7 +28,9 @@ def shadowed_views(light, darkness=0.4, radius=0.25):
             mask = np.zeros(image.shape[:2], np.uint16)
             seen.append(train_views.TrainView(f"v{k}_{s}", camera, float(t), image.astype(np.uint8), mask, None))
     ones = np.ones((1, 7))
-    places = triangulation.Places(np.array([1]), path[None], ones > 0, ones, np.array([radius]), ones, ones > 0)
+    places = triangulation.ObjectPositions(
+        np.array([1]), path[None], ones > 0, ones, np.array([radius]), ones, ones > 0
+    )
     return seen, places
 
 

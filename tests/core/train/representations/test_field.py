@@ -14,7 +14,7 @@ from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError
 from r5dgs_core.model.trd import MotionState
 from r5dgs_core.motion import rotations
-from r5dgs_core.playback import residuals, scene_player
+from r5dgs_core.playback import modes, residuals, scene_player
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import validation
 from r5dgs_core.train import checkpoint, run
@@ -172,7 +172,7 @@ def test_the_baked_scene_is_valid_and_renders_like_the_trained_state(made, scene
     trainer = Trainer(datasets.read(made.dataset_root), made.config)
     trainer.restore(checkpoint.load(made.folder))
     assert scene.t_max == pytest.approx(0.7)
-    assert {mode.partition("/")[0] for mode in scene_player.modes(scene)} == set(scene_player.MODES)
+    assert {mode.partition("/")[0] for mode in scene_player.modes(scene)} == set(modes.MODES)
     assert [g.role for g in scene.groups][:3] == ["pinned", "body", "body"] and scene.residuals is not None
     pairs = zip(trainer.dataset.train, trainer.views, strict=True)
     for view, trained_view in [pair for pair in pairs if pair[0].t < scene.t_max][::5]:

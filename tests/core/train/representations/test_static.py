@@ -30,7 +30,7 @@ from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
 from r5dgs_core.train import learning_curves
 from tests.support import tiny_datasets
-learning_curves.Curves.update = lambda self, *, finished=False: None
+learning_curves.LearningCurves.update = lambda self, *, finished=False: None
 data, folder = Path(sys.argv[1]), Path(sys.argv[2])
 run.train(data, folder / "run", tiny_datasets.settings("train.iterations=30", *sys.argv[3:]))
 bake.run_bake(folder / "run", folder / "still.r5dgs")

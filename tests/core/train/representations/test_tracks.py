@@ -32,7 +32,7 @@ def make(measured, absent=None, first=3, path=None):
     count = len(TIMES)
     tracks = initialize.FirstTracks(TIMES, np.zeros((2, 3)), np.zeros((2, count, 3)), np.array([1]), None, np.zeros(3))
     centers = np.asarray(path if path is not None else [truth(t)[0] for t in TIMES])[None]
-    places = triangulation.Places(
+    places = triangulation.ObjectPositions(
         np.array([1]),
         centers,
         np.array([measured], bool),
@@ -42,7 +42,7 @@ def make(measured, absent=None, first=3, path=None):
         np.array([measured], bool),
     )
     gone = np.zeros((1, count), bool) if absent is None else np.array([absent], bool)
-    known = evidence.Evidence(np.ones((1, count)), np.tile(np.eye(3), (1, count, 1, 1)), gone)
+    known = evidence.BodyEvidence(np.ones((1, count)), np.tile(np.eye(3), (1, count, 1, 1)), gone)
     start = SimpleNamespace(tracks=tracks, places=places, evidence=known, first_time=first)
     return tracks_representation.TracksRepresentation(start, config.Config())
 
