@@ -404,6 +404,12 @@ def test_malformed_models_are_refused_by_the_name_of_the_key(change, message):
         MotionModel.from_dict(data)
 
 
+@pytest.mark.parametrize("data", [{}, {"radius": 1.0}, "static", None])
+def test_models_without_a_kind_are_refused(data):
+    with pytest.raises(ValueError, match="'kind'"):
+        MotionModel.from_dict(data)
+
+
 def test_times_before_t_max_are_refused():
     with pytest.raises(ValueError, match="tau"):
         models.evaluate(MotionModel(), -0.1)

@@ -117,6 +117,13 @@ def test_an_axis_can_be_reversed():
         np.testing.assert_allclose(rotation_centers.with_axis(model, -along).angular_velocity, -along, atol=1e-12)
 
 
+def test_the_axis_of_a_spin_from_rest_can_be_changed():
+    model = MotionModel("world_twist", velocity=[0.4, 0.1, 0.3], angular_acceleration=[0, 0, 2.0])
+    turned = rotation_centers.with_axis(model, np.array([1.0, 0, 0]))
+    np.testing.assert_allclose(turned.angular_acceleration, [2.0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(turned.velocity, [0.3, 0.1, -0.4], atol=1e-12)
+
+
 def test_motions_without_center_or_axis_raise():
     without = (
         MotionModel("static"),

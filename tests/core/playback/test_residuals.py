@@ -88,6 +88,10 @@ def test_residuals_change_the_bind_state_before_the_group_moves_it(bending, k):
     np.testing.assert_allclose(
         frame.log_scales[row], bending.gaussians.log_scales[row] + bending.residuals.log_scales[i, k]
     )
+    light = bending.shading.light
+    change = rotations.rotate(rotations.conjugate(rotations.multiply(q, bending.residuals.quats[i, k])), light) - light
+    wanted = max(1 + change @ bending.shading.vectors[row], 0)
+    assert frame.shading_factor[row] == pytest.approx(wanted, abs=1e-5)
 
 
 def test_residuals_are_smooth_between_knots_and_gone_at_t_max(bending):
@@ -181,6 +185,19 @@ def loose(scene: Scene, rows: np.ndarray, size: float) -> Scene:
     return scene.with_arrays(
         residual_rows=rows, residual_offsets=offsets, residual_quats=quats, residual_log_scales=0 * offsets
     )
+
+
+@pytest.mark.parametrize("mode", ["hybrid", "standard", "rigid_paper"])
+def test_an_origin_only_shifts_the_centres_past_t_max(twisted, mode):
+    player = scene_player.Player(loose(twisted, np.arange(0, 300, 7, dtype=np.int32), 0.5), mode)
+    plain, origin = player.frame(1.1), np.array([3.0, -40.0, 7.5])
+    np.testing.assert_allclose(player.frame(1.1, origin).means + origin, plain.means, atol=1e-5)
+
+
+def test_any_residual_of_a_pinned_gaussian_is_unexplained(twisted):
+    pinned, body = (np.flatnonzero(twisted.gaussians.motion_ids == g).astype(np.int32)[:3] for g in (0, 1))
+    scene = loose(twisted, np.sort(np.concatenate([pinned, body])), 1e-3)
+    np.testing.assert_array_equal(residuals.unexplained(scene), pinned)
 
 
 @pytest.mark.parametrize("variant", ["", "/least_squares"])
