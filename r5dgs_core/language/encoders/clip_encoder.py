@@ -13,7 +13,6 @@ from ...scene.lookup_table import EncoderCard
 from . import encoder_base
 
 TEMPLATES = ("{}", "a photo of a {}", "a render of a {}")
-_BATCH = 16
 
 
 def detect(folder: Path) -> bool:
@@ -26,7 +25,7 @@ def load(folder: Path) -> ClipEncoder:
     return ClipEncoder(folder, str(encoder_base.model_type(folder)))
 
 
-class ClipEncoder:
+class ClipEncoder(encoder_base.BatchEncoder):
     """CLIP or SigLIP model of a folder.
 
     Args:
@@ -60,14 +59,6 @@ class ClipEncoder:
         dimension = self._texts(["object"]).shape[1]
         digest = encoder_base.digest_of(paths)
         self.card = EncoderCard(kind, folder.name, digest, dimension, TEMPLATES, encoder_base.SCALE)
-
-    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
-        """Implement `encoder_base.Encoder`."""
-        return encoder_base.in_batches(texts, _BATCH, self._texts, self.card.dimension)
-
-    def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
-        """Implement `encoder_base.Encoder`."""
-        return encoder_base.in_batches(pictures, _BATCH, self._images, self.card.dimension)
 
     def _texts(self, texts: Sequence[str]) -> np.ndarray:
         tokens = self._tokenizer(

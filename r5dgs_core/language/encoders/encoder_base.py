@@ -41,6 +41,33 @@ class Encoder(Protocol):
         ...
 
 
+class BatchEncoder:
+    """Base class of an `Encoder` that embeds in batches; subclasses set ``card`` and embed one batch.
+
+    Attributes:
+        batch_size: Maximum number of texts or images per batch.
+    """
+
+    card: EncoderCard
+    batch_size = 16
+
+    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
+        """Implement `Encoder`."""
+        return in_batches(texts, self.batch_size, self._texts, self.card.dimension)
+
+    def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
+        """Implement `Encoder`."""
+        return in_batches(pictures, self.batch_size, self._images, self.card.dimension)
+
+    def _texts(self, texts: Sequence[str]) -> np.ndarray:
+        """Embed one batch of texts. [n, D]"""
+        raise NotImplementedError
+
+    def _images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
+        """Embed one batch of images. [n, D]"""
+        raise NotImplementedError
+
+
 def embed_phrases(encoder: Encoder, phrases: Sequence[str]) -> np.ndarray:
     """Embed phrases, each as the mean over the encoder's templates. [n, D] float32, unit"""
     if not phrases:

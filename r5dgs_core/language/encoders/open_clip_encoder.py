@@ -12,7 +12,6 @@ from ...scene.lookup_table import EncoderCard
 from . import encoder_base
 from .clip_encoder import TEMPLATES
 
-_BATCH = 16
 CONFIG = "open_clip_config.json"
 
 
@@ -26,7 +25,7 @@ def load(folder: Path) -> OpenClipEncoder:
     return OpenClipEncoder(folder)
 
 
-class OpenClipEncoder:
+class OpenClipEncoder(encoder_base.BatchEncoder):
     """Model of a folder with open_clip_config.json and open_clip_model.safetensors.
 
     Args:
@@ -52,14 +51,6 @@ class OpenClipEncoder:
         self._model.eval()
         digest = encoder_base.digest_of(paths)
         self.card = EncoderCard("open_clip", folder.name, digest, dimension, TEMPLATES, encoder_base.SCALE)
-
-    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
-        """Implement `encoder_base.Encoder`."""
-        return encoder_base.in_batches(texts, _BATCH, self._texts, self.card.dimension)
-
-    def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
-        """Implement `encoder_base.Encoder`."""
-        return encoder_base.in_batches(pictures, _BATCH, self._images, self.card.dimension)
 
     def _texts(self, texts: Sequence[str]) -> np.ndarray:
         with self._torch.no_grad():

@@ -14,7 +14,6 @@ from . import encoder_base
 # Sentence models are trained on pairs of captions, so templates that are sentences separate objects better. Templates
 # that mention a person or a hand would match persons and hands in every scene.
 TEMPLATES = ("a photo of a {}", "A {} is in the picture.", "looking at a {}")
-_BATCH = 64
 _TYPES = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta", "albert", "electra", "deberta-v2", "modernbert")
 _POOLING = Path("1_Pooling") / "config.json"
 
@@ -29,12 +28,14 @@ def load(folder: Path) -> SentenceEncoder:
     return SentenceEncoder(folder)
 
 
-class SentenceEncoder:
+class SentenceEncoder(encoder_base.BatchEncoder):
     """Sentence model of a folder: the mean of the last layer's tokens, or its first token, as configured there.
 
     Args:
         folder: Folder with config.json, model.safetensors and a tokenizer.
     """
+
+    batch_size = 64
 
     def __init__(self, folder: Path):
         with extras.required("encoder", "encoders"):
@@ -59,10 +60,6 @@ class SentenceEncoder:
         dimension = int(self._model.config.hidden_size)
         name = folder.parent.name if folder.name == "model" else folder.name
         self.card = EncoderCard("text", name, encoder_base.digest_of(paths), dimension, TEMPLATES, encoder_base.SCALE)
-
-    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
-        """Implement `encoder_base.Encoder`."""
-        return encoder_base.in_batches(texts, _BATCH, self._texts, self.card.dimension)
 
     def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
         """Raise `BackendError`, as sentence models embed text only."""
