@@ -43,3 +43,7 @@ def _explain(error: BaseException, args: argparse.Namespace) -> ExitStatus:
         remedy = "; check the path, its permissions and the free disk space" if isinstance(error, OSError) else ""
         print(f"r5dgs: {terminal.printable(str(error)) or 'stopped'}{remedy}", file=sys.stderr)
     return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+import r5dgs_core
 from r5dgs_core import __version__, atomic_files, errors, progress
 from r5dgs_core.bench import variants
 from r5dgs_core.cli import inputs, main, parser, registry
@@ -530,3 +531,9 @@ def test_steps_and_seed_reach_the_run_and_threads_leave_its_bits(tiny, tmp_path)
     settled = checkpoint.open_run(folder).config.train
     assert (settled.iterations, settled.seed, states[0].iteration) == (4, 7, 4)
     assert all((states[0].tensors[name] == tensor).all() for name, tensor in states[1].tensors.items())
+
+
+def test_the_module_runs_as_a_program():
+    command = [sys.executable, "-m", "r5dgs_core.cli.main", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert r5dgs_core.__version__ in done.stdout
