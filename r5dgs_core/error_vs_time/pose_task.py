@@ -266,7 +266,7 @@ def _band(
     row = Row(
         task="poses",
         mode="rigid/fitted",
-        method="95 % band",
+        method="outside 95 % band",
         setting=CHOSEN,
         error_kind="outside_band",
         error=1 - inside / count,

@@ -285,7 +285,7 @@ def test_the_report_is_written_for_programs_and_people(report, field, tmp_path):
     text = by_name["report.md"].read_text()
     for word in (
         "Magnus-4",
-        "95 % band",
+        "outside 95 % band",
         "rigid/least_squares",
         "true poses",
         "PSNR",
