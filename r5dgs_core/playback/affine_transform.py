@@ -191,7 +191,7 @@ def is_similarity(linear: np.ndarray) -> bool:
 
 
 def nearest_rotation(linear: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to a linear map. A mirror is undone along the first axis before the map.
+    """Return the rotation nearest to a linear map. If the map mirrors, its first column changes sign beforehand.
 
     [..., 3, 3] -> [..., 3, 3]
     """
