@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core.scene.instance import Instance
-from ..scene import evaluated_points, loaded_scenes, point_clouds, timeline
+from ..scene import evaluated_points, loaded_scenes, point_clouds, retiming, timeline
 
 FLAT = 1e-6  # minimum ratio of smallest to largest scale
 
@@ -68,7 +68,9 @@ def instances(
             own = np.array(obj.evaluated_get(depsgraph).matrix_world, np.float64)
             world = matrix @ np.linalg.solve(own, world)
         tint, number = tuple(obj.r5dgs_look.tint), scenes.index(collection)
-        t = timeline.of_collection(collection).time(frame) if collection.r5dgs_exact.enabled else None
+        t = None
+        if collection.r5dgs_exact.enabled:
+            t = timeline.of_collection(collection).time(retiming.source_frame(obj, frame))
         edit = evaluated_points.of(obj, depsgraph, collection.r5dgs.gaussians).edit if edits else None
         count = obj.r5dgs.count if edit is None else len(edit.points.rows)
         t = None if edit is not None and edit.bent else t

@@ -16,7 +16,15 @@ from ...r5dgs_core.scene import cameras, scene_file
 from ...r5dgs_core.scene.scene import Scene, SceneObject
 from ..engine import render_request, visible_clouds
 from ..motion import physics
-from ..scene import evaluated_points, loaded_scenes, object_names, object_tint, timeline
+from ..scene import (
+    evaluated_points,
+    loaded_scenes,
+    object_names,
+    object_tint,
+    point_clouds,
+    retiming,
+    timeline,
+)
 from ..ui import plural
 from ..ui.stepwise_operator import Outcome, Step, Steps
 from . import frame_range
@@ -127,6 +135,9 @@ def edited_steps(
     pieces = [piece for member in members for piece in _pieces(member, extended, placed.get(id(member)))]
     result, notes = edited_scene.edit(extended, pieces, when, _table(collection, source, members, names))
     notes += _lost_points(members, source, extended)
+    retimed = [one.cloud.name for one in members if _bends_retimed(one.cloud)]
+    if retimed:
+        notes.append(f"{', '.join(retimed)}: retimed; the motion of single Gaussians keeps its original times")
     lost = _moving_before(members, before, TOLERANCE * source.extent, source.extent)
     if lost:
         notes.append(
@@ -136,6 +147,12 @@ def edited_steps(
     if not _rests(collection):
         notes.append("The root was moved; positions in the file are relative to the root")
     return EditedScene(result, notes, len(when) + 1)
+
+
+def _bends_retimed(cloud: bpy.types.Object) -> bool:
+    """True if a cloud has points that bend, and is retimed."""
+    bound = point_clouds.attribute(cloud.data, point_clouds.BIND + "position", "FLOAT_VECTOR")
+    return bound is not None and retiming.strip_of(cloud.parent) is not None
 
 
 def _lost_points(members: list[_Member], source: Scene, extended: Scene) -> list[str]:

@@ -18,7 +18,7 @@ from ...r5dgs_core.playback.residuals import Residuals
 from ...r5dgs_core.scene import scene_file
 from ...r5dgs_core.scene.scene import Scene
 from ..engine import render_request
-from ..scene import file_cache, loaded_scenes, timeline
+from ..scene import file_cache, loaded_scenes, retiming, timeline
 from . import exact_points
 from .exact_points import File
 
@@ -116,10 +116,10 @@ def apply(collection: bpy.types.Collection, frame: float) -> None:
         SceneFileError: The scene's file cannot be read.
     """
     file = _file_of(collection)
-    t = timeline.of_collection(collection).time(frame)
-    for cloud in dict.fromkeys(obj.data for obj in loaded_scenes.members(collection, "CLOUD")):
+    times = timeline.of_collection(collection)
+    for cloud, obj in {obj.data: obj for obj in reversed(loaded_scenes.members(collection, "CLOUD"))}.items():
         if cloud.library is None:
-            exact_points.write(cloud, file, t)
+            exact_points.write(cloud, file, times.time(retiming.source_frame(obj, frame)))
 
 
 def _exact_scenes() -> list[bpy.types.Collection]:

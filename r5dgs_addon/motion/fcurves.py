@@ -236,7 +236,9 @@ def _restore(curve: bpy.types.FCurve, before: KeyArrays, keep: int) -> None:
 
 
 def _stretch(strip: bpy.types.NlaStrip) -> None:
-    """Extend an NLA strip to its whole action."""
+    """Extend an NLA strip to its whole action, unless it is a retiming, which covers all frames."""
+    if strip.use_animated_time:
+        return
     last = max(
         (point.co[0] for curve in Place(strip.action, compat.slot_of(strip)).curves().values()
          for point in list(curve.keyframe_points)[-1:]),

@@ -5,7 +5,7 @@ import bpy
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import models
 from ..motion import confidence_tubes, curve_place, duplicate_delete, physics, pivot
-from ..scene import loaded_scenes
+from ..scene import loaded_scenes, retiming
 from ..ui import status_bar
 from . import sidebar
 
@@ -48,6 +48,26 @@ class R5DGS_PT_change_motion(sidebar.Sidebar, bpy.types.Panel):
         column.operator("r5dgs.replace_motion", icon="PASTEDOWN")
         column.operator("r5dgs.duplicate_object", icon="DUPLICATE")
         column.operator("r5dgs.delete_object", icon="TRASH")
+
+
+class R5DGS_PT_retime(sidebar.WithScene, bpy.types.Panel):
+    """Retiming of the selected objects or of the scene."""
+
+    bl_idname = "R5DGS_PT_retime"
+    bl_parent_id = R5DGS_PT_motion.bl_idname
+    bl_label = "Retime"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context):
+        layout = self.layout
+        anchor = duplicate_delete.anchor_of(context.view_layer.objects.active)
+        strip = retiming.strip_of(anchor)
+        if strip is not None:
+            shown = retiming.source_frame(anchor, context.scene.frame_current_final)
+            layout.label(text=f"{anchor.name} shows frame {shown:.4g}", icon="TIME")
+        for which, text in (("SELECTED", "Retime Selected"), ("SCENE", "Retime Scene")):
+            button = layout.operator_menu_enum("r5dgs.retime", "kind", text=text, icon="MOD_TIME")
+            button.which = which
 
 
 class R5DGS_PT_all_motions(sidebar.WithScene, bpy.types.Panel):
@@ -126,4 +146,4 @@ def _scene(layout, collection) -> None:
         status_bar.wrapped(layout, bpy.context, exact.problem, "ERROR")
 
 
-CLASSES = (R5DGS_PT_motion, R5DGS_PT_change_motion, R5DGS_PT_all_motions)
+CLASSES = (R5DGS_PT_motion, R5DGS_PT_change_motion, R5DGS_PT_retime, R5DGS_PT_all_motions)

@@ -52,7 +52,9 @@ class Layout:
         return _SetOnly({p.identifier for p in properties})
 
     def operator_menu_enum(self, idname, name, **_):
-        setattr(self.operator(idname), name, None)
+        made = self.operator(idname)
+        setattr(made, name, None)
+        return made
 
 
 class _SetOnly:
