@@ -2,7 +2,7 @@
 
 from . import panels, preferences
 from .clean_up import criteria, overlay
-from .engine import engine, live_preview, render_notes, render_stats
+from .engine import engine, live_preview, mesh_merge, render_notes, render_stats
 from .language import prompt_state
 from .motion import event_markers, exact_mode, extrapolate, motion_fields, pivot
 from .scene import click_select, evaluated_points, object_names, object_tint, properties, relink
@@ -23,6 +23,7 @@ MODULES = (
     preferences,
     render_stats,
     render_notes,
+    mesh_merge,
     engine,
     viewport_splats,
     criteria,

@@ -195,3 +195,58 @@ def panels_of_all_engines() -> list[type]:
     panels = [p for p in bpy.types.Panel.__subclasses__() if "BLENDER_RENDER" in getattr(p, "COMPAT_ENGINES", ())]
     words = ("simplify", "freestyle", "gpencil", "grease_pencil")
     return [panel for panel in panels if not any(word in panel.__name__.lower() for word in words)]
+
+
+# Blender 4.2 to 4.5 call the new EEVEE differently.
+EEVEE = "BLENDER_EEVEE_NEXT" if bpy.app.version < (5, 0) else "BLENDER_EEVEE"
+
+
+def compositor(scene: bpy.types.Scene) -> bpy.types.NodeTree | None:
+    """Compositor of a scene, or None. From 5.0 on, it is a node group."""
+    if "compositing_node_group" in scene.bl_rna.properties:
+        return scene.compositing_node_group
+    return scene.node_tree if scene.use_nodes else None
+
+
+def make_compositor(scene: bpy.types.Scene) -> bpy.types.NodeTree:
+    """Compositor of a scene, created if there is none."""
+    found = compositor(scene)
+    if found is not None:
+        return found
+    if "compositing_node_group" not in scene.bl_rna.properties:
+        scene.use_nodes = True
+        return scene.node_tree
+    tree = scene.compositing_node_group = bpy.data.node_groups.new(f"{scene.name} Compositor", "CompositorNodeTree")
+    tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    return tree
+
+
+def compositor_output(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
+    """Socket of the picture that a compositor writes; its node is created if there is none."""
+    kind = "NodeGroupOutput" if "node_tree" not in bpy.types.Scene.bl_rna.properties else "CompositorNodeComposite"
+    node = next((node for node in tree.nodes if node.bl_idname == kind), None) or tree.nodes.new(kind)
+    return node.inputs[0]
+
+
+def set_alpha(tree: bpy.types.NodeTree, mode: str, image, alpha) -> bpy.types.NodeSocket:
+    """Add a *Set Alpha* node and return its output. ``mode``: APPLY or REPLACE_ALPHA; ``alpha``: None for 0."""
+    node = tree.nodes.new("CompositorNodeSetAlpha")
+    if hasattr(node, "mode"):
+        node.mode = mode
+    else:  # from 5.0 on
+        node.inputs["Type"].default_value = {"APPLY": "Apply Mask", "REPLACE_ALPHA": "Replace Alpha"}[mode]
+    tree.links.new(image, node.inputs["Image"])
+    if alpha is None:
+        node.inputs["Alpha"].default_value = 0.0
+    else:
+        tree.links.new(alpha, node.inputs["Alpha"])
+    return node.outputs[0]
+
+
+def alpha_over(tree: bpy.types.NodeTree, background, foreground) -> bpy.types.NodeSocket:
+    """Add an *Alpha Over* node for premultiplied colours; returns its output."""
+    node = tree.nodes.new("CompositorNodeAlphaOver")
+    pictures = [socket for socket in node.inputs if socket.type == "RGBA"]  # background first, under changing names
+    tree.links.new(background, pictures[0])
+    tree.links.new(foreground, pictures[1])
+    return node.outputs[0]

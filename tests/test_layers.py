@@ -125,7 +125,7 @@ LATE_MODULES = {
     "api",
     *("cli.inputs", "cli.options", "cli.pictures", *(f"cli.commands.{name}" for name in COMMANDS)),
     *("check", "check.run", "stability.training"),
-    *("worker.server", "worker.warming"),
+    *("worker.further_layers", "worker.server", "worker.warming"),
 }
 # Further modules of the core, and what each may import inside functions.
 LATE_IMPORTS = {
@@ -139,7 +139,9 @@ LATE_IMPORTS = {
         *("raster.cpu.sky", "raster.cpu.static_layer"),
     },
     # scipy is slow to import.
-    "render.warm_up": {"render.segment_weights"},
+    "render.warm_up": {
+        *("render.front_layer", "render.mesh_depths", "render.posed_scene", "render.segment_weights"),
+    },
     # The stability table is listed without torch.
     "stability.loading": {"raster", "render.warm_up"},
     # OpenImageIO is needed for images alone, not for words.

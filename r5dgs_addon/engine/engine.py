@@ -14,7 +14,17 @@ from ..color import display_to_linear, inverse_loss, view_transform
 from ..scene import loaded_scenes, render_settings
 from ..ui import plural
 from ..worker import jobs
-from . import cryptomatte, render_notes, render_passes, render_request, stereo, view_cameras, viewport
+from . import (
+    cryptomatte,
+    mesh_merge,
+    render_notes,
+    render_passes,
+    render_request,
+    stereo,
+    view_cameras,
+    viewport,
+    visible_meshes,
+)
 
 ENGINE = "R5DGS"
 LOOK_S = 0.005  # polling interval of the worker and of the user's request to stop
@@ -34,7 +44,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
 
     def update_render_passes(self, scene, renderlayer):
         """Register the passes with the compositor."""
-        for one in render_passes.of_layer(renderlayer):
+        for one in render_passes.of_layer(renderlayer, mesh_merge.of(scene) is not None):
             self.register_pass(scene, renderlayer, one.name, len(one.channels), one.channels, one.kind)
 
     def render(self, depsgraph):
@@ -76,13 +86,16 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
                 f"R5DGS: colors are not as trained with {', '.join(objections)}; press 'Show Colors as "
                 "Trained' in the render properties",
             )
-        passes, transparent = render_passes.of_layer(layer), scene.render.film_transparent
+        merged, transparent = mesh_merge.of(scene) is not None, scene.render.film_transparent
+        passes = render_passes.of_layer(layer, merged)
         mattes = cryptomatte.pass_names(layer)
         seen = render_request.shown(depsgraph, functools.partial(view_cameras.of_camera, depsgraph, eye=eye))
         render_notes.report(self, render_notes.of(scene, depsgraph))
         if seen.scenes:
             sky = render_settings.of(scene).sky and not transparent
             steps = render_request.steps(seen, render_passes.wanted(passes, transparent), sky)
+            if merged:
+                steps[-1][-1]["meshes"] = visible_meshes.of(depsgraph).to_json()
             if mattes:
                 steps[-1][-1]["coverage"] = cryptomatte.request(seen, len(mattes))
             arrays = self._ask(steps)

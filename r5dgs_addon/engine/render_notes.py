@@ -4,7 +4,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..scene import evaluated_points, loaded_scenes
-from . import visible_clouds
+from . import mesh_merge, visible_clouds
 
 _reported: set[str] = set()  # since the start of the render; an animation is one render
 
@@ -25,6 +25,7 @@ def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> 
     held = sorted({obj.name for obj in others if visible_clouds.is_held_out(obj, None, depsgraph)})
     if held:
         notes.append(f"{', '.join(held)}: hold-outs other than clouds do not cut Gaussians; merge them by depth")
+    notes += mesh_merge.notes(scene)
     return notes + [note for one in loaded_scenes.shown(scene) for note in evaluated_points.notes(one)]
 
 

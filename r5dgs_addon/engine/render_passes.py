@@ -35,12 +35,18 @@ class Pass:
 
 COMBINED = Pass("Combined", "RGBA", "COLOR")
 DEPTH = Pass("Depth", "Z", "VALUE", "depth")
+FRONT = Pass("In Front of Meshes", "RGBA", "COLOR", "front")  # alpha is the visible part of the meshes behind
 INDEX = Pass(compat.OBJECT_INDEX, "X", "VALUE", "owners")
 
 
-def of_layer(view_layer: bpy.types.ViewLayer) -> list[Pass]:
-    """Passes of a view layer, *Combined* first."""
-    found = [COMBINED]
+def of_layer(view_layer: bpy.types.ViewLayer, merged: bool) -> list[Pass]:
+    """Passes of a view layer, *Combined* first.
+
+    Args:
+        view_layer: The view layer.
+        merged: True if meshes are merged with the picture, see `mesh_merge`.
+    """
+    found = [COMBINED, FRONT] if merged else [COMBINED]
     if view_layer.use_pass_z:
         found.append(DEPTH)
     if view_layer.use_pass_object_index:
@@ -51,7 +57,7 @@ def of_layer(view_layer: bpy.types.ViewLayer) -> list[Pass]:
 
 def wanted(passes: Sequence[Pass], transparent: bool) -> tuple[str, ...]:
     """Names of the arrays to request from the worker in addition to the colour."""
-    names = [one.want for one in passes if one.want]
+    names = [one.want for one in passes if one.want and one != FRONT]
     return (*names, "alpha") if transparent or DEPTH in passes else tuple(names)
 
 
@@ -76,6 +82,9 @@ def pixels(
     """
     if one == COMBINED:
         return display_to_linear.scene_linear(arrays["color"], alpha(arrays, transparent), inverse)
+    if one == FRONT:
+        front = display_to_linear.scene_linear(arrays["front"][..., :3], arrays["front"][..., 3], inverse)
+        return np.concatenate([front[..., :3], 1 - front[..., 3:]], -1)
     if one == DEPTH:
         return depths(arrays)[..., None]
     if one.name.startswith(cryptomatte.LAYER):
@@ -109,6 +118,7 @@ def empty(camera: cameras.Camera, ranks: int) -> dict[str, np.ndarray]:
         "alpha": np.zeros(size, np.float32),
         "depth": np.zeros(size, np.float32),
         "owners": np.full(size, -1, np.int32),
+        "front": np.zeros((*size, 4), np.float32),
         "coverage": np.zeros((*size, ranks), np.float32),
         "coverage_groups": np.full((*size, ranks), -1, np.int32),
     }

@@ -3,7 +3,7 @@
 import bpy
 
 from ..color import display_to_linear, inverse_loss
-from ..engine import engine, render_notes
+from ..engine import engine, mesh_merge, render_notes
 from ..ui import status_bar
 from ..worker import jobs
 
@@ -68,6 +68,26 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
             status_bar.wrapped(layout, context, jobs.notice().capitalize(), "SORTTIME")
 
 
+class R5DGS_PT_merge(_OfEngine, bpy.types.Panel):
+    """Meshes of another engine among the Gaussians."""
+
+    bl_idname = "R5DGS_PT_merge"
+    bl_parent_id = "R5DGS_PT_render"
+    bl_label = "Meshes"
+    bl_context = "render"
+
+    def draw(self, context):
+        layout = self.layout
+        meshes = mesh_merge.of(context.scene)
+        if meshes is None:
+            layout.operator("r5dgs.merge_with_meshes", icon="NODE_COMPOSITING")
+            return
+        status_bar.wrapped(layout, context, f"Merged with '{meshes.name}'; its settings are in that scene", "CHECKMARK")
+        row = layout.row(align=True)
+        row.operator("r5dgs.merge_with_meshes", text="Merge Again", icon="FILE_REFRESH").engine = meshes.render.engine
+        row.operator("r5dgs.stop_merging", icon="X")
+
+
 class R5DGS_PT_passes(_OfEngine, bpy.types.Panel):
     """Passes supported by the engine."""
 
@@ -89,4 +109,4 @@ class R5DGS_PT_passes(_OfEngine, bpy.types.Panel):
         row.prop(context.view_layer, "pass_cryptomatte_depth", text="Levels")
 
 
-CLASSES = (R5DGS_PT_render, R5DGS_PT_passes)
+CLASSES = (R5DGS_PT_render, R5DGS_PT_merge, R5DGS_PT_passes)

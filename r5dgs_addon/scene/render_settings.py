@@ -32,6 +32,11 @@ class R5DGS_PG_render(bpy.types.PropertyGroup):
         items=MOVING,
         default="4",
     )
+    meshes: PointerProperty(
+        name="Meshes",
+        description="Scene of the meshes that are merged with the Gaussians",
+        type=bpy.types.Scene,
+    )
 
 
 def of(scene: bpy.types.Scene) -> R5DGS_PG_render:

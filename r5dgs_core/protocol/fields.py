@@ -18,7 +18,7 @@ from ..scene.cameras import Camera
 from ..scene.instance import Instance, Sky
 from ..search import prompts
 
-MOST_LINE = 512 << 20  # bytes per request; edited points are large
+MOST_LINE = 512 << 20  # bytes per request; edited points and meshes are large
 MOST_ENTRIES = 100_000  # per list
 _MOST_PATH = 4096  # letters
 _MOST_TINT = 1e6
@@ -28,7 +28,7 @@ _FIELDS = {
     "hello": (),
     "load": ("paths",),
     "points": ("keep", "new"),
-    "render": ("camera", "instances", "t", "scene", "sky", "near", "distance", "want", "coverage"),
+    "render": ("camera", "instances", "t", "scene", "sky", "near", "distance", "want", "coverage", "meshes"),
     "query": ("text", "scene", "encoder"),
     "embed": ("texts", "encoder"),
     "warm_up": (),

@@ -14,8 +14,9 @@ import numpy as np
 from ..scene.cameras import Camera
 from ..scene.instance import Instance, Sky
 from . import fields
+from .meshes import Meshes
 
-VERSION = 4  # of the protocol; the worker reports it in its answer to "hello"
+VERSION = 5  # of the protocol; the worker reports it in its answer to "hello"
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,8 @@ class RenderRequest:
         distance: Offset from the camera at which depth starts.
         want: Names of further arrays: any of ``depth alpha owners holdout``, for playback of ``depth alpha ids``.
             ``owners`` and ``ids`` are the instance or object with the largest share of each pixel, -1 for none.
+        meshes: Meshes in the world of the picture; adds the array ``front``, the Gaussians in front of them. None to
+            leave it out.
         coverage: Adds the arrays ``coverage_groups`` and ``coverage``; None to leave them out.
     """
 
@@ -65,6 +68,7 @@ class RenderRequest:
     distance: float = 0.0
     want: tuple[str, ...] = ()
     coverage: Coverage | None = None
+    meshes: Meshes | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields of the request as JSON values."""
@@ -75,6 +79,7 @@ class RenderRequest:
             result |= {"instances": [_instance_to_json(*entry) for entry in entries], "distance": self.distance}
         else:
             result |= {"t": self.t, "scene": self.scene}
+        result |= {} if self.meshes is None else {"meshes": self.meshes.to_json()}
         return result if self.coverage is None else {**result, "coverage": self.coverage.to_json()}
 
     @classmethod
@@ -108,6 +113,7 @@ class RenderRequest:
             distance=fields.distance_of(request),
             want=tuple(want),
             coverage=covered,
+            meshes=None if request.get("meshes") is None else Meshes.from_json(request["meshes"]),
         )
 
 

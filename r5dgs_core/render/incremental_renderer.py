@@ -109,6 +109,14 @@ class Stage:
             labels = np.repeat(np.asarray(groups, np.int64), [instance.count for instance in instances])
             return coverage.shares(self._pose(instances), labels, camera, ranks=ranks, settings=settings)
 
+    def posed(
+        self, instances: Sequence[Instance], near: float | None = None
+    ) -> tuple[posed_scene.PosedScene, RasterSettings]:
+        """Return the Gaussians of instances in the world, and the settings that `render` draws them with."""
+        with self._lock:
+            settings = RasterSettings(near_plane=self._near(instances) if near is None else near)
+            return self._pose(instances), settings
+
     def _render(
         self, instances: Sequence[Instance], camera: Camera, sky: Sky | None, near: float | None, distance: float
     ) -> RenderOutput:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..raster import backends, rasterizer, shade
 from ..raster.arrays import Array, like
+from ..raster.settings import RasterSettings
 from ..scene.cameras import Camera
 
 _VIEW = Camera(4, 4, np.array([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]), np.eye(4))
@@ -31,7 +32,7 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
     start = time.perf_counter()
     stages: list[tuple[str, Callable[[], object]]] = [
         *(("splats", _splats), ("splats before others", _static_layer)),
-        *(("colors", _colors), ("sky", _sky)),
+        *(("colors", _colors), ("sky", _sky), ("meshes", _meshes)),
     ]
     if gradients:
         stages += [
@@ -82,6 +83,18 @@ def _colors() -> None:
 
 def _sky() -> None:
     shade.sky(np.zeros((_SH, 3)), _VIEW)
+
+
+def _meshes() -> None:
+    backend = backends.on_cpu()
+    if backend.has_static_layer:  # its kernels are used
+        from . import front_layer, mesh_depths, posed_scene  # import numba
+
+        row, turn = np.ones((1, 1, 3), np.float32), np.array([[1, 0, 0, 0]], np.float32)
+        zero = np.zeros(1, np.int32)
+        posed = posed_scene.PosedScene(row[0], turn, row[0], row[0, :, 0], row, zero, np.eye(3)[None], zero, None)
+        depths = mesh_depths.draw(_VIEW, np.eye(3), np.arange(3)[None], 0.1)
+        front_layer.render(posed, _VIEW, depths, RasterSettings())
 
 
 def _splat_gradients() -> None:

@@ -45,7 +45,7 @@ from ..render import posed_scene
 from ..scene import quality, scene_file
 from ..scene.instance import Instance
 from ..scene.scene import Scene
-from . import edited_points
+from . import edited_points, further_layers
 from .warming import WarmUpThread
 
 NEEDED = ("numba",)
@@ -146,14 +146,13 @@ class Server:
             instances = edited_points.placed(wanted, places)
             fields.check_rows(instances, [len(scene.gaussians.means) for scene in scenes])
             fields.check_size(wanted.camera, sum(instance.count for instance in instances), ranks)
-        covered = {}
+        added: dict[str, np.ndarray] = {}
         try:
             if wanted.t is None:
                 output, ms_motion, count = self._draw(wanted, instances, scenes)
+                added = further_layers.draw(self._stage, wanted, instances, scenes)
             else:
                 output, ms_motion, count = self._play(wanted, wanted.t, scenes[wanted.scene])
-            if wanted.coverage is not None:
-                covered = self._coverage(wanted, wanted.coverage, instances)
         except (ValueError, OverflowError, FloatingPointError) as error:  # Gaussians out of the numeric range
             raise errors.ConfigError(f"worker: this picture cannot be drawn: {error}") from error
         ms_raster = 1e3 * (time.perf_counter() - started) - ms_motion
@@ -161,19 +160,9 @@ class Server:
         for name in wanted.want:
             value = output.ids if name in ("ids", "owners") else getattr(output, name)
             arrays[name] = 0 * output.alpha if value is None else value  # no hold-outs
-        arrays |= covered
+        arrays |= added
         result = {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count, "scenes": self._known(wanted)}
         return result, arrays
-
-    def _coverage(
-        self, wanted: messages.RenderRequest, coverage: messages.Coverage, instances: list[Instance]
-    ) -> dict[str, np.ndarray]:
-        """Return the groups of instances that share each pixel, and their shares."""
-        assert self._stage is not None  # created by `_draw`
-        found, shares = self._stage.coverage(
-            instances, coverage.groups, wanted.camera, ranks=coverage.ranks, near=wanted.near
-        )
-        return {"coverage_groups": found, "coverage": shares}
 
     def _known(self, wanted: messages.RenderRequest) -> list[dict[str, Any]]:
         """Return the known error of each scene and the number of its Gaussians with unapplied residuals."""

@@ -16,6 +16,7 @@ from r5dgs_core.language import build_table
 from r5dgs_core.language.encoders import encoder_base, registry
 from r5dgs_core.playback import scene_player
 from r5dgs_core.protocol import messages
+from r5dgs_core.protocol.meshes import Meshes
 from r5dgs_core.raster import compilation
 from r5dgs_core.render import incremental_renderer, posed_scene, scene_renderer, warm_up
 from r5dgs_core.scene import scene_file
@@ -31,6 +32,7 @@ CAMERA_JSON = {
     "intrinsics": CAMERA.intrinsics.tolist(),
     "T_cam_world": CAMERA.T_cam_world.tolist(),
 }
+TRIANGLE, FAR_FACE = np.eye(3, dtype=np.float32), np.array([[0, 1, 3]], np.int32)
 ROWS = {"start": 0, "count": 1, "matrix": np.eye(4).tolist()}
 
 
@@ -172,6 +174,26 @@ def test_scenes_no_longer_requested_are_released(path, tmp_path, monkeypatch):
         ({"command": "load", "paths": ["/nowhere/at all.r5dgs"]}, "SceneFileError", "at all.r5dgs"),
         ({"command": "render", "camera": CAMERA_JSON, "instances": [ROWS | {"t": "now"}]}, "ConfigError", "time"),
         ({"command": "render", "camera": CAMERA_JSON, "instances": [], "distance": "far"}, "ConfigError", "'distance'"),
+        (
+            {"command": "render", "camera": CAMERA_JSON, "instances": [], "meshes": {"vertices": ""}},
+            "ConfigError",
+            "'meshes'",
+        ),
+        (
+            {
+                "command": "render",
+                "camera": CAMERA_JSON,
+                "instances": [],
+                "meshes": Meshes(TRIANGLE, FAR_FACE).to_json(),
+            },
+            "ConfigError",
+            "'triangles'",
+        ),
+        (
+            {"command": "render", "camera": CAMERA_JSON, "instances": [], "meshes": {"vertices": "=", "triangles": ""}},
+            "ConfigError",
+            "'vertices'",
+        ),
         ({"command": "load", "paths": [3]}, "ConfigError", "paths"),
         ({"command": "load", "path": "/nowhere/at all.r5dgs"}, "ConfigError", "paths"),
     ],

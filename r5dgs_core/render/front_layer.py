@@ -1,0 +1,168 @@
+"""The part of a picture in front of meshes: Gaussians between the camera and the nearest surface of each pixel.
+
+A Gaussian contributes with the share of its density along the ray of a pixel that lies before the surface, so it fades
+where a surface passes through it. The layer is laid over the picture of the meshes, whose coverage decides their
+anti-aliased edges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..motion import rotations
+from ..raster.compilation import helper, kernel, run
+from ..raster.cpu import forward, projection, tiles
+from ..raster.cpu.projection import EXTENT_X, EXTENT_Y, L11, L12, L22, LOG2_OPACITY, MEAN_X, MEAN_Y
+from ..raster.settings import RasterSettings
+from ..scene import cameras, sh_color
+from ..scene.cameras import Camera
+from ..scene.instance import Instance
+from ..scene.scene import Scene
+from . import scene_renderer
+from .posed_scene import PosedScene
+
+THINNEST = 1e-3  # smallest ratio of two axes of a Gaussian in the depth of its density
+SKY_TOLERANCE = 0.1  # distance from the sky's colour, per channel, up to which a Gaussian may be a part of the sky
+SKY_LOGIT = 0.0  # logit of the opacity below which it is, wherever it lies
+
+
+def render(
+    posed: PosedScene,
+    camera: Camera,
+    meshes: np.ndarray,
+    settings: RasterSettings,
+    without: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the layer of the Gaussians in front of meshes.
+
+    Args:
+        posed: Gaussians in the world.
+        camera: The camera, in the same world.
+        meshes: Depth of the nearest mesh at each pixel, infinite for none; see `mesh_depths.draw`. [H, W]
+        settings: Rasterizer settings.
+        without: True for Gaussians to leave out, or None. [N]
+
+    Returns:
+        Display-referred colours premultiplied by alpha, and alpha; zero in pixels without a mesh. [H, W, 4] float32
+    """
+    layer = np.zeros((camera.height, camera.width, 4), np.float32)
+    if not len(posed.means) or not np.isfinite(meshes).any():
+        return layer
+    colors = np.ascontiguousarray(scene_renderer.colors(posed, camera), np.float32)
+    gaussians, seen = scene_renderer.PosedGaussians(posed), cameras.moved(camera, -posed.origin)
+    if without is not None:
+        gaussians.opacities = np.where(without, np.float32(0), gaussians.opacities)
+    rows = projection.padded_rows(len(gaussians.means))
+    geometry, depths = forward.aligned((rows, projection.GEOMETRY), np.float64), np.empty(rows)
+    boxes, radii = np.empty(rows), np.empty(rows, np.float32)
+    arrays = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+    forward.project(forward.pack_view(seen, settings), arrays, geometry, depths, boxes, radii)
+    order = tiles.sort_by_depth(depths, radii)
+    run(
+        _draw, camera.height // 32,
+        geometry[order], _along_rays(gaussians, seen, order), colors[order], np.linalg.inv(camera.intrinsics), meshes,
+        settings.alpha_min, settings.alpha_max, settings.finished_at, layer,
+    )  # fmt: skip
+    return layer
+
+
+def of_sky(scenes: Sequence[Scene], instances: Sequence[Instance], posed: PosedScene, camera: Camera) -> np.ndarray:
+    """Return a mask of the Gaussians that have learned the sky, which no mesh can be behind.
+
+    These are background or unassigned Gaussians with the colour of the sky behind them that are faint, or farther from
+    the middle of their scene than all its cameras.
+
+    Args:
+        scenes: Scenes that the instances refer to.
+        instances: The instances.
+        posed: Their Gaussians in the world.
+        camera: The camera, in the same world.
+
+    Returns:
+        The mask. [N]
+    """
+    result, end = np.zeros(len(posed.means), bool), 0
+    colors = scene_renderer.colors(posed, camera)
+    for instance in instances:
+        start, end = end, end + instance.count
+        rows = start + np.flatnonzero(posed.object_ids[start:end] <= 0)
+        if not len(rows):
+            continue
+        scene = scenes[instance.scene]
+        world = np.eye(4) if instance.world is None else np.asarray(instance.world, np.float64)
+        rays = (posed.means[rows] + posed.origin - camera.center) @ np.linalg.inv(world[:3, :3]).T
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-30)
+        skies = np.clip(sh_color.to_rgb(scene.background_sh, rays), 0, 1)
+        alike = (np.abs(colors[rows] - skies) < SKY_TOLERANCE).all(axis=1)
+        faint = posed.opacity_logits[rows] < SKY_LOGIT
+        result[rows] = alike & (faint | _is_beyond(scene, scene.gaussians.means[instance.start + rows - start]))
+    return result
+
+
+def _is_beyond(scene: Scene, means: np.ndarray) -> np.ndarray:
+    """Mask of points farther from the middle of a scene than all its cameras. [n]"""
+    if not scene.cameras:
+        return np.zeros(len(means), bool)
+    middle = np.median(scene.gaussians.means, axis=0)
+    farthest = max(float(np.linalg.norm(camera.center - middle)) for camera in scene.cameras)
+    return np.linalg.norm(means - middle, axis=1) > farthest
+
+
+def _along_rays(gaussians: scene_renderer.PosedGaussians, camera: Camera, rows: np.ndarray) -> np.ndarray:
+    """Quadratic forms of the exponents along rays through the camera, in its frame.
+
+    The exponent at the depth z of a ray r is -(z^2 r.A r - 2 z r.b) / 2 plus a constant.
+
+    Returns:
+        A as xx, xy, xz, yy, yz, zz, and b. [n, 9]
+    """
+    T = camera.T_cam_world
+    scales = gaussians.scales[rows].astype(np.float64)
+    inverse = 1 / np.maximum(scales, THINNEST * scales.max(axis=1, keepdims=True))
+    frames = T[:3, :3] @ rotations.quats_to_rotmats(rotations.normalize(gaussians.quats[rows].astype(np.float64)))
+    axes = frames * inverse[:, None, :]
+    forms = axes @ np.swapaxes(axes, 1, 2)
+    centers = gaussians.means[rows].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+    upper = forms[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
+    return np.ascontiguousarray(np.concatenate([upper, np.einsum("nij,nj->ni", forms, centers)], 1))
+
+
+@kernel
+def _draw(worker, workers, geometry, lines, colors, rays, meshes, least, most, finished, layer):
+    """Blend all Gaussians, nearest first, into the worker's share of the rows."""
+    height, width = meshes.shape
+    top, bottom = height * worker // workers, height * (worker + 1) // workers
+    log2_least = math.log2(least)
+    for i in range(len(geometry)):
+        g, line = geometry[i], lines[i]
+        first_y = max(top, int(math.ceil(g[MEAN_Y] - g[EXTENT_Y] - 0.5)))
+        end_y = min(bottom, int(math.floor(g[MEAN_Y] + g[EXTENT_Y] - 0.5)) + 1)
+        first_x = max(0, int(math.ceil(g[MEAN_X] - g[EXTENT_X] - 0.5)))
+        end_x = min(width, int(math.floor(g[MEAN_X] + g[EXTENT_X] - 0.5)) + 1)
+        for row in range(first_y, end_y):
+            v = g[L22] * (row + 0.5 - g[MEAN_Y])
+            for column in range(first_x, end_x):
+                mesh, passed = meshes[row, column], 1 - layer[row, column, 3]
+                if not mesh < math.inf or passed < finished:
+                    continue
+                u = g[L11] * (column + 0.5 - g[MEAN_X]) - g[L12] * (row + 0.5 - g[MEAN_Y])
+                exponent = g[LOG2_OPACITY] - u * u - v * v
+                if exponent < log2_least:
+                    continue
+                alpha = min(most, 2.0**exponent) * _share_in_front(line, rays, column + 0.5, row + 0.5, mesh)
+                for c in range(3):
+                    layer[row, column, c] += passed * alpha * colors[i, c]
+                layer[row, column, 3] += passed * alpha
+
+
+@helper
+def _share_in_front(line, rays, x, y, mesh):
+    """Share of a Gaussian's density along the ray of a pixel that lies nearer than a depth."""
+    a = rays[0, 0] * x + rays[0, 1] * y + rays[0, 2]
+    b = rays[1, 1] * y + rays[1, 2]
+    form = a * (line[0] * a + 2 * (line[1] * b + line[2])) + b * (line[3] * b + 2 * line[4]) + line[5]
+    middle = (a * line[6] + b * line[7] + line[8]) / form
+    return 0.5 * math.erfc((middle - mesh) * math.sqrt(0.5 * form))
