@@ -17,7 +17,7 @@ Notation: G groups, S poses. Until `bind_state.rebind`, poses are relative to th
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,12 +26,13 @@ from scipy import stats
 
 from ..config.sections.needs import NeedsSection
 from ..motion import free_top, rotations
+from ..motion.history import PoseErrors
 from ..motion_fit import model_selection, shared_gravity
 from ..motion_fit import noise as noises
 from ..playback import visibility
-from ..scene.scene import Scene
+from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
-from . import bind_state, falling_bodies, image_evidence, needs, track_checks
+from . import bind_state, falling_bodies, image_evidence, needs, pose_errors, track_checks
 from .draft import Context, Draft, Need
 from .image_evidence import ImageEvidence
 
@@ -94,12 +95,20 @@ def apply(draft: Draft, context: Context) -> Draft:
     """Simplify the motion of the scene by the evidence of the training images."""
     observed = np.stack([group.observed for group in draft.observed.motion.groups])
     evidence = image_evidence.gather(draft.scene, context.dataset, context.config)
-    found = simplify(draft.scene, observed, evidence, context.wanted)
+    errors: dict[int, PoseErrors] = {}
+    if evidence is not None:
+        groups = [group.id for group in _moving(draft.scene)]
+        errors = pose_errors.measure(draft.scene, context.dataset, context.config, groups, not context.discovered)
+    found = simplify(draft.scene, observed, evidence, context.wanted, errors)
     return dataclasses.replace(draft, scene=found.scene, trained=draft.scene, parts=found.rows)
 
 
 def simplify(
-    scene: Scene, observed: np.ndarray, evidence: ImageEvidence | None, wanted: NeedsSection | None = None
+    scene: Scene,
+    observed: np.ndarray,
+    evidence: ImageEvidence | None,
+    wanted: NeedsSection | None = None,
+    errors: Mapping[int, PoseErrors] | None = None,
 ) -> Simplified:
     """Drop rotations, paths and bends that are noise, and fit the motion past t_max.
 
@@ -109,13 +118,14 @@ def simplify(
         evidence: The training images; None if they are missing. Then only motion below `needs.STILL` and `needs.TURN`
             is dropped.
         wanted: The user's overrides; parts that are "on" are kept.
+        errors: Errors of the observed poses of groups, if they are known.
 
     Returns:
         The simplified scene. Groups that follow a body follow its simplified motion.
     """
-    wanted = wanted or NeedsSection()
+    wanted, errors = wanted or NeedsSection(), errors or {}
     names = {item.id: item.name for item in scene.objects}
-    bodies = [g for g in scene.groups if g.role == "body" and np.any(scene.tracks.poses[g.id, :, 1:] != 0)]
+    bodies = _moving(scene)
     parts = [part for g in bodies for part in _parts(scene, g.id, observed[g.id], evidence, wanted)]
     dropped, losses = _unseen(scene, [part for part in parts if part.noise], evidence)
     bound = bind_state.rebind(scene, _with_parts(scene, dropped))
@@ -126,7 +136,7 @@ def simplify(
         future = _future(bound.tracks.poses[g.id], mine)
         if np.any(future[:, 1:] != 0):
             track_checks.warn_of_aliasing(names[g.object_id], scene.tracks.times, future)
-            fits[g.id] = _fit(bound, g.id, observed[g.id], future, mine)
+            fits[g.id] = _fit(bound, g.id, observed[g.id], future, mine, errors.get(g.id))
         description = _describe(fits[g.id][1] if g.id in fits else None)
         travel = float(np.linalg.norm(bound.tracks.poses[g.id, :, 4:], axis=1).max()) / (2 * g.model.radius)
         found = [_row(part, part in dropped, losses.get(id(part)), description, travel) for part in mine]
@@ -141,6 +151,11 @@ def simplify(
     for index, model in models.items():
         groups[index] = dataclasses.replace(groups[index], model=model, history=shared[index].history)
     return Simplified(dataclasses.replace(bound, groups=tuple(groups)), tuple(rows))
+
+
+def _moving(scene: Scene) -> list[MotionGroup]:
+    """Return the bodies whose track moves."""
+    return [g for g in scene.groups if g.role == "body" and np.any(scene.tracks.poses[g.id, :, 1:] != 0)]
 
 
 def _parts(
@@ -261,7 +276,12 @@ def _future(poses: np.ndarray, parts: Sequence[_Part]) -> np.ndarray:
 
 
 def _fit(
-    scene: Scene, group: int, observed: np.ndarray, poses: np.ndarray, parts: Sequence[_Part]
+    scene: Scene,
+    group: int,
+    observed: np.ndarray,
+    poses: np.ndarray,
+    parts: Sequence[_Part],
+    errors: PoseErrors | None,
 ) -> tuple[shared_gravity.Track, model_selection.Fit]:
     """Fit a body's motion past t_max and return its track and the fit.
 
@@ -270,19 +290,24 @@ def _fit(
     members = scene.gaussians.motion_ids == group
     opacities = to_opacities(scene.gaussians.opacity_logits[members])
     body = free_top.inertia(scene.gaussians.means[members][visibility.seen(opacities)].astype(np.float64))
-    track = shared_gravity.Track(scene.tracks.times, poses[:, :4], poses[:, 4:], observed.astype(np.float64))
+    radius, turns = scene.groups[group].model.radius, bool(np.any(poses[:, 1:4] != 0))
+    weights, drift = observed.astype(np.float64), (0.0, 0.0)
+    if errors is not None:
+        weights, drift = pose_errors.weights(errors, observed, radius, turns), pose_errors.drift(errors, observed)
+    track = shared_gravity.Track(scene.tracks.times, poses[:, :4], poses[:, 4:], weights)
     noise = {part.name == "rotation": part.spread / part.change for part in parts if part.seen and part.change > 0}
     fit = model_selection.fit(
         track.times,
         track.quats,
         track.displacements,
-        radius=scene.groups[group].model.radius,
+        radius=radius,
         weights=track.weights,
         inertia=body,
-        least_noise=noises.of_images(scene.groups[group].model.radius, noise.get(False, 0.0), noise.get(True, 0.0)),
+        least_noise=noises.of_images(radius, noise.get(False, 0.0), noise.get(True, 0.0)),
+        drift=drift if turns else (drift[0], 0.0),
         up=falling_bodies.UP.get(scene.world_convention),
     )
-    return track, fit
+    return track, dataclasses.replace(fit, history=dataclasses.replace(fit.history, errors=errors))
 
 
 def _describe(fit: model_selection.Fit | None) -> str:

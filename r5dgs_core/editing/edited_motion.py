@@ -224,6 +224,7 @@ def _go_on(
             if shown(*models.evaluate(turned, later)):
                 band = source.history if model is source.model else replace(source.history, band=None)
                 history = band if (course.parent == np.eye(3)).all() else band.transformed(*_turn_of(course.parent))
+                history = history if course.same else replace(history, errors=None)
                 return replace(source, **known, model=turned, history=history), course.same and turned == source.model
     model, error = fit_drawn_curve.fit(later, quats, moves, course.reach, course.allowed)
     if error > 10 * course.allowed:
@@ -231,5 +232,5 @@ def _go_on(
             f"{first.name}: no motion model matches its curves past t_max; the nearest one deviates by up to "
             f"{error:.3g}"
         )
-    history = replace(source.history, band=None)
+    history = replace(source.history, band=None, errors=None)
     return replace(source, **known, model=model, follows=None, follow_matrix=None, history=history), False

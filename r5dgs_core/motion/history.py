@@ -84,6 +84,19 @@ class Band:
 
 
 @dataclass(frozen=True)
+class PoseErrors:
+    """Standard deviations of the observed poses, per component; infinite at knots at which no image shows the body.
+
+    Attributes:
+        place: Of the displacements, world units. [S]
+        turn: Of the rotations, rad. [S]
+    """
+
+    place: tuple[float, ...]
+    turn: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class History:
     """Evidence of the observed poses on a motion, besides its model.
 
@@ -91,18 +104,23 @@ class History:
         events: Changes of the motion, in order.
         segments: Motion between them, one more than events; empty without events.
         band: Confidence band, or None if it is unknown.
+        errors: Errors of the observed poses, or None if they are unknown.
     """
 
     events: tuple[Event, ...] = field(default=())
     segments: tuple[Segment, ...] = field(default=())
     band: Band | None = None
+    errors: PoseErrors | None = None
 
     def transformed(self, turn: np.ndarray, scale: float) -> History:
         """History after a similarity of the world, see `MotionModel.transformed`."""
-        band = self.band
+        band, errors = self.band, self.errors
+        if errors is not None:
+            errors = replace(errors, place=tuple(abs(scale) * x for x in errors.place))
         if band is not None:
             band = replace(band, half_width=tuple(abs(scale) * width for width in band.half_width))
-        return replace(self, segments=tuple(s.transformed(turn, scale) for s in self.segments), band=band)
+        segments = tuple(s.transformed(turn, scale) for s in self.segments)
+        return replace(self, segments=segments, band=band, errors=errors)
 
     def warning(self) -> str:
         """Reason to distrust the prediction, such as "not predictable past 0.85 (hit at 0.55)", or ""."""

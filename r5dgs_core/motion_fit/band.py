@@ -24,16 +24,25 @@ LEVEL = 0.95
 WIDE = 0.7  # half width above which a motion is not predictable, in radii
 _MULTIPLE = 1.4  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
 _DRIFT = 5.0  # drift of a track over its span, in units of the lower bound of its noise
+_LINE = math.sqrt(12.0)  # drift at a constant rate over the span, in standard deviations
 _SOFT = 4.0  # difference of scores that reduces a candidate's weight by e
 _FARTHEST = 8.0  # maximum counted distance of another candidate, in radii
 _MOST_SCALE = 36.0  # maximum factor on the covariance from the errors of earlier predictions
 
 
-def of(selected: Selected, variance: float, least: Noise) -> Widths:
+def slow(least: Noise, deviations: Noise) -> Noise:
+    """Drift of a track over its span, from the lower bound of its noise and the deviations that drift causes."""
+    return Noise(
+        max(_DRIFT * least.place, _LINE * deviations.place),
+        max(_DRIFT * least.turn, _LINE * deviations.turn),
+    )
+
+
+def of(selected: Selected, variance: float, drift: Noise) -> Widths:
     """Band of the chosen solution, up to one observed span past t_max.
 
-    A lower bound ``least`` of the noise indicates a slow drift of the track, proportional to it. ``variance`` is the
-    factor of the parameters' covariance, from `evidence.variance`.
+    ``drift`` is that of the track over its span. ``variance`` is the factor of the parameters' covariance, from
+    `evidence.variance`.
     """
     tau = np.linspace(0.0, 1.0, MOST_KNOTS)
     chosen, evidence, noise = selected.chosen, selected.evidence, selected.noise
@@ -42,9 +51,9 @@ def of(selected: Selected, variance: float, least: Noise) -> Widths:
     fading = np.exp(-2 * tau / FADE_PER_SPAN)  # of the bind state, which is a noisy pose
     last = evidence.level * fading
     scale = min(max(rolling.misses(chosen, selected.track, noise, variance), 1.0), _MOST_SCALE)
-    drift = 3 * (_DRIFT * (0.5 + tau)) ** 2
-    turn = scale * turn + turn2 + 3 * noise.turn**2 * last + drift * least.turn**2
-    place = scale * place + place2 + 3 * noise.place**2 * last + drift * least.place**2
+    growth = 3 * (0.5 + tau) ** 2
+    turn = scale * turn + turn2 + 3 * noise.turn**2 * last + growth * drift.turn**2
+    place = scale * place + place2 + 3 * noise.place**2 * last + growth * drift.place**2
     width = _MULTIPLE * np.sqrt(place + 2 / 3 * turn)
     wide = np.flatnonzero(width > WIDE)
     return Widths(tau, width, _MULTIPLE * np.sqrt(turn), _crossing(tau, width, int(wide[0])) if len(wide) else None)

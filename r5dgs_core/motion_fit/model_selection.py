@@ -76,6 +76,7 @@ def fit(
     candidates: Sequence[str] | None = None,
     inertia: np.ndarray | None = None,  # [3, 3]
     least_noise: tuple[float, float] = (0.0, 0.0),
+    drift: tuple[float, float] = (0.0, 0.0),
     up: np.ndarray | None = None,  # [3]
 ) -> Fit:
     """Fit all candidates to a pose track and select one.
@@ -91,6 +92,8 @@ def fit(
             not nearly that of a ball, the free top is a candidate. [3, 3]
         least_noise: Lower bounds of the noise of displacements (per component, world units) and rotations (rad), for
             noise that the scatter about a smooth motion does not show.
+        drift: Standard deviations of the displacements and rotations from a slow drift of the track. They widen the
+            band alone.
         up: Upward direction, or None if unknown. A body that slows down on a vertical line falls back; on any other
             line, and if ``up`` is None, friction may stop it. [3]
 
@@ -120,13 +123,14 @@ def fit(
     least = Noise(max(least_noise[0] / radius, noise.FLOOR), max(least_noise[1], noise.FLOOR))
     few = len(track) < 4
     selected = search.few(track, family) if few else search.select(track, family, least, candidates is None, up)
-    return _result(selected, family, float(times[-1]), radius, span, least)
+    drifts = Noise(drift[0] / radius, drift[1])
+    return _result(selected, family, float(times[-1]), radius, span, bands.slow(least, drifts))
 
 
 def _result(
-    selected: Selected, family: tuple[Candidate, ...], t_max: float, radius: float, span: float, least: Noise
+    selected: Selected, family: tuple[Candidate, ...], t_max: float, radius: float, span: float, drift: Noise
 ) -> Fit:
-    """Fit in world units."""
+    """Fit in world units; ``drift`` is that of `band.of`."""
     chosen, evidence, level = selected.chosen, selected.evidence, selected.noise
     variance = evidences.variance(chosen, selected.track, level, evidence)
     model = fitted_motion.to_model(chosen, variance, radius, span)
@@ -136,7 +140,7 @@ def _result(
     owners = [part for part, own in parts for _ in own]
     first = t_max + span * selected.first
     segments = fitted_motion.segments([*owners, chosen], found, first, t_max, radius, span)
-    band = bands.of(selected, variance, least).scaled(t_max, radius, span)
+    band = bands.of(selected, variance, drift).scaled(t_max, radius, span)
     name = chosen.candidate.law.name
     rests = bool(found) and found[-1].kind == "stop"
     by_name = {s.candidate.name: s for s in selected.solutions}

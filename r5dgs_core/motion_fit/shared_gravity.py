@@ -136,5 +136,5 @@ def _refit(
         late = (np.array(band.times) - track.times[-1]) ** 4 * float(np.trace(covariance))  # (2 sigma)^2 of a tau^2 / 2
         widths = np.sqrt(np.array(band.half_width) ** 2 + late)
         band = dataclasses.replace(band, half_width=tuple(widths.tolist()))
-    history = dataclasses.replace(again.history, band=band)
+    history = dataclasses.replace(again.history, band=band, errors=fit.history.errors)
     return dataclasses.replace(again, model=model, scores=fit.scores, chosen=fit.chosen, history=history)

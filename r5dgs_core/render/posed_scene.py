@@ -135,6 +135,26 @@ def pose_frame(scene: Scene, frame: scene_player.Frame) -> PosedScene:
     )
 
 
+def rows_of(posed: PosedScene, rows: np.ndarray) -> PosedScene:
+    """Return some rows of posed Gaussians. [n] int"""
+    names = ("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids", "pose_ids", "shading_factor")
+    found = {name: getattr(posed, name) for name in names}
+    return dataclasses.replace(posed, **{name: x[rows] for name, x in found.items() if x is not None})
+
+
+def with_moved(posed: PosedScene, other: PosedScene, moved: np.ndarray) -> PosedScene:
+    """Return posed Gaussians with the positions, rotations and shading factors of others in some rows. [N] bool"""
+
+    def mixed(here: np.ndarray, there: np.ndarray) -> np.ndarray:
+        return np.where(moved.reshape(-1, *[1] * (here.ndim - 1)), there, here)
+
+    factor = None
+    if posed.shading_factor is not None and other.shading_factor is not None:
+        factor = mixed(posed.shading_factor, other.shading_factor)
+    means, quats = mixed(posed.means, other.means), mixed(posed.quats, other.quats)
+    return dataclasses.replace(posed, means=means, quats=quats, shading_factor=factor)
+
+
 def pose_instances(scene: Scene | JoinedScenes, instances: Sequence[Instance]) -> PosedScene:
     """Transform ranges of the Gaussians of one or several scenes, each by its own matrix.
 

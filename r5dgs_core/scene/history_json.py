@@ -1,13 +1,14 @@
-"""JSON form of the events, segments and confidence band of a motion group."""
+"""JSON form of the events, segments, confidence band and pose errors of a motion group."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from .. import errors
-from ..motion.history import EVENTS, MOST_KNOTS, Band, Event, History, Segment
+from ..motion.history import EVENTS, MOST_KNOTS, Band, Event, History, PoseErrors, Segment
 from ..motion.models import KINDS
 from .json_row import Row
 
@@ -33,6 +34,9 @@ def tree(history: History) -> dict[str, Any]:
             "level": band.level,
             "predictable_until": band.predictable_until,
         }
+    if history.errors is not None:
+        columns = {"place": history.errors.place, "turn": history.errors.turn}
+        found["errors"] = {name: [x if math.isfinite(x) else None for x in values] for name, values in columns.items()}
     return found
 
 
@@ -42,6 +46,9 @@ def read(row: Row) -> History:
         events=() if row.lacks("events") else row.each("events", _event),
         segments=() if row.lacks("segments") else row.each("segments", _segment),
         band=None if row.lacks("band") else _band(Row(row.get("band", dict), f"{row.place}: band", row.guard)),
+        errors=None
+        if row.lacks("errors")
+        else _errors(Row(row.get("errors", dict), f"{row.place}: errors", row.guard)),
     )
 
 
@@ -75,6 +82,20 @@ def _band(row: Row) -> Band:
     if not 0 < level < 1:
         raise errors.SceneFileError(f"{row.place}: level: expected a number between 0 and 1, found {level:g}")
     return Band(*(tuple(found[name].tolist()) for name in found), level=level, predictable_until=until)
+
+
+def _errors(row: Row) -> PoseErrors:
+    count = len(row.get("place", list))
+    return PoseErrors(*(_deviations(row, name, count) for name in ("place", "turn")))
+
+
+def _deviations(row: Row, key: str, count: int) -> tuple[float, ...]:
+    """Numbers >= 0, infinite for null."""
+    values = row.get(key, list)
+    plain = Row({key: [0.0 if x is None else x for x in values]}, row.place, row.guard).numbers(key, (count,))
+    if (plain < 0).any():
+        raise errors.SceneFileError(f"{row.place}: {key}: expected numbers >= 0, found {plain.min():g}")
+    return tuple(math.inf if x is None else float(y) for x, y in zip(values, plain, strict=True))
 
 
 def _one_of(row: Row, key: str, names: tuple[str, ...]) -> str:

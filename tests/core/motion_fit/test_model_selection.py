@@ -245,6 +245,17 @@ def test_the_band_holds_the_true_error():
     assert fit.history.band.half_width[-1] > fit.history.band.half_width[4] > 0
 
 
+def test_a_drift_of_the_track_widens_the_band_and_not_the_fit():
+    (plain, _), (wide, _) = (
+        fitted("ballistic, spinning", np.random.default_rng(1), 2e-3, 2e-3, drift=drift)
+        for drift in ((0, 0), (0.01, 0.3))
+    )
+    assert plain.model == wide.model
+    own, wider = plain.history.band, wide.history.band
+    assert (np.array(wider.half_angle) > own.half_angle).all() and wider.half_angle[-1] > 0.3
+    assert plain.history.warning() == "" and wide.history.warning()
+
+
 def test_a_law_that_contradicts_earlier_poses_is_rejected():
     """A path of five random waves, three of them too fast to be resolved."""
     rng, trusted = np.random.default_rng(0), []

@@ -7,7 +7,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.motion import rotations
-from r5dgs_core.motion.history import NONE, Band, Event, History, Segment
+from r5dgs_core.motion.history import NONE, Band, Event, History, PoseErrors, Segment
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.scene import scene_file
 from tests.support import scenes
@@ -39,6 +39,16 @@ def test_events_segments_and_band_survive_a_file(tmp_path):
     features = tree_of(path)["features"]
     assert [(row["name"], row["required"]) for row in features] == [("events", False)]
     assert tree_of(path)["groups"][1]["segments"][1]["from"] == 0.31
+
+
+def test_pose_errors_survive_a_file_and_grow_with_the_scene(tmp_path):
+    errors_of_poses = PoseErrors((0.1, np.inf), (0.02, np.inf))
+    path = scene_file.write(with_history(History(errors=errors_of_poses)), tmp_path / "errors.r5dgs")
+    assert tree_of(path)["format_version"] == 1
+    assert scene_file.read(path).groups[1].history.errors == errors_of_poses
+    assert History(errors=errors_of_poses).transformed(np.eye(3), 2.0).errors == PoseErrors(
+        (0.2, np.inf), (0.02, np.inf)
+    )
 
 
 def test_a_band_alone_needs_no_newer_release(tmp_path):
@@ -74,6 +84,9 @@ def test_a_motion_that_older_releases_would_misread_is_a_required_feature(model,
         ({"band": {"times": [1], "half_width": [-1], "half_angle": [0], "level": 0.95}}, "half_width: .* >= 0"),
         ({"band": {"times": [1], "half_width": [1], "half_angle": [0], "level": 95}}, "between 0 and 1"),
         ({"band": {"times": [1], "half_width": [1, 2], "half_angle": [0], "level": 0.5}}, "half_width"),
+        ({"errors": {"place": [0.1], "turn": [-0.1]}}, "errors: turn: expected numbers >= 0"),
+        ({"errors": {"place": [0.1, None], "turn": [0.1]}}, "errors: turn: expected finite numbers of shape"),
+        ({"errors": {"place": ["a"], "turn": [0.1]}}, "errors: place: expected finite numbers"),
     ],
 )
 def test_a_faulty_history_is_named(change, message, tmp_path):

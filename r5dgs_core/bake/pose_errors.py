@@ -1,0 +1,225 @@
+"""Standard deviations of the observed poses of bodies, from the training images.
+
+A small change of a pose changes the pixels of the body by J. With the misfit r of these pixels, the pose of least
+misfit has the covariance (J^T J)^-1 (sum g g^T) (J^T J)^-1, with the score g = J^T r of each view. Misfits of trained
+Gaussians are correlated over a view, so the score of a view counts as one number. The ratio to the covariance for
+independent pixels is pooled over the knots of a body, because single knots have few views. Tracks also drift, together
+with the texture that they shaped: `FACTORS` are the measured errors of tracks in these deviations. If the misfit is as
+large as the texture of the images, wrong rotations have blurred it, and the rotations are unknown.
+
+Notation: S knots, P values of pixels. A change of a pose is a rotation vector in world axes, and a displacement in
+radii of the body.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from ..config.config import Config
+from ..data import dataset as datasets
+from ..motion import rotations
+from ..motion.history import PoseErrors
+from ..playback import scene_player
+from ..render import posed_scene, scene_renderer
+from ..render.posed_scene import PosedScene
+from ..scene import cameras
+from ..scene.cameras import Camera
+from ..scene.scene import Scene
+from ..train import train_views
+
+VIEWS = 4  # of a knot, spread evenly
+STEP = 0.03  # change of the pose for finite differences, rad or radii
+MARGIN = 2  # dilation of the pixels that show a body, px
+FEWEST_PIXELS = 8  # of a body in a view
+FACTORS = (2.0, 4.5)  # measured errors of displacements and rotations, in deviations from single views
+UNEXPLAINED = 0.5  # share of the texture from which the rotations are unknown
+LARGE = 2.0  # misfit, in that of all pixels, from which it counts as unexplained
+UNKNOWN = 1.0  # standard deviation of an unknown rotation, rad, or displacement, radii
+EXACT = 1e-6  # error that cannot be distinguished from zero, rad or radii
+_REACH = 3.0  # extent of a Gaussian, standard deviations
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Pixels of a body in a view.
+
+    Attributes:
+        slopes: Derivatives of the values by the pose. [P, 6]
+        misses: Picture minus image. [P]
+        inner: Squared misfit of the pixels inside the body's outline.
+        texture: Squared differences of these pixels in the image from their mean colour.
+        values: Number of values of these pixels.
+    """
+
+    slopes: np.ndarray
+    misses: np.ndarray
+    inner: float
+    texture: float
+    values: int
+
+
+def measure(
+    scene: Scene, dataset: datasets.Dataset, config: Config, groups: Collection[int], masked: bool
+) -> dict[int, PoseErrors]:
+    """Return the errors of the observed poses of some groups.
+
+    Args:
+        scene: The scene with the trained motion.
+        dataset: Its data set.
+        config: Configuration of the run.
+        groups: The bodies.
+        masked: True if the masks of the data set have the ids of the scene's objects.
+
+    Returns:
+        The errors by group.
+
+    Raises:
+        DatasetError: An image is missing or cannot be read.
+    """
+    scene = dataclasses.replace(scene, t_max=math.inf)  # the player then never uses the motion model
+    players = [scene_player.Player(part) for part in (scene, *(_moved(scene, groups, axis) for axis in range(6)))]
+    behind = train_views.behind(dataset, config)
+    knots = np.array([train_views.nearest_knot(scene.tracks.times, view.t) for view in dataset.train])
+    looks: dict[tuple[int, int], list[_Look]] = {}
+    misfits = []
+    for knot in range(len(scene.tracks.times)) if groups else ():
+        views = [view for view, k in zip(dataset.train, knots, strict=True) if k == knot]
+        shown = train_views.spread(views, VIEWS)
+        posed: dict[float, list[PosedScene]] = {}
+        for number, view in enumerate(shown):
+            if view.t not in posed:
+                posed[view.t] = [scene_renderer.pose_frame(scene, player.frame(view.t)) for player in players]
+            truth, ids = datasets.load_image(view, behind), datasets.load_mask(view) if masked else None
+            if ids is None or number == 0:
+                picture = scene_renderer.render_frame(scene, posed[view.t][0], view.camera)
+                misfits.append(float(((np.clip(picture.color, 0, 1) - truth) ** 2).mean()))
+                ids = picture.ids if ids is None else ids
+            for group in groups:
+                mine = ids == scene.groups[group].object_id
+                if mine.sum() >= FEWEST_PIXELS:
+                    look = _look(scene, group, posed[view.t], view, truth, mine)
+                    looks.setdefault((group, knot), []).append(look)
+    usual, count = float(np.mean(misfits)) if misfits else 0.0, len(scene.tracks.times)
+    return {
+        g: _errors([looks.get((g, s), []) for s in range(count)], scene.groups[g].model.radius, usual) for g in groups
+    }
+
+
+def _moved(scene: Scene, groups: Collection[int], axis: int) -> Scene:
+    """Return the scene with small changes of the poses of some groups: turns about an axis 0 to 2, or shifts."""
+    poses = scene.tracks.poses.copy()
+    for group in groups:
+        if axis < 3:
+            turn = rotations.rotvecs_to_quats(STEP * np.eye(3)[axis])
+            poses[group, :, :4] = rotations.normalize(rotations.multiply(turn, poses[group, :, :4]))
+        else:
+            poses[group, :, 1 + axis] += STEP * scene.groups[group].model.radius
+    return scene.with_arrays(track_poses=poses)
+
+
+def _look(
+    scene: Scene,
+    group: int,
+    frames: Sequence[PosedScene],
+    view: datasets.View,
+    truth: np.ndarray,
+    mine: np.ndarray,
+) -> _Look:
+    """Draw the surroundings of a body in a view in the given poses of the scene, of which the first is the observed."""
+    region = ndimage.binary_dilation(mine, iterations=MARGIN)
+    rows, columns = ndimage.find_objects(region.astype(np.int8))[0]
+    intrinsics = view.camera.intrinsics.copy()
+    intrinsics[:2, 2] -= columns.start, rows.start
+    size = {"width": columns.stop - columns.start, "height": rows.stop - rows.start}
+    camera = dataclasses.replace(view.camera, intrinsics=intrinsics, **size)
+    near = _near(frames[0], camera)
+    own = scene.gaussians.motion_ids[near] == group
+    parts = [posed_scene.rows_of(frame, near) for frame in frames]
+    region = np.asarray(region[rows, columns], bool)
+    core = np.asarray(ndimage.binary_erosion(mine)[rows, columns], bool)
+    pictures = []
+    for part in parts:
+        mixed = posed_scene.with_moved(parts[0], part, own)
+        pictures.append(np.clip(scene_renderer.render_frame(scene, mixed, camera).color, 0, 1).astype(np.float64))
+    image = np.asarray(truth[rows, columns], np.float64)
+    slopes = np.stack([(picture - pictures[0])[region].ravel() for picture in pictures[1:]], -1) / STEP
+    inner = image[core] - (image[core].mean(0) if core.any() else 0.0)
+    return _Look(
+        slopes,
+        (pictures[0] - image)[region].ravel(),
+        float(((pictures[0] - image)[core] ** 2).sum()),
+        float((inner**2).sum()),
+        int(3 * core.sum()),
+    )
+
+
+def _near(posed: PosedScene, camera: Camera) -> np.ndarray:
+    """Return the rows of the Gaussians that may reach a camera's picture."""
+    pixels, depth = cameras.project(camera, posed.means.astype(np.float64) + posed.origin)
+    scales = np.exp(posed.log_scales.max(1))
+    reach = _REACH * scales * camera.intrinsics[0, 0] / np.maximum(depth, 1e-6) + 1
+    outside = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1) > reach
+    return np.flatnonzero(~outside & (depth > 0))
+
+
+def _errors(looks: Sequence[Sequence[_Look]], radius: float, usual: float) -> PoseErrors:
+    """Return the errors of a body's poses.
+
+    Args:
+        looks: Its looks at each knot. S
+        radius: Its radius, world units.
+        usual: Squared misfit of a value anywhere in the images.
+    """
+    variances, ratios = np.full((len(looks), 6), np.inf), []
+    for s, own in enumerate(looks):
+        if any(look.slopes.any() for look in own):  # a body without Gaussians changes no pixel
+            slopes, misses = (np.concatenate([getattr(look, name) for look in own]) for name in ("slopes", "misses"))
+            misfit = max(float((misses**2).mean()), 1e-8)
+            inverse = np.linalg.inv(slopes.T @ slopes + misfit / UNKNOWN**2 * np.eye(6))
+            scores = np.stack([look.slopes.T @ look.misses for look in own])
+            variances[s] = misfit * np.diag(inverse)
+            ratios.append(((inverse @ scores.T) ** 2).sum(1) / variances[s])
+    every = [look for own in looks for look in own]
+    inner, texture = sum(look.inner for look in every), sum(look.texture for look in every)
+    blurred = inner > max(UNEXPLAINED * texture, LARGE**2 * usual * sum(look.values for look in every))
+    pooled = np.mean(ratios, axis=0) if ratios else np.ones(6)
+    found = []
+    for factor, part, lost in zip(FACTORS, (slice(3, 6), slice(0, 3)), (False, blurred), strict=True):
+        deviation = factor * np.sqrt(variances[:, part].mean(1) * pooled[part].mean())
+        deviation = np.where(np.isinf(deviation), deviation, UNKNOWN if lost else np.minimum(deviation, UNKNOWN))
+        found.append(deviation)
+    return PoseErrors(tuple((radius * found[0]).tolist()), tuple(found[1].tolist()))
+
+
+def weights(errors: PoseErrors, observed: np.ndarray, radius: float, turns: bool) -> np.ndarray:
+    """Return weights of the poses of a track, 1 for the usual ones and less for those with larger errors. [S]
+
+    Args:
+        errors: Errors of the poses.
+        observed: Knots to use; others get the weight 0. [S] bool
+        radius: Radius of the body, world units.
+        turns: False if its rotations are not used.
+    """
+    variances = (np.array(errors.place) / radius) ** 2
+    if turns:
+        variances = variances + 2 / 3 * np.array(errors.turn) ** 2
+    variances = np.maximum(variances, EXACT**2)
+    used = observed & np.isfinite(variances)
+    if not used.any():
+        return observed.astype(np.float64)
+    share = np.where(used, variances, np.inf) / float(np.median(variances[used]))
+    return np.minimum(2 / (1 + share), 1.0)
+
+
+def drift(errors: PoseErrors, observed: np.ndarray) -> tuple[float, float]:
+    """Return the usual errors of displacements, world units, and rotations, rad; zero if no image shows the body."""
+    used = observed & np.isfinite(errors.turn)
+    if not used.any():
+        return 0.0, 0.0
+    return float(np.median(np.array(errors.place)[used])), float(np.median(np.array(errors.turn)[used]))

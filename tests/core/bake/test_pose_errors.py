@@ -1,0 +1,90 @@
+"""Errors of observed poses from images: as large as real errors, infinite without views, weights of a fit."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.bake import pose_errors
+from r5dgs_core.config import config
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.motion.history import PoseErrors
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
+from tests.support import tiny_datasets
+
+HIDDEN = 2  # knot
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory):
+    """The true scene of a tiny data set, and the data set."""
+    tiny = tiny_datasets.make_dataset(tmp_path_factory.mktemp("errors"), width=96, height=72)
+    return tiny.truth, datasets.read(tiny.root)
+
+
+def measured(monkeypatch, scene, data, noise=0.02, shown=None):
+    """Errors of all bodies of a scene whose images show another one, with noise; no mask shows them at one knot."""
+    shown = scene if shown is None else shown
+    player, draw = scene_player.Player(shown), np.random.default_rng(3)
+
+    def image(view, _):
+        color = scene_renderer.render_frame(shown, player.frame(view.t), view.camera).color
+        return (color + noise * draw.standard_normal(color.shape)).astype(np.float32)
+
+    def mask(view):
+        ids = scene_renderer.render_frame(shown, player.frame(view.t), view.camera).ids
+        return 0 * ids if abs(view.t - scene.tracks.times[HIDDEN]) < 1e-6 else ids
+
+    monkeypatch.setattr(datasets, "load_image", image)
+    monkeypatch.setattr(datasets, "load_mask", mask)
+    bodies = [group.id for group in scene.groups if group.role == "body"]
+    return pose_errors.measure(scene, data, config.Config(), bodies, True)
+
+
+def test_errors_follow_the_misfit_and_are_infinite_at_knots_that_no_image_shows(monkeypatch, given):
+    scene, data = given
+    found, noisy = (measured(monkeypatch, scene, data, noise) for noise in (0.01, 0.04))
+    assert set(found) == {group.id for group in scene.groups if group.role == "body"}
+    for group, own in found.items():
+        place, turn = np.array(own.place), np.array(own.turn)
+        assert np.flatnonzero(np.isinf(place)).tolist() == np.flatnonzero(np.isinf(turn)).tolist() == [HIDDEN]
+        seen = np.isfinite(place)
+        assert (place[seen] > 0).all() and (place[seen] < 0.1 * scene.groups[group].model.radius).all()
+        for name in ("place", "turn"):
+            growth = np.median(np.array(getattr(noisy[group], name))[seen] / np.array(getattr(own, name))[seen])
+            assert 2 < growth < 8
+
+
+def test_rotations_are_unknown_if_the_images_show_another_texture(monkeypatch, given):
+    scene, data = given
+    group = tiny_datasets.BRICK
+    index = next(g.id for g in scene.groups if g.object_id == group and g.role == "body")
+    sh = scene.gaussians.sh.copy()
+    mine = np.flatnonzero(scene.gaussians.motion_ids == index)
+    sh[mine] = sh[np.random.default_rng(0).permutation(mine)]
+    other = scene.with_arrays(sh=sh)
+    found = measured(monkeypatch, other, data, shown=scene)[index]
+    seen = np.isfinite(found.turn)
+    assert (np.array(found.turn)[seen] == pose_errors.UNKNOWN).all()
+    assert (np.array(measured(monkeypatch, scene, data)[index].turn)[seen] < 0.5).all()
+
+
+def test_poses_with_large_errors_count_less_and_unseen_ones_not_at_all():
+    errors = PoseErrors((0.1, 0.1, 0.1, 0.3, np.inf, 0.1), (0.1, 0.1, 0.1, 0.3, np.inf, 0.1))
+    observed = np.array([True, True, True, True, True, False])
+    weights = pose_errors.weights(errors, observed, 1.0, True)
+    assert weights[:3].tolist() == [1, 1, 1] and weights[3] == pytest.approx(0.2) and weights[4:].tolist() == [0, 0]
+    assert pose_errors.drift(errors, observed) == (0.1, 0.1)
+    turned = dataclasses.replace(errors, turn=(9.0, 0.1, 0.1, 0.3, np.inf, 0.1))
+    assert (
+        pose_errors.weights(turned, observed, 1.0, False)[0] == 1 > pose_errors.weights(turned, observed, 1.0, True)[0]
+    )
+
+
+def test_without_any_view_all_observed_poses_count_alike():
+    errors = PoseErrors((np.inf,) * 2, (np.inf,) * 2)
+    assert pose_errors.weights(errors, np.array([True, False]), 1.0, True).tolist() == [1, 0]
+    assert pose_errors.drift(errors, np.array([True, False])) == (0, 0)
+    exact = PoseErrors((0.0,) * 2, (0.0,) * 2)
+    assert pose_errors.weights(exact, np.array([True, True]), 1.0, True).tolist() == [1, 1]
