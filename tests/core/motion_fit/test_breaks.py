@@ -81,12 +81,12 @@ def test_a_break_without_noise_is_exact(name):
 @pytest.mark.parametrize("left", [2, 3])
 def test_few_poses_after_a_break_suffice(left):
     errors = []
-    for seed in range(4):
+    for seed in range(2):
         at = TIMES[-left] - 0.6 * STEP
         fit, error = observed(broken(at), np.random.default_rng(seed))
         assert abs(fit.history.events[-1].time - at) < STEP
         errors.append(error)
-    assert np.median(errors) < {2: 10, 3: 8}[left]
+    assert max(errors) < {2: 10, 3: 8}[left]
 
 
 def test_segments_lie_between_events_and_hold_the_rates_of_each_side():
@@ -129,7 +129,7 @@ def test_the_last_part_may_have_a_law_of_its_own():
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
 def test_smooth_motions_have_no_events(correlation):
     rng, found = np.random.default_rng(1), 0
-    for _ in range(6):
+    for _ in range(3):
         v, w, a = rng.normal(size=3), 1.5 * rng.normal(size=3), rng.choice([0, 8.0]) * rng.normal(size=3)
         noise = rng.normal(size=(15, 6))
         for i in range(1, 15):

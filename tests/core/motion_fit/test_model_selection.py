@@ -39,18 +39,15 @@ def test_uneven_times_and_gaps_are_supported(name):
 
 def test_the_right_family_is_chosen_in_noise_and_beats_the_largest():
     rng = np.random.default_rng(2)
-    right, total, ours, full = 0, 0, [], []
-    for name, (_, names) in MOTIONS.items():
-        for _ in range(1 + (name != "static")):
-            truth = MOTIONS[name][0]
-            quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
-            fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
-            largest = model_selection.fit(TIMES, quats, d, radius=RADIUS, candidates=["full, free centre"])
-            right += fit.chosen in names
-            total += 1
-            ours.append(problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0])
-            full.append(problems.error_percent(largest.model, truth, HORIZON[:1], last_quat, last)[0])
-    assert right >= 0.85 * total
+    right, ours, full = 0, [], []
+    for truth, names in MOTIONS.values():
+        quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
+        fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
+        largest = model_selection.fit(TIMES, quats, d, radius=RADIUS, candidates=["full, free centre"])
+        right += fit.chosen in names
+        ours.append(problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0])
+        full.append(problems.error_percent(largest.model, truth, HORIZON[:1], last_quat, last)[0])
+    assert right >= 0.85 * len(MOTIONS)
     assert np.median(ours) < 0.6 * np.median(full)
 
 
@@ -107,7 +104,7 @@ def test_a_tumbling_box_is_recovered_without_noise():
 def test_the_inertia_changes_nothing_for_bodies_that_do_not_tumble():
     box = np.diag([0.4, 0.8, 1.0])
     rng = np.random.default_rng(22)
-    for name in ("static", "uniform", "ballistic", "spin", "hinge", "rolling, slowing", "pendulum"):
+    for name in ("static", "spin", "rolling, slowing"):
         quats, d, _, _ = problems.observe(MOTIONS[name][0], TIMES, rng, 0.003 * SIZE, 0.01)
         plain = model_selection.fit(TIMES, quats, d, radius=RADIUS)
         assert model_selection.fit(TIMES, quats, d, radius=RADIUS, inertia=box).model == plain.model

@@ -38,11 +38,16 @@ def observed(truths, rng, sigma=0.005 * SIZE):
     return tracks, fits, lasts
 
 
+@pytest.fixture(scope="module")
+def falls():
+    rng = np.random.default_rng(0)
+    return [observed(FALLING, rng) for _ in range(4)]
+
+
 @pytest.mark.parametrize("up", [None, np.array([0, 0, 2.0])])
-def test_bodies_that_fall_share_gravity_and_are_predicted_better(up):
-    rng, alone, together, sharing = np.random.default_rng(0), [], [], []
-    for _ in range(4):
-        tracks, fits, lasts = observed(FALLING, rng)
+def test_bodies_that_fall_share_gravity_and_are_predicted_better(falls, up):
+    alone, together, sharing = [], [], []
+    for tracks, fits, lasts in falls:
         shared, who = shared_gravity.share(tracks, fits, up)
         assert {0, 2} <= set(who)
         sharing += who
