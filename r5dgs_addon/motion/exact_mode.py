@@ -24,6 +24,7 @@ from .exact_points import File
 
 _log = logging.getLogger(__name__)
 _told: set[str] = set()  # errors already logged
+_collections = [0]  # number of collections at the last update
 
 
 class R5DGS_PG_exact(bpy.types.PropertyGroup):
@@ -159,6 +160,18 @@ def _try(collection: bpy.types.Collection, frame: float) -> None:
         collection.r5dgs_exact.problem = problem
 
 
+@persistent
+def _notice_import(*_):
+    """Start playing scenes that were appended. Blender has no event for this before 4.3; a new collection shows it."""
+    if len(bpy.data.collections) == _collections[0]:
+        return
+    _collections[0] = len(bpy.data.collections)
+    silent = _follow_frame not in bpy.app.handlers.frame_change_pre
+    listen()
+    if silent:
+        refresh()
+
+
 def refresh() -> None:
     """Update the points of all scenes, for example after a file became readable."""
     for collection in _exact_scenes():
@@ -169,6 +182,7 @@ def refresh() -> None:
 def _look_again(*_):
     """Update handlers and points after loading, undo and redo."""
     exact_points.forget()
+    _collections[0] = len(bpy.data.collections)
     listen()
     refresh()
 
@@ -194,6 +208,7 @@ def register():
     bpy.types.Collection.r5dgs_exact = PointerProperty(type=R5DGS_PG_exact)
     for events in (bpy.app.handlers.load_post, bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
         events.append(_look_again)
+    bpy.app.handlers.depsgraph_update_post.append(_notice_import)
 
 
 def unregister():
@@ -201,6 +216,8 @@ def unregister():
     for events in (bpy.app.handlers.load_post, bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
         if _look_again in events:
             events.remove(_look_again)
+    if _notice_import in bpy.app.handlers.depsgraph_update_post:
+        bpy.app.handlers.depsgraph_update_post.remove(_notice_import)
     for events, handler in _hooks():
         if handler in events:
             events.remove(handler)

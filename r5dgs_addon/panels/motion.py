@@ -144,6 +144,9 @@ def _scene(layout, collection) -> None:
     column.operator("r5dgs.exact_mode", text=text, icon="MOD_SIMPLEDEFORM", depress=exact.enabled)
     if exact.problem:
         status_bar.wrapped(layout, bpy.context, exact.problem, "ERROR")
+    elif exact.enabled and any(cloud.data.library for cloud in loaded_scenes.members(collection, "CLOUD")):
+        text = "Linked points do not bend in viewports, only in renders; append the scene instead"
+        status_bar.wrapped(layout, bpy.context, text, "ERROR")
 
 
 CLASSES = (R5DGS_PT_motion, R5DGS_PT_change_motion, R5DGS_PT_retime, R5DGS_PT_all_motions)

@@ -9,7 +9,7 @@ from r5dgs_core.formats import ply
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
-from tests.support import motions, tiny_datasets
+from tests.support import layouts, motions, tiny_datasets
 
 TIMES = (0.0, 0.0437, 0.2, 0.3333, 0.61, tiny_datasets.T_MAX - 1e-4, tiny_datasets.T_MAX, 0.9)
 
@@ -276,3 +276,30 @@ def test_edits_of_points_stay_at_other_frames_and_when_it_is_off(blender, loaded
     blender.ops.r5dgs.exact_mode(action="OFF")
     np.testing.assert_allclose(stored(bending, "position", "vector", 3), there, atol=1e-6)
     np.testing.assert_allclose(exported(blender, bending, tmp_path), seen(blender, bending), atol=1e-5)
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_a_scene_that_bends_goes_on_bending_where_it_is_appended(blender, scene, scene_path, tmp_path, link):
+    collection = motions.load(blender, scene_path)
+    collection.asset_mark()
+    motions.go_to(blender, collection, 0.3)
+    name, blend = collection.name, tmp_path / "library.blend"
+    blender.ops.wm.save_as_mainfile(filepath=str(blend))
+    blender.ops.wm.read_homefile(app_template="")
+    assert not listeners()
+    bring = blender.ops.wm.link if link else blender.ops.wm.append
+    bring(
+        filepath=f"{blend}/Collection/{name}", directory=f"{blend}/Collection/", filename=name,
+        instance_collections=link,
+    )  # fmt: skip
+    blender.context.view_layer.update()
+    own = next(one for one in blender.data.collections if one.r5dgs.is_scene)
+    assert own.r5dgs_exact.enabled and len(listeners()) == 1
+    motions.go_to(blender, own, 0.2)
+    drawn = motions.addon("engine.visible_clouds").instances(blender.context.evaluated_depsgraph_get())[1]
+    assert drawn and all(one.t == pytest.approx(0.2, abs=1e-5) for one in drawn)
+    if link:
+        panel = importlib.import_module("r5dgs.r5dgs_addon.panels.motion").R5DGS_PT_all_motions
+        assert any("Linked points do not bend" in line for line in layouts.draw(blender, panel))
+    else:
+        assert_bends_like_the_core(blender, own, scene, (0.2, 0.61))
