@@ -1,0 +1,83 @@
+"""Undo and redo of every operator that changes the .blend."""
+
+import importlib
+
+import numpy as np
+import pytest
+
+from tests.support import motions
+
+OPERATORS = {  # call of each; None if another module tests it
+    "add_alias": lambda ops: ops.add_alias(word="tankard"),
+    "delete_object": lambda ops: ops.delete_object(),
+    "duplicate_object": lambda ops: ops.duplicate_object(),
+    "exact_mode": None,  # test_exact_mode.py
+    "extrapolate_until": lambda ops: ops.extrapolate_until(t_end=1.4),
+    "isolate": lambda ops: ops.isolate(),
+    "pivot_to_cursor": lambda ops: ops.pivot_to_cursor(),
+    "recolor": lambda ops: ops.recolor(tint=(0.2, 0.9, 0.1)),
+    "rename_object": lambda ops: ops.rename_object(new_name="cup"),
+    "select_by_prompt": lambda ops: ops.select_by_prompt(text="toy car"),
+    "set_display": lambda ops: ops.set_display(display="POINTS"),
+    "show_confidence": lambda ops: ops.show_confidence(),
+    "simplify_keys": lambda ops: ops.simplify_keys(tolerance=0.05),
+    "use_engine": lambda ops: ops.use_engine(),
+    "retime": lambda ops: ops.retime(kind="REVERSE"),
+    "select_floaters": lambda ops: ops.select_floaters(),
+    "add_crop_box": lambda ops: ops.add_crop_box(),
+}
+
+
+def value(item):
+    """A property as something that can be compared and printed."""
+    return (
+        np.round(np.array(item, np.float64), 5).tolist()
+        if hasattr(item, "__len__") and not isinstance(item, str)
+        else item
+    )
+
+
+def snapshot(bpy):
+    """What the operators change: objects, their motion, looks, keys, points and selection, tables and settings."""
+    found = {}
+    for obj in bpy.data.objects:
+        tint, motion = obj.r5dgs_look.tint, obj.r5dgs_motion
+        curves = {
+            name: [tuple(np.round(p.co, 4)) for p in c.keyframe_points] for name, c in motions.curves(obj).items()
+        }
+        tracks = [] if obj.animation_data is None else [track.name for track in obj.animation_data.nla_tracks]
+        chosen = obj.type == "POINTCLOUD" and "r5dgs_selected" in obj.data.attributes
+        found[obj.name] = (
+            value(obj.matrix_basis), value(tint), motion.kind, value(motion.velocity), value(obj.r5dgs_pivot.point),
+            sorted(map(str, curves.items())), tracks, chosen, [one.name for one in obj.modifiers],
+            obj.select_get() if obj.name in bpy.context.view_layer.objects else None,
+            obj.name in bpy.context.view_layer.objects and obj.visible_get(),
+        )  # fmt: skip
+    for one in (c for c in bpy.data.collections if c.r5dgs.is_scene):
+        table = [(entry.name, [alias.name for alias in entry.aliases]) for entry in one.r5dgs.table]
+        found[one.name] = one.r5dgs.display, round(one.r5dgs.t_end, 4), table
+    scene = bpy.context.scene
+    found["scene"] = scene.render.engine, scene.frame_end, [marker.frame for marker in scene.timeline_markers]
+    return found
+
+
+@pytest.mark.parametrize("name", [name for name, call in OPERATORS.items() if call is not None])
+def test_undo_and_redo_restore_everything(blender, loaded, mug, name):
+    blender.context.scene.cursor.location = (0.3, 0.2, 0.1)
+    blender.ops.ed.undo_push(message="loaded")
+    before = snapshot(blender)
+    assert OPERATORS[name](blender.ops.r5dgs) == {"FINISHED"}
+    blender.ops.ed.undo_push(message=name)
+    after = snapshot(blender)
+    assert after != before
+    blender.ops.ed.undo()
+    assert snapshot(blender) == before
+    blender.ops.ed.redo()
+    assert snapshot(blender) == after
+
+
+def test_every_operator_that_changes_the_file_offers_undo(extension):
+    operators = importlib.import_module("r5dgs.operators")
+    found = {cls.bl_idname.partition(".")[2]: cls for module in operators.modules() for cls in module.CLASSES}
+    for name in OPERATORS:
+        assert "UNDO" in found[name].bl_options, name
