@@ -31,10 +31,16 @@ def problems(path):
     return [finding.problem for finding in check.check(path) if finding.severity == findings.ERROR]
 
 
-def assert_strict_reader_raises_the_first(path):
+def only_problem(path):
+    """The one fault of a scene file, which its reader raises."""
+    (found,) = check.check(path)
+    assert_strict_reader_raises(found, path)
+    return found.problem
+
+
+def assert_strict_reader_raises(first, path):
     with pytest.raises(errors.SceneFileError) as caught:
         scene_file.read(path)
-    first = check.check(path)[0]
     assert str(caught.value).startswith(f"{first.place}: {first.problem[:40]}")
 
 
@@ -55,8 +61,7 @@ SHARED_ROWS = ("track_times", "residual_rows")
 )
 def test_a_damaged_array_is_one_fault(name, damage, sound, tmp_path):
     broken = rewrite(sound, tmp_path / "b.r5dgs", replace={f"{name}.npy": DAMAGES[damage](array(sound, name))})
-    assert len(problems(broken)) == 1 and name in problems(broken)[0], problems(broken)
-    assert_strict_reader_raises_the_first(broken)
+    assert name in only_problem(broken)
 
 
 @pytest.mark.parametrize("name", DTYPES)
@@ -84,7 +89,7 @@ def test_three_arrays_a_camera_and_two_objects_are_six_faults(sound, tmp_path):
     assert len(found) == 6, found
     for part in ("means", "sh.npy", "quats", "objects[1]: color", "objects[2]: aliases", "camera"):
         assert any(part in problem for problem in found), part
-    assert_strict_reader_raises_the_first(broken)
+    assert_strict_reader_raises(check.check(broken)[0], broken)
 
 
 def test_all_wrong_entries_of_scene_json_are_listed(sound, tmp_path):

@@ -91,7 +91,7 @@ def test_masks_marked_unknown_do_not_change_the_labels(tiny, seen, pose):
             v if (k + k // 6) % 3 == 0 else marked(v, v.mask == tiny_datasets.BALL, missed) for k, v in enumerate(seen)
         ]
         labels = label_votes.elect(label_votes.votes(some, pose, CLASSES, len(truth)), fallback)
-        settings = config.load(None, ["identity.iterations=60"])
+        settings = config.load(None, ["identity.iterations=30"])
         means = torch.from_numpy(tiny.truth.gaussians.means)
         encodings, weight, bias = identity_training.train_encodings(
             some, pose, CLASSES, labels, settings, means, torch.Generator().manual_seed(0)

@@ -32,10 +32,11 @@ from r5dgs_core.train import learning_curves
 from tests.support import tiny_datasets
 learning_curves.LearningCurves.update = lambda self, *, finished=False: None
 data, folder = Path(sys.argv[1]), Path(sys.argv[2])
-run.train(data, folder / "run", tiny_datasets.settings("train.iterations=30", *sys.argv[3:]))
-bake.run_bake(folder / "run", folder / "still.r5dgs")
-scene = scene_file.read(folder / "still.r5dgs")
-scene_player.frame(scene, 2.0)
+for name in sys.argv[3:]:
+    settings = tiny_datasets.settings("train.iterations=25", f"train.representation={name}")
+    run.train(data, folder / name, settings)
+    bake.run_bake(folder / name, folder / f"{name}.r5dgs")
+    scene_player.frame(scene_file.read(folder / f"{name}.r5dgs"), 2.0)
 print(json.dumps(sorted(name for name in sys.modules if name.startswith("r5dgs_core"))))
 """
 
@@ -50,16 +51,25 @@ def train_views(data):
     return training_views.load(read, normalization.from_cameras([v.camera for v in read.train]), None)
 
 
-@pytest.mark.parametrize("representation", ["tracks", "field"])
-def test_a_scene_at_rest_has_nothing_that_moves_in_run_file_and_memory(still, tmp_path, representation):
-    asked = f"train.representation={representation}"
-    done = processes.run(RUN, still.root, tmp_path, asked)
+@pytest.fixture(scope="module")
+def baked_at_rest(still, tmp_path_factory):
+    """Folder of the scenes that a fresh process trained in both representations, and the modules that it loaded."""
+    folder = tmp_path_factory.mktemp("at rest")
+    done = processes.run(RUN, still.root, folder, "tracks", "field")
     assert done.returncode == 0, done.stderr
-    loaded = json.loads(done.stdout.splitlines()[-1])
-    parts = {name.rpartition(".")[2] for name in loaded}
+    return folder, json.loads(done.stdout.splitlines()[-1])
+
+
+def test_training_a_scene_at_rest_loads_no_module_of_motion(baked_at_rest):
+    parts = {name.rpartition(".")[2] for name in baked_at_rest[1]}
     assert not parts & set(MOVING_PARTS) and not [part for part in parts if part.startswith("field")]
-    scene = scene_file.read(tmp_path / "still.r5dgs")
-    members = set(zipfile.ZipFile(tmp_path / "still.r5dgs").namelist())
+
+
+@pytest.mark.parametrize("representation", ["tracks", "field"])
+def test_the_file_of_a_scene_at_rest_has_nothing_that_moves(baked_at_rest, representation):
+    path = baked_at_rest[0] / f"{representation}.r5dgs"
+    scene = scene_file.read(path)
+    members = set(zipfile.ZipFile(path).namelist())
     moving = ("track_times", "track_poses", "dynamics", "canonical_means", "residual_rows", "shading")
     assert not members & {f"{name}.npy" for name in moving}
     decisions = {row["name"]: row["decision"] for row in scene.needs}
