@@ -94,7 +94,7 @@ def measure(
         posed: dict[float, list[PosedScene]] = {}
         for number, view in enumerate(shown):
             if view.t not in posed:
-                posed[view.t] = [scene_renderer.pose_frame(scene, player.frame(view.t)) for player in players]
+                posed[view.t] = [posed_scene.pose_frame(scene, player.frame(view.t)) for player in players]
             truth, ids = datasets.load_image(view, behind), datasets.load_mask(view) if masked else None
             if ids is None or number == 0:
                 picture = scene_renderer.render_frame(scene, posed[view.t][0], view.camera)
