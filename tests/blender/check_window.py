@@ -391,7 +391,39 @@ def combine_by_depth(first: bpy.types.Scene, second: bpy.types.Scene) -> None:
     tree.links.new(combine.outputs[0], output)
 
 
-CHECKS = (browsing, typing, clicking, rendering, previewing, stopping, looking, exporting, capturing, merging)
+def selecting(path: Path, folder: Path):
+    """A drag with the tool *Brush Gaussians* selects Gaussians in one undo step."""
+    points, region = w.service("clean_up.selected_points"), w.region_of(w.area_of("VIEW_3D"))
+    with w.inside():
+        bpy.ops.view3d.view_all()
+        bpy.ops.ed.undo_push(message="View")
+        bpy.ops.wm.tool_set_by_id(name="r5dgs.brush_tool")
+    yield 1.0
+    yield from w.drag(region, (0.3 * region.width, 0.7 * region.height), (0.6 * region.width, 0.2 * region.height))
+    count = points.count(loaded()[0])
+    assert count > 0, "the brush selected nothing"
+    yield from w.press("ctrl+z")
+    assert points.count(loaded()[0]) == 0, "Ctrl+Z left a selection"
+    yield from w.press("ctrl+shift+z")
+    assert points.count(loaded()[0]) == count, "Ctrl+Shift+Z did not bring the selection back"
+    with w.inside():
+        bpy.ops.wm.tool_set_by_id(name="builtin.select_box")
+        bpy.ops.r5dgs.select_gaussians(action="NONE")
+
+
+CHECKS = (
+    browsing,
+    typing,
+    clicking,
+    selecting,
+    rendering,
+    previewing,
+    stopping,
+    looking,
+    exporting,
+    capturing,
+    merging,
+)
 
 
 def checks(path: Path, chosen: list):
