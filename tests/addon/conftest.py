@@ -73,16 +73,25 @@ def blender(extension):
     return bpy
 
 
+@pytest.fixture(scope="session")
+def scene_contents(tmp_path_factory):
+    """Contents of the file of a synthetic scene of five objects."""
+    path = tmp_path_factory.mktemp("scene") / "synthetic.r5dgs"
+    return scene_file.write(scenes.make_scene(n=400, objects=5, seed=1), path).read_bytes()
+
+
 @pytest.fixture
-def scene_path(tmp_path):
-    """File of a synthetic scene of five objects."""
-    return scene_file.write(scenes.make_scene(n=400, objects=5, seed=1), tmp_path / "synthetic.r5dgs")
+def scene_path(scene_contents, tmp_path):
+    """File of a synthetic scene of five objects, of the test's own."""
+    path = tmp_path / "synthetic.r5dgs"
+    path.write_bytes(scene_contents)
+    return path
 
 
 @pytest.fixture
 def loaded(blender, scene_path):
     """Its collection in Blender."""
-    return motions.load(blender, scene_path)
+    return motions.load_again(blender, scene_path)
 
 
 @pytest.fixture

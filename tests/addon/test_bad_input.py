@@ -72,7 +72,7 @@ def saved(blender, tmp_path):
 def loaded(saved, scene_path, monkeypatch):
     """`saved` with a scene, a camera and the render engine."""
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
-    motions.load(saved, scene_path)
+    motions.load_again(saved, scene_path)
     render = saved.context.scene.render
     render.engine, render.resolution_x, render.resolution_y = "R5DGS", 64, 48
     saved.ops.wm.save_mainfile()

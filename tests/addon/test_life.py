@@ -51,7 +51,7 @@ def library(blender, scene_path, tmp_path):
     blend = tmp_path / "library" / "library.blend"
     blend.parent.mkdir()
     blender.ops.wm.read_homefile(app_template="", use_empty=True)
-    motions.load(blender, scene_path)
+    motions.load_again(blender, scene_path)
     blender.ops.wm.save_as_mainfile(filepath=str(blend))
     blender.ops.wm.read_homefile(app_template="", use_empty=True)
     return blend

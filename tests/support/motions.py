@@ -1,6 +1,9 @@
 """Loaded scenes for tests of motion: positions of their points and contents of their curves."""
 
+import hashlib
 import importlib
+import pickle
+from unittest import mock
 
 import numpy as np
 
@@ -8,6 +11,7 @@ from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import cameras
 
 POSITION_TOLERANCE = 1e-5  # of the scene's size: float32 in Blender and the tolerance of reduced keys
+_REDUCED = {}  # curves by everything that `keyframes.curves` reads
 
 
 def addon(name):
@@ -20,6 +24,24 @@ def load(bpy, path, **options):
     before = set(bpy.data.collections)
     assert bpy.ops.r5dgs.load_scene(filepath=str(path), **options) == {"FINISHED"}
     return next(c for c in bpy.data.collections if c not in before and c.r5dgs.is_scene)
+
+
+def load_again(bpy, path, **options):
+    """`load` for fixtures: keys of a motion that another test has loaded are not reduced again.
+
+    Reduction is most of the time of a small scene, and a function of its arguments only.
+    """
+    keyframes = addon("motion.keyframes")
+    reduce = keyframes.curves
+
+    def curves(*arguments):
+        key = hashlib.blake2b(pickle.dumps(arguments)).digest()
+        if key not in _REDUCED:
+            _REDUCED[key] = reduce(*arguments)
+        return _REDUCED[key]
+
+    with mock.patch.object(keyframes, "curves", curves):
+        return load(bpy, path, **options)
 
 
 def choose(bpy, *objects):

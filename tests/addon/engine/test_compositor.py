@@ -7,7 +7,7 @@ import pytest
 
 from r5dgs_core.data import images
 from r5dgs_core.scene import scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
@@ -33,7 +33,7 @@ def merged(blender, tmp_path, monkeypatch):
         if obj.type != "CAMERA":
             blender.data.objects.remove(obj)
     scene = scenes.make_scene(n=600, objects=3, seed=4)
-    blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(scene, tmp_path / "scene.r5dgs")))
+    motions.load_again(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
     blender.ops.r5dgs.use_engine()
     blender.ops.r5dgs.show_colors_as_trained()
     gaussians.frame_set(46)

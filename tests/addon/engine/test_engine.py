@@ -15,7 +15,7 @@ from r5dgs_core.data import images
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import cameras, scene_file
-from tests.support import layouts, scenes
+from tests.support import layouts, motions, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -33,8 +33,7 @@ def scene(tmp_path):
 def loaded(blender, scene, tmp_path, monkeypatch):
     """Scene with render engine, first camera and multilayer EXR output."""
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
-    blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(scene, tmp_path / "scene.r5dgs")))
-    collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
+    collection = motions.load_again(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
     camera = scene.cameras[0]
     data = blender.data.cameras.new("view")
     data.sensor_fit, data.lens = "HORIZONTAL", camera.intrinsics[0, 0] * data.sensor_width / camera.width

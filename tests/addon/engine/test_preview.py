@@ -18,7 +18,7 @@ from r5dgs_core.playback import scene_player
 from r5dgs_core.render import posed_scene, scene_renderer
 from r5dgs_core.scene import cameras, quality, scene_file
 from r5dgs_core.scene.instance import Instance
-from tests.support import layouts, patience, scenes
+from tests.support import layouts, motions, patience, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -39,8 +39,7 @@ def worker(blender, monkeypatch):
 
 @pytest.fixture
 def loaded(blender, worker, scene_path):
-    blender.ops.r5dgs.load_scene(filepath=str(scene_path))
-    collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
+    collection = motions.load_again(blender, scene_path)
     scene = scene_file.read(scene_path)
     place_camera(blender, collection, scene.cameras[0])
     return collection

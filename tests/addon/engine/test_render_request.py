@@ -35,7 +35,7 @@ def load(blender, tmp_path):
     def loaded(name, **options):
         made = dataclasses.replace(scenes.make_scene(world_convention="colmap", **options), name=name)
         path = scene_file.write(made, tmp_path / f"{name}.r5dgs")
-        return motions.load(blender, path), scene_file.read(path)
+        return motions.load_again(blender, path), scene_file.read(path)
 
     return loaded
 

@@ -5,7 +5,7 @@ import pytest
 
 from r5dgs_core.data import images
 from r5dgs_core.scene import scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
@@ -18,7 +18,7 @@ def stereo(blender, tmp_path, monkeypatch):
     """Scene with a stereo camera that writes one file per eye."""
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
     scene = scenes.make_scene(n=600, objects=3, seed=4)
-    blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(scene, tmp_path / "scene.r5dgs")))
+    motions.load_again(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
     blender.ops.r5dgs.use_engine()
     blender.ops.r5dgs.show_colors_as_trained()
     shown = blender.context.scene

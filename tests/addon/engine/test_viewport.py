@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.scene import cameras, scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
@@ -18,7 +18,7 @@ def seen(blender, tmp_path, monkeypatch):
     """Return the visible scene of the camera at a frame."""
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
     picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
-    blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(scenes.make_scene(n=300), tmp_path / "scene.r5dgs")))
+    motions.load_again(blender, scene_file.write(scenes.make_scene(n=300), tmp_path / "scene.r5dgs"))
     render = blender.context.scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = 64, 40, 100
 

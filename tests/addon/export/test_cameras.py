@@ -33,7 +33,7 @@ def view(blender):
 def loaded(blender, tmp_path):
     made = scenes.make_scene(n=100, world_convention="colmap")
     path = scene_file.write(made, tmp_path / "scene.r5dgs")
-    return motions.load(blender, path, fit_timeline=False, cameras=False)
+    return motions.load_again(blender, path, fit_timeline=False, cameras=False)
 
 
 def pixel(camera, point):

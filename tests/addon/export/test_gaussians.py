@@ -13,7 +13,7 @@ from r5dgs_core.render import posed_scene, scene_renderer
 from r5dgs_core.scene import cameras, scene_file, sh_color
 from r5dgs_core.scene.instance import Instance
 from r5dgs_core.scene.splats import Splats
-from tests.support import scenes
+from tests.support import motions, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -31,8 +31,7 @@ def scene(tmp_path):
 
 @pytest.fixture
 def loaded(blender, scene, tmp_path):
-    blender.ops.r5dgs.load_scene(filepath=str(tmp_path / "scene.r5dgs"))
-    return next(c for c in blender.data.collections if c.r5dgs.is_scene)
+    return motions.load_again(blender, tmp_path / "scene.r5dgs")
 
 
 @pytest.fixture

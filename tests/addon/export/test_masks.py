@@ -10,7 +10,7 @@ from r5dgs_core.data import images
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import cameras, scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -26,7 +26,7 @@ def scene(tmp_path):
 @pytest.fixture
 def loaded(blender, scene, tmp_path, monkeypatch):
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
-    blender.ops.r5dgs.load_scene(filepath=str(tmp_path / "scene.r5dgs"))
+    motions.load_again(blender, tmp_path / "scene.r5dgs")
     camera, view = scene.cameras[0], blender.context.scene
     view.camera.data.sensor_fit = "HORIZONTAL"
     view.camera.data.lens = camera.intrinsics[0, 0] * view.camera.data.sensor_width / camera.width

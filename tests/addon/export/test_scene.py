@@ -27,7 +27,7 @@ def scene(tmp_path):
 
 @pytest.fixture
 def loaded(blender, scene, tmp_path):
-    return motions.load(blender, tmp_path / "scene.r5dgs")
+    return motions.load_again(blender, tmp_path / "scene.r5dgs")
 
 
 def save(bpy, path):

@@ -34,7 +34,7 @@ def loaded(blender, folders, monkeypatch):
     monkeypatch.setenv("R5DGS_PYTHON", sys.executable)
     monkeypatch.setenv("R5DGS_TEXT_ENCODER", str(folders[0]))
     motions.addon("language.phrase_embeddings").forget()
-    blender.ops.r5dgs.load_scene(filepath=str(folders[2]))
+    motions.load_again(blender, folders[2])
     return blender
 
 

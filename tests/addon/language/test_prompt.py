@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from r5dgs_core.scene import scene_file
-from tests.support import layouts, scenes
+from tests.support import layouts, motions, scenes
 
 
 @pytest.fixture
 def loaded(blender, tmp_path):
     path = scene_file.write(scenes.make_scene(n=300, objects=6), tmp_path / "scene.r5dgs")
-    blender.ops.r5dgs.load_scene(filepath=str(path))
+    motions.load_again(blender, path)
     path.unlink()  # the file is not needed any more
     return next(c for c in blender.data.collections if c.r5dgs.is_scene)
 
@@ -267,7 +267,7 @@ def meaningful(blender, tmp_path):
         bare.with_arrays(embeddings=axes, vocabulary_embeddings=axes[row : row + 1]), vocabulary=("sour thing",)
     )
     path = scene_file.write(rich, tmp_path / "meaningful.r5dgs")
-    blender.ops.r5dgs.load_scene(filepath=str(path))
+    motions.load_again(blender, path)
     return path, rich
 
 

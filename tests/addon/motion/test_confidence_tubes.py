@@ -31,7 +31,7 @@ def scene():
 
 @pytest.fixture
 def loaded(blender, scene, tmp_path):
-    return motions.load(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
+    return motions.load_again(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"))
 
 
 def rings(tube):

@@ -32,7 +32,7 @@ def scene(scene_path):
 @pytest.fixture
 def loaded(blender, scene_path):
     """The scene, loaded rigid."""
-    return motions.load(blender, scene_path, bend=False)
+    return motions.load_again(blender, scene_path, bend=False)
 
 
 def listeners():

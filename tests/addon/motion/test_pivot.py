@@ -17,7 +17,7 @@ PIVOT = np.array([0.4, -0.3, 0.9])
 @pytest.fixture
 def loaded(blender, scene_path):
     """A scene whose root was moved, turned and scaled."""
-    collection = motions.load(blender, scene_path)
+    collection = motions.load_again(blender, scene_path)
     root = collection.r5dgs.root
     root.location, root.scale = (3.0, -1.0, 2.0), (2.0, 2.0, 2.0)
     root.rotation_mode, root.rotation_quaternion = "QUATERNION", (0.6, 0.0, 0.8, 0.0)

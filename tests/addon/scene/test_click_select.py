@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import pytest
 
 from r5dgs_core.scene import scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 
 @pytest.fixture
 def click(blender, tmp_path):
     path = scene_file.write(scenes.make_scene(n=200), tmp_path / "scene.r5dgs")
-    blender.ops.r5dgs.load_scene(filepath=str(path))
+    motions.load_again(blender, path)
     return importlib.import_module("r5dgs.r5dgs_addon.scene.click_select")
 
 

@@ -10,7 +10,7 @@ from r5dgs_core.formats import ply
 from r5dgs_core.playback import affine_transform
 from r5dgs_core.render import posed_scene, scene_renderer
 from r5dgs_core.scene import scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -25,7 +25,7 @@ def scene(tmp_path):
 
 @pytest.fixture
 def loaded(blender, scene, tmp_path):
-    blender.ops.r5dgs.load_scene(filepath=str(tmp_path / "scene.r5dgs"))
+    motions.load_again(blender, tmp_path / "scene.r5dgs")
     blender.context.scene.frame_set(40)
     return next(c for c in blender.data.collections if c.r5dgs.is_scene)
 

@@ -3,14 +3,14 @@
 import pytest
 
 from r5dgs_core.scene import scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 
 @pytest.fixture
 def load(blender, tmp_path):
     def load(name):
         path = scene_file.write(scenes.make_scene(n=200), tmp_path / f"{name}.r5dgs")
-        blender.ops.r5dgs.load_scene(filepath=str(path))
+        motions.load_again(blender, path)
 
     load("first")
     return load

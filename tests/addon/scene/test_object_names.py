@@ -6,7 +6,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.scene import scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 MUG, APPLE, CAR = 1, 2, 3
 
@@ -18,8 +18,7 @@ def path(tmp_path):
 
 @pytest.fixture
 def loaded(blender, path):
-    blender.ops.r5dgs.load_scene(filepath=str(path))
-    return next(c for c in blender.data.collections if c.r5dgs.is_scene)
+    return motions.load_again(blender, path)
 
 
 @pytest.fixture

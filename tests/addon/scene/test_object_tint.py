@@ -7,7 +7,7 @@ import pytest
 
 from r5dgs_core.color import srgb
 from r5dgs_core.scene import scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 TINT = (0.25, 0.5, 1.0)
 
@@ -15,7 +15,7 @@ TINT = (0.25, 0.5, 1.0)
 @pytest.fixture
 def mug(blender, tmp_path):
     path = scene_file.write(scenes.make_scene(n=300, sh_degree=1), tmp_path / "scene.r5dgs")
-    blender.ops.r5dgs.load_scene(filepath=str(path))
+    motions.load_again(blender, path)
     return blender.data.objects["mug"]
 
 

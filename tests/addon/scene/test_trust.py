@@ -34,7 +34,7 @@ def scene_path(tmp_path):
 @pytest.fixture
 def blend(blender, trust, scene_path, tmp_path):
     """A .blend with Exact Mode on whose scene file is in another folder, opened in a new session."""
-    motions.load(blender, scene_path)
+    motions.load_again(blender, scene_path)
     blender.ops.r5dgs.exact_mode(action="ON")
     path = tmp_path / "project" / "work.blend"
     path.parent.mkdir()

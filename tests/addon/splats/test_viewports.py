@@ -43,7 +43,7 @@ def viewport(bpy, address, regions=()):
 
 @pytest.fixture
 def collection(blender, tmp_path):
-    return motions.load(blender, scene_file.write(scenes.make_scene(n=100), tmp_path / "scene.r5dgs"))
+    return motions.load_again(blender, scene_file.write(scenes.make_scene(n=100), tmp_path / "scene.r5dgs"))
 
 
 def filled(bpy, visible, collection):
