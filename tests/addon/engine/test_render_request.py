@@ -107,8 +107,7 @@ def test_a_scene_loaded_twice_is_drawn_twice(blender, picture, kitchen):
 def test_exact_mode_renders_deformed_gaussians(blender, picture, load, tmp_path):
     made = tiny_datasets.breathing(tiny_datasets.make_truth(), 0.4)
     path = scene_file.write(made, tmp_path / "balloon.r5dgs")
-    assert blender.ops.r5dgs.load_scene(filepath=str(path)) == {"FINISHED"}
-    collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
+    collection = motions.load(blender, path, bend=False)
     place_camera(blender, collection, made.cameras[0], made.world_convention)
     scene, t = scene_file.read(path), 0.2
     blender.context.scene.frame_set(int(1 + scene.frames_per_unit * t))
