@@ -17,7 +17,7 @@ from tests.support import scenes
 
 WIDTH, HEIGHT = 48, 36
 OBSERVED, LATER = (0.0, 0.3, 0.75), (0.85, 1.0)
-BACKEND = "reference"
+BACKEND = "cpu"
 
 
 def write_dataset(root: Path, scene: Scene) -> dataset.Dataset:

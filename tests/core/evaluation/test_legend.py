@@ -7,11 +7,11 @@ import pytest
 
 from r5dgs_core.evaluation import legend
 from r5dgs_core.render import viewpoints
-from tests.support import scenes
+from tests.support import pictures, scenes
 
 pytestmark = pytest.mark.heavy
 
-BACKEND = "reference"
+BACKEND = pictures.BACKEND
 
 
 def board(height=720, width=960):
