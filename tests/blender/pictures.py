@@ -169,41 +169,19 @@ def preview(window: Window):
 
 
 def merge(window: Window):
-    """A mesh by Cycles among the Gaussians, merged by depth in the compositor."""
+    """A mesh by Cycles among the Gaussians, by Merge with Meshes."""
     gaussians = bpy.context.scene
-    gaussians.view_layers[0].use_pass_z = True
-    meshes = bpy.data.scenes.new("Meshes")
     low, high = bounds()
     middle, size = (low + high) / 2, (high - low).length
     bpy.ops.mesh.primitive_monkey_add(size=0.12 * size, location=middle + Vector((-0.03, -0.08, 0.02)) * size)
-    monkey = bpy.context.object
-    for holder in list(monkey.users_collection):
-        holder.objects.unlink(monkey)
     light = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
     light.data.energy, light.rotation_euler = 4.0, (0.6, 0.3, 0.0)
-    for obj in (monkey, light, gaussians.camera):
-        meshes.collection.objects.link(obj)
-    meshes.camera, meshes.render.engine = gaussians.camera, "CYCLES"
-    meshes.cycles.samples, meshes.cycles.use_denoising = 32, False
-    meshes.view_layers[0].use_pass_z = True
-    meshes.view_settings.view_transform = "Standard"
-    meshes.render.film_transparent = True  # otherwise its world would hide the sky
-    for scene in (gaussians, meshes):
-        scene.render.resolution_percentage = 60
-    for name in ("resolution_x", "resolution_y"):
-        setattr(meshes.render, name, getattr(gaussians.render, name))
-    gaussians.use_nodes = True
-    tree = gaussians.node_tree
-    tree.nodes.clear()
-    combine, output = tree.nodes.new("CompositorNodeZcombine"), tree.nodes.new("CompositorNodeComposite")
-    combine.use_alpha = True
-    combine.location, output.location = (60, 0), (280, 0)
-    for index, source in enumerate((gaussians, meshes)):
-        layers = tree.nodes.new("CompositorNodeRLayers")
-        layers.scene, layers.location = source, (-260, 250 - 420 * index)
-        tree.links.new(layers.outputs["Image"], combine.inputs[2 * index])
-        tree.links.new(layers.outputs["Depth"], combine.inputs[2 * index + 1])
-    tree.links.new(combine.outputs["Image"], output.inputs["Image"])
+    gaussians.collection.objects.link(light)
+    gaussians.view_settings.view_transform = "Standard"
+    gaussians.render.resolution_percentage = 400
+    bpy.ops.r5dgs.merge_with_meshes()
+    gaussians.r5dgs_render.meshes.cycles.samples = 32
+    gaussians.r5dgs_render.meshes.cycles.use_denoising = False
     bpy.ops.render.render()
     window.window.workspace = bpy.data.workspaces["Compositing"]
     yield 1.0
