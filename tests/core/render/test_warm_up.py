@@ -15,6 +15,7 @@ import torch
 from r5dgs_core.raster import compilation
 from r5dgs_core.render import warm_up
 from r5dgs_core.scene import scene_file
+from r5dgs_core.train import warm_up as train_warm_up
 from tests.support import scenes, tiny_datasets
 
 pytestmark = pytest.mark.heavy
@@ -29,6 +30,7 @@ from r5dgs_core.raster import compilation
 from r5dgs_core.render import scene_renderer, incremental_renderer
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
+from r5dgs_core.scene.instance import Instance
 from r5dgs_core.config import config
 from r5dgs_core.train import run
 
@@ -82,9 +84,8 @@ def scene_path(tmp_path_factory):
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
     """A copy of the kernels of this machine without one that pictures need and one that only training needs."""
-    command = [sys.executable, "-m", "r5dgs_core.cli", "warm-up", "--progress", "json"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    source = Path(json.loads(done.stdout.splitlines()[-1])["folder"])
+    train_warm_up.warm_up(lambda stage: None)
+    source = compilation.cache_folder()
     folder = tmp_path_factory.mktemp("cache")
     shutil.copytree(source, folder / source.name)
     for name in ("tiles.merge_pairs", "losses._moments"):
