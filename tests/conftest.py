@@ -25,6 +25,9 @@ BPY_PYTHON = (3, 11)
 STATUS = pytest.StashKey[int]()
 NOT_QUICK = ("blender", "heavy", "slow", "gpu", "browser", "cluster")
 
+# Files in the order in which two processes take them: the first one compiles kernels in test_warm_up.
+FIRST_FILES = ("test_warm_up.py", "test_breaks.py", "test_compilation.py", "test_model_selection.py")
+
 hypothesis.settings.register_profile("r5dgs", deadline=None, max_examples=50)
 hypothesis.settings.load_profile("r5dgs")
 
@@ -55,6 +58,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect long tests with ``--quick``, and begin with the longest files if several processes share them.
 
+    The first process compiles all kernels while the second one runs files that need none, so that no two compile them.
+
     Tests with the fixture `blender` count as marked.
     """
     long = [
@@ -68,7 +73,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     elif hasattr(config, "workerinput"):
         heavy = {item.path for item in items if item.get_closest_marker("heavy")}
         longer = {item.path for item in long}
-        items.sort(key=lambda item: (item.path not in heavy, item.path not in longer))
+        rank = {name: place for place, name in enumerate(FIRST_FILES)}
+        items.sort(
+            key=lambda item: (rank.get(item.path.name, len(rank)), item.path not in heavy, item.path not in longer)
+        )
 
 
 def pytest_report_header(config: pytest.Config) -> str:
