@@ -31,7 +31,7 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -43,10 +43,12 @@ from ..protocol import answers as wire
 from ..protocol import fields, messages
 from ..render import posed_scene
 from ..scene import quality, scene_file
-from ..scene.instance import Instance
 from ..scene.scene import Scene
 from . import edited_points, further_layers
 from .warming import WarmUpThread
+
+if TYPE_CHECKING:
+    from ..render.incremental_renderer import Stage
 
 NEEDED = ("numba",)
 
@@ -65,7 +67,7 @@ class Server:
         self._scenes: dict[tuple[str, int, int], Scene] = {}  # by path, time and size of the file; in load order
         self._failed: dict[tuple[str, int, int], str] = {}  # stamp and error of the last unreadable file
         self._points = edited_points.EditedPoints()
-        self._stage = None  # incremental renderer of `_staged`, created with the first picture
+        self._stage: Stage | None = None  # incremental renderer of `_staged`, created with the first picture
         self._staged: list[Scene] = []  # the scenes, extended by edited points
         self._numbers: list[int] = []  # scene number of each path of the last load
         self._errors: list[quality.Quality] = []  # known error of each scene
@@ -149,8 +151,12 @@ class Server:
         added: dict[str, np.ndarray] = {}
         try:
             if wanted.t is None:
-                output, ms_motion, count = self._draw(wanted, instances, scenes)
-                added = further_layers.draw(self._stage, wanted, instances, scenes)
+                stage, count = self._stage_of(scenes), sum(instance.count for instance in instances)
+                output = stage.render(
+                    instances, wanted.camera, sky=wanted.sky, near=wanted.near, distance=wanted.distance
+                )
+                ms_motion = stage.ms_motion
+                added = further_layers.draw(stage, wanted, instances, scenes)
             else:
                 output, ms_motion, count = self._play(wanted, wanted.t, scenes[wanted.scene])
         except (ValueError, OverflowError, FloatingPointError) as error:  # Gaussians out of the numeric range
@@ -173,19 +179,16 @@ class Server:
             for k, (scene, known) in enumerate(zip(self._scenes.values(), self._errors, strict=True))
         ]
 
-    def _draw(self, wanted: messages.RenderRequest, instances: list[Instance], scenes: list[Scene]):
-        """Render instances; returns the output, milliseconds of motion, and the number of Gaussians."""
+    def _stage_of(self, scenes: list[Scene]) -> Stage:
+        """Stage of the loaded scenes, which is made again when they change."""
         from ..render import incremental_renderer
 
         if self._stage is None or self._staged is not scenes:
             self._stage, self._staged = incremental_renderer.Stage(scenes), scenes
-        output = self._stage.render(
-            instances, wanted.camera, sky=wanted.sky, near=wanted.near, distance=wanted.distance
-        )
-        return output, self._stage.ms_motion, sum(instance.count for instance in instances)
+        return self._stage
 
     def _play(self, wanted: messages.RenderRequest, t: float, scene: Scene):
-        """Render a scene at a time; returns the same as `_draw`."""
+        """Render a scene at a time; returns the output, milliseconds of motion, and the number of Gaussians."""
         from ..raster import RasterSettings
         from ..render import scene_renderer
 
