@@ -7,15 +7,13 @@ anti-aliased edges.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from ..motion import rotations
-from ..raster.compilation import helper, kernel, run
-from ..raster.cpu import forward, projection, tiles
-from ..raster.cpu.projection import EXTENT_X, EXTENT_Y, L11, L12, L22, LOG2_OPACITY, MEAN_X, MEAN_Y
+from ..raster.compilation import run
+from ..raster.cpu import blend_before_depths, forward, projection, tiles
 from ..raster.settings import RasterSettings
 from ..scene import cameras, sh_color
 from ..scene.cameras import Camera
@@ -62,7 +60,7 @@ def render(
     forward.project(forward.pack_view(seen, settings), arrays, geometry, depths, boxes, radii)
     order = tiles.sort_by_depth(depths, radii)
     run(
-        _draw, camera.height // 32,
+        blend_before_depths.blend, camera.height // 32,
         geometry[order], _along_rays(gaussians, seen, order), colors[order], np.linalg.inv(camera.intrinsics), meshes,
         settings.alpha_min, settings.alpha_max, settings.finished_at, layer,
     )  # fmt: skip
@@ -128,41 +126,3 @@ def _along_rays(gaussians: scene_renderer.PosedGaussians, camera: Camera, rows: 
     centers = gaussians.means[rows].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
     upper = forms[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
     return np.ascontiguousarray(np.concatenate([upper, np.einsum("nij,nj->ni", forms, centers)], 1))
-
-
-@kernel
-def _draw(worker, workers, geometry, lines, colors, rays, meshes, least, most, finished, layer):
-    """Blend all Gaussians, nearest first, into the worker's share of the rows."""
-    height, width = meshes.shape
-    top, bottom = height * worker // workers, height * (worker + 1) // workers
-    log2_least = math.log2(least)
-    for i in range(len(geometry)):
-        g, line = geometry[i], lines[i]
-        first_y = max(top, int(math.ceil(g[MEAN_Y] - g[EXTENT_Y] - 0.5)))
-        end_y = min(bottom, int(math.floor(g[MEAN_Y] + g[EXTENT_Y] - 0.5)) + 1)
-        first_x = max(0, int(math.ceil(g[MEAN_X] - g[EXTENT_X] - 0.5)))
-        end_x = min(width, int(math.floor(g[MEAN_X] + g[EXTENT_X] - 0.5)) + 1)
-        for row in range(first_y, end_y):
-            v = g[L22] * (row + 0.5 - g[MEAN_Y])
-            for column in range(first_x, end_x):
-                mesh, passed = meshes[row, column], 1 - layer[row, column, 3]
-                if not mesh < math.inf or passed < finished:
-                    continue
-                u = g[L11] * (column + 0.5 - g[MEAN_X]) - g[L12] * (row + 0.5 - g[MEAN_Y])
-                exponent = g[LOG2_OPACITY] - u * u - v * v
-                if exponent < log2_least:
-                    continue
-                alpha = min(most, 2.0**exponent) * _share_in_front(line, rays, column + 0.5, row + 0.5, mesh)
-                for c in range(3):
-                    layer[row, column, c] += passed * alpha * colors[i, c]
-                layer[row, column, 3] += passed * alpha
-
-
-@helper
-def _share_in_front(line, rays, x, y, mesh):
-    """Share of a Gaussian's density along the ray of a pixel that lies nearer than a depth."""
-    a = rays[0, 0] * x + rays[0, 1] * y + rays[0, 2]
-    b = rays[1, 1] * y + rays[1, 2]
-    form = a * (line[0] * a + 2 * (line[1] * b + line[2])) + b * (line[3] * b + 2 * line[4]) + line[5]
-    middle = (a * line[6] + b * line[7] + line[8]) / form
-    return 0.5 * math.erfc((middle - mesh) * math.sqrt(0.5 * form))

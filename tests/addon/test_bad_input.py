@@ -149,9 +149,10 @@ def test_bad_input_raises_with_a_remedy_and_changes_nothing(saved, bad, kind):
 
 WITHOUT_A_SCENE = {
     "Load an R5DGS scene first": (
-        "add_alias", "allow_scene_file", "exact_mode", "export_format", "export_masks", "export_ply", "export_scene",
-        "extrapolate_until", "fit_timeline", "isolate", "preview", "remove_alias",
-        "rename_object", "select_by_prompt", "select_object", "set_display",
+        "add_alias", "add_crop_box", "allow_scene_file", "assign_gaussians", "delete_gaussians", "exact_mode",
+        "export_format", "export_masks", "export_ply", "export_scene", "extrapolate_until", "fit_timeline", "isolate",
+        "merge_with_meshes", "preview", "remove_alias", "rename_object", "retime", "select_by_prompt",
+        "select_floaters", "select_gaussians", "select_object", "set_display",
         "show_confidence", "view_as_trained",
     ),
     "Select an object of an R5DGS scene first": (
@@ -162,6 +163,8 @@ WITHOUT_A_SCENE = {
     "Select the objects to change": ("replace_motion",),
     "Nothing is isolated": ("unisolate",),
     "Live preview needs a window": ("live_preview",),
+    "Nothing is merged with this scene": ("stop_merging",),
+    "Use this in a 3D view": ("brush_gaussians", "lasso_gaussians"),
 }  # fmt: skip
 NEEDING_NONE = {
     "capture_dataset", "check_worker", "export_cameras", "load_scene", "show_colors_as_trained", "use_engine",
