@@ -5,7 +5,7 @@ import pytest
 
 from r5dgs_core.data import images
 from r5dgs_core.scene import scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 SIZE = 96, 72
@@ -109,19 +109,20 @@ def test_settings_that_change_after_the_click_apply_to_the_meshes(blender, scene
 
 
 def traces(blender):
-    scene = blender.context.scene
-    nodes = [] if scene.node_tree is None else [node.name for node in scene.node_tree.nodes]
-    links = [] if scene.node_tree is None else [(a.from_node.name, a.to_node.name) for a in scene.node_tree.links]
+    tree = motions.addon("compat").compositor(blender.context.scene)
+    nodes = [] if tree is None else [node.name for node in tree.nodes]
+    links = [] if tree is None else [(a.from_node.name, a.to_node.name) for a in tree.links]
     return sorted(one.name for one in blender.data.scenes), sorted(nodes), sorted(links)
 
 
 def test_stop_merging_and_undo_remove_everything(blender, scene):
     blender.ops.r5dgs.use_engine()
-    scene.use_nodes = True
-    blur = scene.node_tree.nodes.new("CompositorNodeBlur")  # a user's own node stays in its place
-    layers, output = scene.node_tree.nodes["Render Layers"], scene.node_tree.nodes["Composite"]
-    scene.node_tree.links.new(layers.outputs["Image"], blur.inputs["Image"])
-    scene.node_tree.links.new(blur.outputs[0], output.inputs["Image"])
+    compat = motions.addon("compat")
+    tree = compat.make_compositor(scene)
+    blur = tree.nodes.new("CompositorNodeBlur")  # a user's own node stays in its place
+    layers = tree.nodes.get("Render Layers") or tree.nodes.new("CompositorNodeRLayers")
+    tree.links.new(layers.outputs["Image"], blur.inputs["Image"])
+    tree.links.new(blur.outputs[0], compat.compositor_output(tree))
     blender.ops.ed.undo_push(message="before")
     before = traces(blender)
     blender.ops.r5dgs.merge_with_meshes()
