@@ -44,7 +44,7 @@ def view_of(strokes) -> object:
     bpy.context.view_layer.update()
     depsgraph = bpy.context.evaluated_depsgraph_get()
     projection = np.array(camera.calc_matrix_camera(depsgraph, x=WIDTH, y=HEIGHT))
-    return strokes.View(projection @ np.linalg.inv(np.array(camera.matrix_world)), WIDTH, HEIGHT)
+    return strokes.StrokeView(projection @ np.linalg.inv(np.array(camera.matrix_world)), WIDTH, HEIGHT)
 
 
 def main(count: int) -> None:

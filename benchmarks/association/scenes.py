@@ -21,7 +21,7 @@ TALLEST = 0.24  # semi-axis of the largest body, world units
 
 
 @dataclass(frozen=True)
-class Plan:
+class SceneSettings:
     """Content of a scene.
 
     Attributes:
@@ -54,12 +54,12 @@ class Plan:
 
 
 PLANS = {
-    "ten": Plan(),
-    "two": Plan(bodies=2, gaussians=2000, pairs=0, still=0.0),
-    "thirty": Plan(bodies=30, gaussians=9000, radius=(0.09, 0.13), pairs=4, extent=1.25),
-    "static": Plan(still=1.0, sweep_rad=1.5, views=2, times=32),
-    "leaving": Plan(leaving=True),
-    "four_images": Plan(views=4, times=1),
+    "ten": SceneSettings(),
+    "two": SceneSettings(bodies=2, gaussians=2000, pairs=0, still=0.0),
+    "thirty": SceneSettings(bodies=30, gaussians=9000, radius=(0.09, 0.13), pairs=4, extent=1.25),
+    "static": SceneSettings(still=1.0, sweep_rad=1.5, views=2, times=32),
+    "leaving": SceneSettings(leaving=True),
+    "four_images": SceneSettings(views=4, times=1),
 }
 
 
@@ -77,7 +77,7 @@ class Scene:
     paths: np.ndarray
     objects: np.ndarray
     sigmas: np.ndarray
-    plan: Plan
+    plan: SceneSettings
 
     @property
     def focal(self) -> float:
@@ -101,7 +101,7 @@ class Image:
     weights: np.ndarray
 
 
-def make(plan: Plan, seed: int) -> Scene:
+def make(plan: SceneSettings, seed: int) -> Scene:
     """Make a scene."""
     rng = np.random.default_rng(seed)
     times = np.linspace(0.0, 1.0, plan.times)
@@ -128,7 +128,9 @@ def make(plan: Plan, seed: int) -> Scene:
     return Scene(*(np.concatenate(parts) for parts in (paths, objects, sigmas)), plan)
 
 
-def _motions(plan: Plan, axes: np.ndarray, times: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def _motions(
+    plan: SceneSettings, axes: np.ndarray, times: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, ...]:
     """Centres [M, T, 3] and rotations about the vertical [M, T] of bodies that stay apart, except in pairs."""
     ahead = times[:, None]
     centres, turns = np.zeros((plan.bodies, len(times), 3)), np.zeros((plan.bodies, len(times)))
@@ -208,7 +210,7 @@ def observe(scene: Scene, error_px: float, model: str, seed: int) -> Iterator[Im
         yield image
 
 
-def _moments(plan: Plan) -> list[tuple[int, int]]:
+def _moments(plan: SceneSettings) -> list[tuple[int, int]]:
     return [(view, t) for view in range(plan.views) for t in range(plan.times)]
 
 

@@ -40,12 +40,12 @@ MEASURES = (
     *("in", "majority", "sequential", "ours", "mended", "oracle", "objects", "found", "precision", "recall"),
     *("confident", "usual", "fallback", "seconds"),
 )
-LARGE = scenes.Plan(
+LARGE = scenes.SceneSettings(
     bodies=30, gaussians=360_000, floor=374, views=10, times=20, pixels=400, radius=(0.09, 0.13), extent=1.25
 )
 
 
-def measure(plan: scenes.Plan, case: str, error_px: float, model: str, seed: int) -> dict[str, float]:
+def measure(plan: scenes.SceneSettings, case: str, error_px: float, model: str, seed: int) -> dict[str, float]:
     """One run."""
     scene = scenes.make(plan, seed)
     images = list(scenes.observe(scene, error_px, model, seed + 1000))

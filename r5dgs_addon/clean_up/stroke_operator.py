@@ -76,7 +76,7 @@ class StrokeOperator(polls.NeedsScene):
         stroke = strokes.Stroke(path, getattr(self, "radius", None), self.depth == "FRONT")
         collection = loaded_scenes.active_collection(context)
         try:
-            count = strokes.select(context, collection, strokes.View.of(context), stroke, self.mode)
+            count = strokes.select(context, collection, strokes.StrokeView.of(context), stroke, self.mode)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

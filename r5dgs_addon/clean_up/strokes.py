@@ -16,7 +16,7 @@ DEPTHS = (
 
 
 @dataclass(frozen=True)
-class View:
+class StrokeView:
     """View in which a stroke is drawn.
 
     Attributes:
@@ -32,11 +32,11 @@ class View:
     space: bpy.types.SpaceView3D | None = None
 
     @staticmethod
-    def of(context: bpy.types.Context) -> "View":
+    def of(context: bpy.types.Context) -> "StrokeView":
         """View of the 3D view in a context."""
         region = context.region
         matrix = np.array(context.region_data.perspective_matrix, np.float64)
-        return View(matrix, region.width, region.height, context.space_data)
+        return StrokeView(matrix, region.width, region.height, context.space_data)
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,15 @@ class Stroke:
     front: bool
 
 
-def select(context: bpy.types.Context, collection: bpy.types.Collection, view: View, stroke: Stroke, mode: str) -> int:
+def select(
+    context: bpy.types.Context, collection: bpy.types.Collection, view: StrokeView, stroke: Stroke, mode: str
+) -> int:
     """Select the visible Gaussians of a loaded scene whose centres a stroke covers.
 
     Args:
         context: Context with the current frame.
         collection: Loaded scene.
-        view: View of the stroke.
+        view: StrokeView of the stroke.
         stroke: The stroke.
         mode: Key of `selected_points.MODES`.
 
@@ -97,7 +99,7 @@ def _matrix(context: bpy.types.Context, cloud: bpy.types.Object) -> np.ndarray:
     return np.array(cloud.evaluated_get(context.evaluated_depsgraph_get()).matrix_world, np.float64)
 
 
-def _seen(context: bpy.types.Context, cloud: bpy.types.Object, view: View) -> tuple[np.ndarray, ...]:
+def _seen(context: bpy.types.Context, cloud: bpy.types.Object, view: StrokeView) -> tuple[np.ndarray, ...]:
     """Pixels, depths and homogeneous coordinates of the points of a cloud. [n, 2], [n], [n]"""
     position = point_clouds.attribute(cloud.data, "position", "FLOAT_VECTOR")
     places = point_clouds.view(position, "vector", 3)
@@ -107,7 +109,7 @@ def _seen(context: bpy.types.Context, cloud: bpy.types.Object, view: View) -> tu
 def _front(
     context: bpy.types.Context,
     members: list[bpy.types.Object],
-    view: View,
+    view: StrokeView,
     pixels: np.ndarray,
     depths: np.ndarray,
     w: np.ndarray,

@@ -39,7 +39,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
     bl_use_preview = False
     bl_use_eevee_viewport = True  # for Material Preview
 
-    _port = None  # viewport that this engine instance draws
+    _viewport_image = None  # of the viewport that this engine instance draws
     _said = ""
 
     def update_render_passes(self, scene, renderlayer):
@@ -65,9 +65,9 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
 
     def view_draw(self, context, depsgraph):
         """Draw the last image of the viewport, and request another if the view has changed."""
-        if self._port is None:
-            self._port = viewport.Port()
-        self._port.draw(self, context, depsgraph)
+        if self._viewport_image is None:
+            self._viewport_image = viewport.ViewportImage()
+        self._viewport_image.draw(self, context, depsgraph)
 
     def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
         for view, eye in stereo.eyes(self, depsgraph):

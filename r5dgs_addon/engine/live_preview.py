@@ -15,46 +15,46 @@ from ..worker import jobs
 from . import render_request
 
 KEY = "live preview"  # job key for `jobs.busy`
-LOOK_S = 0.05  # timer interval while an image is rendered
+POLL_S = 0.05  # timer interval while an image is rendered
 IDLE_S = 0.1  # timer interval while the image is up to date
 
 _job: jobs.Job | None = None
-_asked: list[tuple[str, str, dict[str, Any]]] | None = None  # steps of the last request
+_last_steps: list[tuple[str, str, dict[str, Any]]] | None = None  # steps of the last request
 _message = ""
 
 
 def running() -> bool:
     """True if the live preview is on."""
-    return bpy.app.timers.is_registered(look)
+    return bpy.app.timers.is_registered(poll)
 
 
 def message() -> str:
-    """Error message if there is no image, or ""."""
+    """Error message if windows is no image, or ""."""
     return _message
 
 
 def start() -> None:
     """Start the live preview."""
-    global _asked, _message
+    global _last_steps, _message
     if not running():
-        _asked, _message = None, ""
-        bpy.app.timers.register(look, first_interval=0.0)
+        _last_steps, _message = None, ""
+        bpy.app.timers.register(poll, first_interval=0.0)
 
 
 def stop() -> None:
     """Stop the live preview without waiting for a running render."""
-    global _job, _asked, _message
-    _job, _asked, _message = None, None, ""
+    global _job, _last_steps, _message
+    _job, _last_steps, _message = None, None, ""
     if running():
-        bpy.app.timers.unregister(look)
+        bpy.app.timers.unregister(poll)
 
 
-def look() -> float:
+def poll() -> float:
     """Show a finished image and request the next one if the view changed. Returns the timer interval in seconds."""
-    global _job, _asked, _message
+    global _job, _last_steps, _message
     if _job is not None:
         if not _job.done:
-            return LOOK_S
+            return POLL_S
         job, _job = _job, None
         try:
             render_request.show(bpy.context, render_request.finish(job.answer())[0])
@@ -63,22 +63,22 @@ def look() -> float:
             _message = str(error)
         status_bar.redraw("VIEW_3D", "IMAGE_EDITOR")
     if jobs.busy() or bpy.app.is_job_running("RENDER"):
-        return LOOK_S
-    there = bpy.context.window_manager.windows
-    if not there:
+        return POLL_S
+    windows = bpy.context.window_manager.windows
+    if not windows:
         return IDLE_S
-    with bpy.context.temp_override(window=there[0]):
+    with bpy.context.temp_override(window=windows[0]):
         try:
             steps = render_request.steps(render_request.shown(bpy.context.evaluated_depsgraph_get()))
-            if steps == _asked:
+            if steps == _last_steps:
                 return IDLE_S
-            _asked, _job = steps, jobs.submit(KEY, steps)
+            _last_steps, _job = steps, jobs.submit(KEY, steps)
         except errors.R5dgsError as error:
             if str(error) != _message:
                 _message = str(error)
                 status_bar.redraw("VIEW_3D", "IMAGE_EDITOR")
             return IDLE_S
-    return LOOK_S
+    return POLL_S
 
 
 @persistent

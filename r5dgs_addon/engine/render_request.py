@@ -37,7 +37,7 @@ class VisibleParts:
         instances: Visible point clouds and instances of them.
     """
 
-    view: view_cameras.View
+    view: view_cameras.ViewCamera
     scenes: tuple[bpy.types.Collection, ...]
     worlds: tuple[np.ndarray, ...]
     instances: tuple[visible_clouds.VisibleCloud, ...]
@@ -50,7 +50,7 @@ class VisibleParts:
 
 def shown(
     depsgraph: bpy.types.Depsgraph,
-    looks: Callable[[Callable[[], np.ndarray]], view_cameras.View] | None = None,
+    looks: Callable[[Callable[[], np.ndarray]], view_cameras.ViewCamera] | None = None,
     space: bpy.types.SpaceView3D | None = None,
 ) -> VisibleParts:
     """Visible parts of the loaded scenes at the evaluated frame, sub-frame included.

@@ -11,7 +11,7 @@ from ...r5dgs_core.scene import cameras
 
 
 @dataclass(frozen=True)
-class View:
+class ViewCamera:
     """Core camera and depth range of a view.
 
     Attributes:
@@ -47,7 +47,7 @@ def of_camera(
     camera: bpy.types.Object | None = None,
     border: bool = True,
     eye: Eye | None = None,
-) -> View:
+) -> ViewCamera:
     """View of the image that Blender would render.
 
     Args:
@@ -92,7 +92,7 @@ def of_camera(
     view = _view(projection, world, width, height, points, camera.name, behind=False)
     if border and render.use_border:
         left, top, cut_width, cut_height = border_of(scene)
-        return View(cameras.crop(view.camera, left, top, cut_width, cut_height), view.distance, view.near)
+        return ViewCamera(cameras.crop(view.camera, left, top, cut_width, cut_height), view.distance, view.near)
     return view
 
 
@@ -100,7 +100,7 @@ def of_region(
     region: bpy.types.Region,
     region_3d: bpy.types.RegionView3D,
     points: Callable[[], np.ndarray],  # [P, 3]
-) -> View:
+) -> ViewCamera:
     """View of a 3D viewport.
 
     Args:
@@ -142,7 +142,7 @@ def _fitted(camera: bpy.types.Camera, render: bpy.types.RenderSettings, width: i
     return width if horizontal else up / render.pixel_aspect_x
 
 
-def _view(projection, matrix_world, width: int, height: int, points: Callable, name: str, behind: bool) -> View:
+def _view(projection, matrix_world, width: int, height: int, points: Callable, name: str, behind: bool) -> ViewCamera:
     p, world = np.array(projection, np.float64), np.array(matrix_world, np.float64)
     span = (0.0, 1.0)
     if cameras.is_parallel(p):
@@ -152,4 +152,4 @@ def _view(projection, matrix_world, width: int, height: int, points: Callable, n
     camera, distance = cameras.from_projection(p, world, width, height, span, name)
     # Orthographic cameras clip what is behind them; orthographic viewports do not.
     near = distance if distance and not behind else None
-    return View(camera, distance, near)
+    return ViewCamera(camera, distance, near)

@@ -25,16 +25,16 @@ from ..worker import jobs
 from . import render_passes, render_request, view_cameras
 
 KEY = "viewport"  # job key for `jobs.busy`
-LOOK_S = 0.01  # polling interval of the worker
+POLL_S = 0.01  # polling interval of the worker
 REST_S = 0.15  # time without movement after which a view counts as resting
 QUICK_MS = 40.0  # full-size images that render at least this fast are requested even while the view moves
 FULL = 1
 
-_ports: "weakref.WeakSet[Port]" = weakref.WeakSet()
-_asked: "tuple[jobs.Job, Port, Wish, int] | None" = None
+_viewports: "weakref.WeakSet[ViewportImage]" = weakref.WeakSet()
+_running: "tuple[jobs.Job, ViewportImage, ImageRequest, int] | None" = None
 
 
-class Wish:
+class ImageRequest:
     """Image requested by a viewport.
 
     Args:
@@ -60,7 +60,7 @@ class Wish:
         self.steps = render_request.steps(seen, ("alpha",) if transparent else (), sky)
         self.since = time.monotonic()
 
-    def same(self, other: "Wish | None") -> bool:
+    def same(self, other: "ImageRequest | None") -> bool:
         """True if another request is for the same image."""
         if other is None or self.inverse is not other.inverse:
             return False
@@ -76,26 +76,26 @@ class Wish:
         return [*before, (doing, command, {**arguments, "camera": camera})]
 
 
-class Port:
+class ViewportImage:
     """State of a viewport: requested image, last image, and render time."""
 
     def __init__(self):
-        self._wish: Wish | None = None
-        self._shown: tuple[Wish, int] | None = None  # request of the shown image, and its reduction factor
-        self._failed: Wish | None = None
+        self._requested: ImageRequest | None = None
+        self._shown: tuple[ImageRequest, int] | None = None  # request of the shown image, and its reduction factor
+        self._failed: ImageRequest | None = None
         self._pixels: np.ndarray | None = None  # image not yet uploaded to the GPU
         self._texture = None
         self._message = ""
         self._full_ms = 1e9
-        _ports.add(self)
+        _viewports.add(self)
 
     def draw(self, engine: bpy.types.RenderEngine, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """Draw the last image over the region and request the current view."""
         region, scene = context.region, depsgraph.scene
         try:
-            self.want(_wish(context, depsgraph))
+            self.request(_request(context, depsgraph))
         except errors.R5dgsError as error:
-            self._wish = self._shown = self._pixels = self._texture = None
+            self._requested = self._shown = self._pixels = self._texture = None
             self._message = str(error)
         if self._pixels is not None:
             height, width = self._pixels.shape[:2]
@@ -109,50 +109,50 @@ class Port:
             gpu.state.blend_set("NONE")
         engine.update_stats("R5DGS", self._message)
 
-    def want(self, wish: Wish) -> None:
+    def request(self, request: ImageRequest) -> None:
         """Set the requested image. Does nothing if it equals the current request."""
-        if not wish.same(self._wish):
-            self._wish, self._failed = wish, None
-        if self.next() is not None and not bpy.app.timers.is_registered(look):
-            bpy.app.timers.register(look, first_interval=0.0)
+        if not request.same(self._requested):
+            self._requested, self._failed = request, None
+        if self.next() is not None and not bpy.app.timers.is_registered(poll):
+            bpy.app.timers.register(poll, first_interval=0.0)
 
-    def next(self) -> tuple[Wish, int] | None:
+    def next(self) -> tuple[ImageRequest, int] | None:
         """Next request and its reduction factor, or None if the shown image is up to date."""
-        wish = self._wish
-        if wish is None or wish.same(self._failed):
+        request = self._requested
+        if request is None or request.same(self._failed):
             return None
-        done = self._shown is not None and wish.same(self._shown[0])
+        done = self._shown is not None and request.same(self._shown[0])
         if done and self._shown[1] == FULL:
             return None
-        quick = self._full_ms <= QUICK_MS or wish.moving == FULL
-        return wish, FULL if done or quick else wish.moving
+        quick = self._full_ms <= QUICK_MS or request.moving == FULL
+        return request, FULL if done or quick else request.moving
 
     def rests(self) -> bool:
         """True if the view has not moved for `REST_S`."""
-        return self._wish is not None and time.monotonic() - self._wish.since >= REST_S
+        return self._requested is not None and time.monotonic() - self._requested.since >= REST_S
 
-    def take(self, wish: Wish, smaller: int, answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> None:
+    def take(self, request: ImageRequest, smaller: int, answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> None:
         """Store an image from the worker for the next redraw."""
         result, arrays = answer
         milliseconds = result["ms_motion"] + result["ms_raster"]
-        alpha = render_passes.alpha(arrays, wish.transparent)
-        linear = display_to_linear.scene_linear(arrays["color"], alpha, wish.inverse)
+        alpha = render_passes.alpha(arrays, request.transparent)
+        linear = display_to_linear.scene_linear(arrays["color"], alpha, request.inverse)
         self._pixels = np.ascontiguousarray(linear[::-1])
-        self._shown = wish, smaller
+        self._shown = request, smaller
         if smaller == FULL:
             self._full_ms = milliseconds
         self._message = f"{plural.of(result['gaussians'], 'Gaussian')} in {milliseconds:.0f} ms"
 
-    def say(self, message: str) -> None:
+    def set_message(self, message: str) -> None:
         """Show a status text in the viewport's corner."""
         self._message = message
 
-    def fail(self, wish: Wish, error: errors.R5dgsError) -> None:
+    def fail(self, request: ImageRequest, error: errors.R5dgsError) -> None:
         """Show an error, and do not repeat the request until it changes."""
-        self._failed, self._message = wish, str(error)
+        self._failed, self._message = request, str(error)
 
 
-def _wish(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> Wish:
+def _request(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> ImageRequest:
     """Return the request for the viewport that is being drawn."""
     scene, settings = depsgraph.scene, render_settings.of(depsgraph.scene)
     looks = functools.partial(view_cameras.of_region, context.region, context.region_data)
@@ -161,46 +161,46 @@ def _wish(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> Wish:
         raise errors.ConfigError("No R5DGS scene is shown; load one from File > Import")
     transparent = scene.render.film_transparent
     inverse = display_to_linear.inverse(scene)
-    return Wish(seen, settings.sky and not transparent, transparent, int(settings.moving), inverse)
+    return ImageRequest(seen, settings.sky and not transparent, transparent, int(settings.moving), inverse)
 
 
-def look() -> float | None:
+def poll() -> float | None:
     """Receive a finished image and submit the next request. Returns the timer interval, or None to stop."""
-    global _asked
-    if _asked is not None:
-        job, port, wish, smaller = _asked
+    global _running
+    if _running is not None:
+        job, viewport, request, smaller = _running
         if not job.done:
             if job.seconds > 1.0:
-                port.say(f"{job.doing[:1].upper()}{job.doing[1:]}, {job.seconds:.0f} s")
+                viewport.set_message(f"{job.doing[:1].upper()}{job.doing[1:]}, {job.seconds:.0f} s")
                 status_bar.redraw("VIEW_3D")
-            return LOOK_S if job.seconds < 1.0 else 0.25
-        _asked = None
+            return POLL_S if job.seconds < 1.0 else 0.25
+        _running = None
         try:
-            port.take(wish, smaller, job.answer())
+            viewport.take(request, smaller, job.answer())
         except errors.R5dgsError as error:
-            port.fail(wish, error)
+            viewport.fail(request, error)
         status_bar.redraw("VIEW_3D")
-    waiting = [(port, *following) for port in _ports if (following := port.next()) is not None]
+    waiting = [(viewport, *following) for viewport in _viewports if (following := viewport.next()) is not None]
     if not waiting:
         return None
     if jobs.busy() or bpy.app.is_job_running("RENDER"):
         return 0.1
-    for port, wish, smaller in sorted(waiting, key=lambda one: -one[2]):  # moving views first
-        if smaller == FULL and wish.moving != FULL and not port.rests():
+    for viewport, request, smaller in sorted(waiting, key=lambda one: -one[2]):  # moving views first
+        if smaller == FULL and request.moving != FULL and not viewport.rests():
             continue
         try:
-            _asked = jobs.submit(KEY, wish.requests(smaller)), port, wish, smaller
+            _running = jobs.submit(KEY, request.requests(smaller)), viewport, request, smaller
         except errors.R5dgsError as error:
-            port.fail(wish, error)
+            viewport.fail(request, error)
             status_bar.redraw("VIEW_3D")
         break
-    return LOOK_S
+    return POLL_S
 
 
 def forget() -> None:
     """Forget all viewports and stop the timer."""
-    global _asked
-    _asked = None
-    _ports.clear()
-    if bpy.app.timers.is_registered(look):
-        bpy.app.timers.unregister(look)
+    global _running
+    _running = None
+    _viewports.clear()
+    if bpy.app.timers.is_registered(poll):
+        bpy.app.timers.unregister(poll)

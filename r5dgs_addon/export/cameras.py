@@ -8,7 +8,7 @@ import numpy as np
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.formats import camera_files
-from ...r5dgs_core.formats.camera_files import View
+from ...r5dgs_core.formats.camera_files import CameraFrame
 from ...r5dgs_core.playback import affine_transform
 from ...r5dgs_core.scene import cameras
 from ..engine import view_cameras, visible_clouds
@@ -62,7 +62,7 @@ def steps(
             for camera in _cameras(scene, which, notes):
                 name = image_name(frame) if which == "ACTIVE" else f"images/{folders[camera]}/{frame:04d}.png"
                 own = in_axes(depsgraph, camera, axes, world)
-                found.append(View(name, cameras.moved(own, origin) if axes == "FILE" else own, t))
+                found.append(CameraFrame(name, cameras.moved(own, origin) if axes == "FILE" else own, t))
     if not found:
         raise errors.ConfigError(f"{scene.name}: expected a camera, found none; add one to the scene")
     try:

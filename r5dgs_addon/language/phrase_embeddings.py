@@ -1,6 +1,6 @@
 """Embeddings of phrases that no scene file stores, computed by the worker with the text encoder of the preferences.
 
-They are cached for the session. `fetch` blocks until the worker responds. `begin` returns immediately, and a timer
+They are cached for the session. `fetch` blocks until the worker responds. `start` returns immediately, and a timer
 receives the response, unless Blender opens another file, which ends the timer.
 """
 
@@ -16,7 +16,7 @@ from .. import preferences
 from ..worker import jobs
 
 KEY = "phrases"  # job key for `jobs.busy`
-_LOOK_S = 0.1  # timer interval
+_POLL_S = 0.1  # timer interval
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class PhraseEmbedding:
 
 _known: dict[tuple[str, str], PhraseEmbedding] = {}  # by encoder folder and phrase
 _job: jobs.Job | None = None
-_asked: tuple[str, list[str]] = ("", [])  # folder and phrases of the job
-_then: Callable[[str], None] | None = None
+_job_phrases: tuple[str, list[str]] = ("", [])  # folder and phrases of the job
+_on_done: Callable[[str], None] | None = None
 
 
 def of(phrase: str, card: EncoderCard) -> np.ndarray | None:
@@ -46,78 +46,78 @@ def of(phrase: str, card: EncoderCard) -> np.ndarray | None:
     return found.vector if found is not None and found.digest == card.digest else None
 
 
-def is_there() -> bool:
+def has_encoder() -> bool:
     """True if the preferences name an encoder."""
     return bool(preferences.text_encoder())
 
 
-def missing(asked: Sequence[str]) -> list[str]:
+def missing(phrases: Sequence[str]) -> list[str]:
     """Phrases without a cached embedding of the preferences' encoder; empty without an encoder."""
-    where = preferences.text_encoder()
-    return [phrase for phrase in asked if (where, phrase) not in _known] if where else []
+    folder = preferences.text_encoder()
+    return [phrase for phrase in phrases if (folder, phrase) not in _known] if folder else []
 
 
-def stranger(asked: Sequence[str], card: EncoderCard) -> str:
+def other_encoder(phrases: Sequence[str], card: EncoderCard) -> str:
     """Name of the preferences' encoder if it differs from the table's, otherwise ""."""
-    where = preferences.text_encoder()
-    found = (_known.get((where, phrase)) for phrase in asked)
+    folder = preferences.text_encoder()
+    found = (_known.get((folder, phrase)) for phrase in phrases)
     return next((one.encoder for one in found if one is not None and one.digest != card.digest), "")
 
 
-def fetch(asked: Sequence[str]) -> None:
+def fetch(phrases: Sequence[str]) -> None:
     """Embed phrases and wait for the result. Raises the same errors as `jobs.run`."""
-    where = preferences.text_encoder()
-    _keep(where, asked, jobs.run(_steps(where, asked)))
+    folder = preferences.text_encoder()
+    _keep(folder, phrases, jobs.run(_steps(folder, phrases)))
 
 
-def begin(asked: Sequence[str], then: Callable[[str], None]) -> None:
+def start(phrases: Sequence[str], on_done: Callable[[str], None]) -> None:
     """Embed phrases without blocking the window.
 
     Args:
-        asked: Phrases; they replace an earlier request that has not started.
-        then: Callback in Blender's main thread, called with "" or an error message.
+        phrases: Phrases; they replace an earlier request that has not started.
+        on_done: Callback in Blender's main thread, called with "" or an error message.
     """
-    global _job, _asked, _then
-    where = preferences.text_encoder()
-    _job, _asked, _then = jobs.submit(KEY, _steps(where, asked)), (where, list(asked)), then
-    if not bpy.app.timers.is_registered(look):
-        bpy.app.timers.register(look, first_interval=_LOOK_S)
+    global _job, _job_phrases, _on_done
+    folder = preferences.text_encoder()
+    _job, _job_phrases, _on_done = jobs.submit(KEY, _steps(folder, phrases)), (folder, list(phrases)), on_done
+    if not bpy.app.timers.is_registered(poll):
+        bpy.app.timers.register(poll, first_interval=_POLL_S)
 
 
-def look() -> float | None:
+def poll() -> float | None:
     """Receive the worker's response if it is ready. Returns the timer interval, or None to stop."""
-    global _job, _then
+    global _job, _on_done
     if _job is None:
         return None
     if not _job.done:
-        return _LOOK_S
-    (where, asked), job, then = _asked, _job, _then
-    _job, _then = None, None
-    wrong = ""
+        return _POLL_S
+    (folder, phrases), job, on_done = _job_phrases, _job, _on_done
+    _job, _on_done = None, None
+    message = ""
     try:
-        _keep(where, asked, job.answer())
+        _keep(folder, phrases, job.answer())
     except errors.R5dgsError as error:
-        wrong = str(error)
-    if then is not None:
-        then(wrong)
-    return None if _job is None else _LOOK_S
+        message = str(error)
+    if on_done is not None:
+        on_done(message)
+    return None if _job is None else _POLL_S
 
 
 def forget() -> None:
     """Clear the cache and stop the timer."""
-    global _job, _then
-    _job, _then = None, None
+    global _job, _on_done
+    _job, _on_done = None, None
     _known.clear()
-    if bpy.app.timers.is_registered(look):
-        bpy.app.timers.unregister(look)
+    if bpy.app.timers.is_registered(poll):
+        bpy.app.timers.unregister(poll)
 
 
-def _steps(where: str, asked: Sequence[str]) -> jobs.Steps:
-    return [("running the text encoder", "embed", {"encoder": where, "texts": list(asked)})]
+def _steps(folder: str, phrases: Sequence[str]) -> jobs.Steps:
+    return [("running the text encoder", "embed", {"encoder": folder, "texts": list(phrases)})]
 
 
-def _keep(where: str, asked: Sequence[str], answer: jobs.Answer) -> None:
+def _keep(folder: str, phrases: Sequence[str], answer: jobs.Answer) -> None:
     result, arrays = answer
     card = result["encoder"]
-    for phrase, vector in zip(asked, arrays["embeddings"], strict=True):
-        _known[where, phrase] = PhraseEmbedding(card["digest"], card["name"], np.array(vector))
+    for phrase, vector in zip(phrases, arrays["embeddings"], strict=True):
+        _known[folder, phrase] = PhraseEmbedding(card["digest"], card["name"], np.array(vector))

@@ -97,8 +97,8 @@ def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> 
         if meanings is not None and meanings.table is not None:
             card, unknown = meanings.table.encoder, object_search.unknown(labels, text, meanings)
             missing += phrase_embeddings.missing(unknown)
-            lost += [] if phrase_embeddings.is_there() else unknown
-            other = phrase_embeddings.stranger(unknown, card)
+            lost += [] if phrase_embeddings.has_encoder() else unknown
+            other = phrase_embeddings.other_encoder(unknown, card)
             notes += [STRANGER.format(collection.name, card.name, other)] if other else []
             embed = functools.partial(phrase_embeddings.of, card=card)
         left.append(object_search.unanswered(labels, text, threshold, meanings, embed))
@@ -167,7 +167,7 @@ def _with_encoder(context: bpy.types.Context, text: str, answer: Answer) -> Answ
     """Result including the encoder's matches, or with a note that it is running or why it failed."""
     asked = " and ".join(repr(phrase) for phrase in answer.missing)
     if _has_window():
-        phrase_embeddings.begin(answer.missing, functools.partial(_join, text))
+        phrase_embeddings.start(answer.missing, functools.partial(_join, text))
         return replace(answer, notes=[*answer.notes, f"{ASKING}{asked}"])
     try:
         phrase_embeddings.fetch(answer.missing)

@@ -25,7 +25,7 @@ MOST_STEPS = 1024  # maximum integration steps per observed span; exceeded only 
 
 
 @dataclass(frozen=True)
-class Plan:
+class PendingKeys:
     """Keys to be written for one anchor. All checks that can fail are done.
 
     Attributes:
@@ -80,12 +80,12 @@ def re_extrapolate(anchors: list[bpy.types.Object], t_end: float | None = None) 
     return everyone
 
 
-def _plans(anchors: list[bpy.types.Object], t_end: float | None) -> list[Plan]:
+def _plans(anchors: list[bpy.types.Object], t_end: float | None) -> list[PendingKeys]:
     most = keyframes.share(len(anchors))
     return [_plan(anchor, t_end, most) for anchor in anchors]
 
 
-def _plan(anchor: bpy.types.Object, t_end: float | None, most: int) -> Plan:
+def _plan(anchor: bpy.types.Object, t_end: float | None, most: int) -> PendingKeys:
     times, place = times_of(anchor, t_end), curve_place.find(anchor)
     location, quat = fcurves.pose_at(anchor, place, times.frame(times.t_max))
     tails, too_fast = {}, False
@@ -98,10 +98,10 @@ def _plan(anchor: bpy.types.Object, t_end: float | None, most: int) -> Plan:
             "location": fcurves.frames(future.location, times),
             "rotation_quaternion": fcurves.frames(future.rotation, times),
         }
-    return Plan(anchor, place, times, tails, too_fast)
+    return PendingKeys(anchor, place, times, tails, too_fast)
 
 
-def _apply(plan: Plan) -> None:
+def _apply(plan: PendingKeys) -> None:
     anchor, place = plan.anchor, plan.place
     if place.strip is None and place.action is not None:
         curve_place.make_own(anchor)

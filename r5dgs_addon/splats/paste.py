@@ -43,7 +43,7 @@ def forget() -> None:
 def paste(
     buffer: renderer.SplatBuffer,
     meshes: gpu.types.GPUTexture | None,
-    view: renderer.View,
+    view: renderer.ViewMatrices,
     sky: np.ndarray | None,
     world: np.ndarray,
     behind: tuple[float, float, float],
@@ -76,7 +76,7 @@ def paste(
     gpu.state.blend_set("NONE")
 
 
-def _rays(view: renderer.View, world: np.ndarray) -> np.ndarray:
+def _rays(view: renderer.ViewMatrices, world: np.ndarray) -> np.ndarray:
     """Linear map from (x, y, 1, 1), x and y in [-1, 1] over the picture, to rays in the world of a scene. [4, 4]"""
     p, rays = view.projection, np.zeros((4, 4))
     if not view.parallel:

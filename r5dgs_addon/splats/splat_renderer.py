@@ -43,7 +43,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class View:
+class ViewMatrices:
     """View of a picture.
 
     Attributes:
@@ -127,7 +127,7 @@ class SplatBuffer:
         return None if self._holes is None else self._holes.texture_color
 
     def draw(
-        self, table: SplatTable, groups: Sequence[Group], view: View, meshes: gpu.types.GPUTexture | None = None
+        self, table: SplatTable, groups: Sequence[Group], view: ViewMatrices, meshes: gpu.types.GPUTexture | None = None
     ) -> None:
         """Draw groups of a table. Those with values that are too large or not finite are left out.
 
@@ -149,7 +149,7 @@ class SplatBuffer:
         else:
             self._holes = None
 
-    def _sorted(self, table: SplatTable, groups: Sequence[Group], view: View) -> np.ndarray:
+    def _sorted(self, table: SplatTable, groups: Sequence[Group], view: ViewMatrices) -> np.ndarray:
         """Rows of the visible Gaussians, from far to near, as an array and as a texture."""
         if self._table is not table or self._order is None:
             self._table, self._order, self._rows = table, DepthOrder(table.positions, table.starts), None
@@ -165,7 +165,7 @@ class SplatBuffer:
         target: gpu.types.GPUOffScreen,
         poses: gpu.types.GPUTexture,
         table: SplatTable,
-        view: View,
+        view: ViewMatrices,
         meshes: gpu.types.GPUTexture | None,
         count: int,
     ) -> None:
@@ -189,7 +189,7 @@ class SplatBuffer:
             gpu.state.blend_set("NONE")
 
 
-def _target(known: gpu.types.GPUOffScreen | None, view: View) -> gpu.types.GPUOffScreen:
+def _target(known: gpu.types.GPUOffScreen | None, view: ViewMatrices) -> gpu.types.GPUOffScreen:
     """Buffer of the size of a view, the known one if possible."""
     size = (view.width, view.height)
     if known is not None and (known.width, known.height) == size:
@@ -197,7 +197,7 @@ def _target(known: gpu.types.GPUOffScreen | None, view: View) -> gpu.types.GPUOf
     return gpu.types.GPUOffScreen(*size, format="RGBA32F")
 
 
-def _is_drawable(group: Group, view: View) -> bool:
+def _is_drawable(group: Group, view: ViewMatrices) -> bool:
     to_camera = view.view_matrix @ group.matrix
     return bool(np.abs(to_camera).max() < LARGEST and np.isfinite((*group.tint, *group.light_change)).all())
 
@@ -224,7 +224,7 @@ def _slopes(p: np.ndarray) -> tuple[float, float, float, float]:
     )
 
 
-def _poses(groups: Sequence[Group], count: int, view: View, holes: bool = False) -> gpu.types.GPUTexture:
+def _poses(groups: Sequence[Group], count: int, view: ViewMatrices, holes: bool = False) -> gpu.types.GPUTexture:
     """Texture with the data of each group for the shader.
 
     With ``holes``, hold-outs are white and the others black; otherwise hold-outs are black.

@@ -105,7 +105,7 @@ def _is_drawn_by_engine(context: bpy.types.Context) -> bool:
 def _draw_in_region(context: bpy.types.Context, found: visible_splats.VisibleSplats) -> None:
     region, space, view_3d = context.region, context.space_data, context.region_data
     picture = _state.pictures.setdefault(region.as_pointer(), _Picture())
-    view = renderer.View(
+    view = renderer.ViewMatrices(
         np.array(view_3d.view_matrix, np.float64),
         np.array(view_3d.window_matrix, np.float64),
         region.width,

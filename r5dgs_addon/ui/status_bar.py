@@ -7,7 +7,7 @@ import bpy
 _LETTER, _MARGIN, _WIDTH = 7, 70, 400  # pixels: letter width, margins beside the text, default region width
 
 
-def say(context: bpy.types.Context, text: str | None) -> None:
+def show(context: bpy.types.Context, text: str | None) -> None:
     """Show a text in the status bar, or clear it if None."""
     if context.workspace is not None:
         context.workspace.status_text_set(text)

@@ -111,7 +111,7 @@ class Running:
         manager.modal_handler_add(self)
         self._timer = manager.event_timer_add(0.01, window=context.window)
         begin(self)
-        status_bar.say(context, f"{self.work}: starting; press Esc to stop")
+        status_bar.show(context, f"{self.work}: starting; press Esc to stop")
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
@@ -167,14 +167,14 @@ class Running:
             context.window_manager.progress_update(step.done / max(step.total, 1))
             rest = f", {left:.0f} s left" if step.done else ""
             stands = "" if step.slow else f", {step.done} of {step.total}{rest}; press Esc to stop"
-            status_bar.say(context, f"{self.work}: {step.what}{stands}")
+            status_bar.show(context, f"{self.work}: {step.what}{stands}")
 
     def _end(self, context):
         end(self)
         context.window_manager.event_timer_remove(self._timer)
         self._timer = None
         context.window_manager.progress_end()
-        status_bar.say(context, None)
+        status_bar.show(context, None)
 
 
 def begin(operator: bpy.types.Operator) -> None:

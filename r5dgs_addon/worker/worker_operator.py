@@ -39,7 +39,7 @@ class Waiting:
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         if not self._job.done:
-            status_bar.say(
+            status_bar.show(
                 context, f"{self.waits_for}: {self._job.doing}, {self._job.seconds:.0f} s; press Esc to stop"
             )
             return {"PASS_THROUGH"}
@@ -70,7 +70,7 @@ class Waiting:
     def _leave(self, context):
         stepwise_operator.end(self)
         context.window_manager.event_timer_remove(self._timer)
-        status_bar.say(context, None)
+        status_bar.show(context, None)
         status_bar.redraw()
 
 

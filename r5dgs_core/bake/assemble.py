@@ -12,10 +12,10 @@ from ..motion import rotations
 from ..scene import sh_color
 from ..scene.scene import NEAR_PLANE, Gaussians, Scene, SceneObject, Shading, Tracks
 from . import bind_state, needs
-from .draft import Cloud, Context, Draft, Need, Observed
+from .draft import Cloud, Context, Draft, Need, ObservedScene
 
 
-def draft(observed: Observed, context: Context) -> Draft:
+def draft(observed: ObservedScene, context: Context) -> Draft:
     """Return the scene with trained poses and static models, without motion of single Gaussians."""
     bound = bind_state.bind(observed, context)
     cloud, dataset, times = bound.cloud, context.dataset, observed.motion.times

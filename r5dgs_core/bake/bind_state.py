@@ -20,13 +20,13 @@ from ..scene.splats import to_opacities
 from ..train import observed_motion
 from ..train.representations import shading as shading_vectors
 from . import track_checks
-from .draft import Bound, Context, Observed
+from .draft import BoundScene, Context, ObservedScene
 
 _ARRAYS = ("means", "quats", "sh", "shading", "shading_rest", "residual_offsets", "residual_quats")  # of `Scene`
 _COLUMNS = ("means", "quats", "sh", "shading", "rest")  # of `Cloud`
 
 
-def bind(observed: Observed, context: Context) -> Bound:
+def bind(observed: ObservedScene, context: Context) -> BoundScene:
     """Transform the Gaussians of a checkpoint to the bind state."""
     cloud, motion, norm, wanted = observed.cloud, observed.motion, context.norm, context.wanted
     names = {int(i): context.dataset.object_names.get(int(i), f"object {i}") for i in context.tensors["object_ids"]}
@@ -61,7 +61,7 @@ def bind(observed: Observed, context: Context) -> Bound:
         anchor = _anchor(np.flatnonzero(members), means[members], opacities[members], pivot)
         groups.append(_motion_group(index, group, motion.times, pivot, MotionModel(radius=radius), anchor))
     bound = dataclasses.replace(cloud, means=means, quats=quats, sh=sh, shading=shading, rest=rest)
-    return Bound(bound, tuple(groups), np.stack(trained), np.stack(pivots), np.stack(played))
+    return BoundScene(bound, tuple(groups), np.stack(trained), np.stack(pivots), np.stack(played))
 
 
 def rebind(scene: Scene, poses: np.ndarray) -> Scene:

@@ -91,7 +91,7 @@ class Cloud:
 
 
 @dataclass(frozen=True)
-class Observed:
+class ObservedScene:
     """Content of a checkpoint without the features that the user disabled.
 
     Attributes:
@@ -106,7 +106,7 @@ class Observed:
 
 
 @dataclass(frozen=True)
-class Bound:
+class BoundScene:
     """Gaussians and motion groups in the bind state.
 
     Attributes:
@@ -179,8 +179,8 @@ class Draft:
     """
 
     scene: Scene
-    observed: Observed
-    bound: Bound
+    observed: ObservedScene
+    bound: BoundScene
     order: np.ndarray
     bent: Need
     trained: Scene | None = None

@@ -13,7 +13,7 @@ from ..motion import rotations
 from ..train import checkpoint
 from ..train.normalization import Normalization
 from ..train.representations import registry
-from .draft import Cloud, Context, Observed, is_discovered
+from .draft import Cloud, Context, ObservedScene, is_discovered
 
 
 def open_context(run: checkpoint.Run, dataset: Dataset | None) -> Context:
@@ -30,7 +30,7 @@ def open_context(run: checkpoint.Run, dataset: Dataset | None) -> Context:
     return Context(run, state, dataset, Normalization(np.array(state.origin) - dataset.origin, state.scale))
 
 
-def observe(context: Context) -> Observed:
+def observe(context: Context) -> ObservedScene:
     """Return the Gaussians and the observed motion of a checkpoint, without the features that the user disabled."""
     tensors, wanted, norm = context.tensors, context.wanted, context.norm
     state, config = context.state, context.config
@@ -69,7 +69,7 @@ def observe(context: Context) -> Observed:
         object_ids=present[labels].astype(np.int32),
         identities=identities,
     )
-    return Observed(cloud, motion, direction)
+    return ObservedScene(cloud, motion, direction)
 
 
 def _unit(vector: np.ndarray) -> tuple[np.ndarray, float]:

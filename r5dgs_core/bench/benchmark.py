@@ -20,7 +20,7 @@ from ..render import machine as machines
 from ..scene import scene_file
 from ..train import checkpoint, interrupt, warm_up
 from . import cases, playback_speed, plot, process, tables
-from .cases import Case, Plan
+from .cases import BenchmarkRequest, Case
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +29,7 @@ RESULT_FILE, TABLES_FILE, PLOT_FILE = "bench.json", "tables.md", "error_against_
 SPLITS = ("test", "val")
 
 
-def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto") -> dict[str, Any]:
+def run_bench(plan: BenchmarkRequest, *, remeasure: bool = False, progress_kind: str = "auto") -> dict[str, Any]:
     """Train, bake and measure every case of a plan, and write the results after each of them.
 
     Writes the files of each case (`cases`), `RESULT_FILE`, `TABLES_FILE` and `PLOT_FILE` into ``plan.out``.
@@ -77,7 +77,7 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
     return result
 
 
-def run_case(plan: Plan, case: Case, remeasure: bool, progress: Progress) -> list[dict[str, Any]]:
+def run_case(plan: BenchmarkRequest, case: Case, remeasure: bool, progress: Progress) -> list[dict[str, Any]]:
     """Finish the training and the measurements of a case; returns its records, one per mode."""
     if not cases.is_finished(case):
         _train(plan, case, progress)
@@ -101,7 +101,7 @@ def run_case(plan: Plan, case: Case, remeasure: bool, progress: Progress) -> lis
     return [{**shared, "mode": mode, **measured["modes"][mode]} for mode in plan.modes if mode in measured["modes"]]
 
 
-def _train(plan: Plan, case: Case, progress: Progress) -> None:
+def _train(plan: BenchmarkRequest, case: Case, progress: Progress) -> None:
     """Train a case in a separate process, from its last checkpoint if it has one."""
     record = cases.read_record(case)
     arguments = ["train", str(case.root), "--out", str(case.run)]
@@ -179,7 +179,9 @@ def _measure(
     }
 
 
-def _write(plan: Plan, records: Sequence[dict[str, Any]], failures: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _write(
+    plan: BenchmarkRequest, records: Sequence[dict[str, Any]], failures: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
     """Write result, tables and plot of the cases finished so far; returns the result."""
     result = {
         "machine": machine(),
@@ -198,7 +200,7 @@ def _write(plan: Plan, records: Sequence[dict[str, Any]], failures: Sequence[dic
     return result
 
 
-def _show(plan: Plan, result: dict[str, Any]) -> None:
+def _show(plan: BenchmarkRequest, result: dict[str, Any]) -> None:
     """Print the tables and the paths of the files."""
 
     for sheet in tables.sheets(result):

@@ -27,7 +27,7 @@ COSTS = ("cpu_seconds", "wall_seconds", "peak_mb", "peak_gpu_mb")  # per sitting
 
 
 @dataclass(frozen=True)
-class Plan:
+class BenchmarkRequest:
     """Request of a benchmark.
 
     Attributes:
@@ -87,7 +87,7 @@ class Case:
         return self.run.with_name(self.run.name + suffix)
 
 
-def make(plan: Plan) -> list[Case]:
+def make(plan: BenchmarkRequest) -> list[Case]:
     """Return the cases of a plan, ordered by seed, scene and variant, so that complete tables are available early.
 
     All checks that are possible before hours of training are made here.

@@ -18,7 +18,7 @@ from . import registry
 
 
 @dataclass(frozen=True)
-class View:
+class CameraFrame:
     """One image and its camera.
 
     Attributes:
@@ -32,7 +32,7 @@ class View:
     t: float | None = None
 
 
-def write_transforms(path: str | Path, views: Sequence[View]) -> Path:
+def write_transforms(path: str | Path, views: Sequence[CameraFrame]) -> Path:
     """Write NeRF's camera file atomically: camera to world with OpenGL axes, in the cameras' world.
 
     ``camera_angle_x w h fl_x fl_y cx cy`` are at the top level if all views share them, else in each view. ``time`` is
@@ -68,7 +68,7 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     views = []
     for number, t in enumerate(options.times):
         end = ".png" if options.frames is None else f"/{options.frames[number]:04d}.png"
-        views += [View(f"images/{c.name}{end}", cameras.moved(c, scene.origin), t) for c in scene.cameras]
+        views += [CameraFrame(f"images/{c.name}{end}", cameras.moved(c, scene.origin), t) for c in scene.cameras]
     if not views:
         raise errors.ConfigError(f"{scene.name}: expected cameras in the scene, found none; train it from a data set")
     yield write_transforms(path, views)
@@ -85,7 +85,7 @@ FORMAT = registry.Format(
 )
 
 
-def write_colmap(folder: str | Path, views: Sequence[View]) -> Path:
+def write_colmap(folder: str | Path, views: Sequence[CameraFrame]) -> Path:
     """Write COLMAP's text model into ``sparse/0`` of a folder, each file atomically, without points.
 
     Images are named by their paths without the leading folder ``images``, as in COLMAP. If views have times, they are
@@ -131,7 +131,7 @@ def _lens(camera: Camera) -> dict[str, float]:
     }  # fmt: skip
 
 
-def _image_name(view: View) -> str:
+def _image_name(view: CameraFrame) -> str:
     return view.file_path.removeprefix("images/")
 
 

@@ -21,8 +21,12 @@ from window import STEP_S, run, service, wait  # noqa: E402
 
 def full_picture():
     """The full-size picture of the only viewport, or None."""
-    ports = [port for port in service("engine.viewport")._ports if port._shown is not None and port.next() is None]
-    return ports[0]._shown if ports else None
+    viewports = [
+        viewport
+        for viewport in service("engine.viewport")._viewports
+        if viewport._shown is not None and viewport.next() is None
+    ]
+    return viewports[0]._shown if viewports else None
 
 
 def checks(path: str):
@@ -53,7 +57,11 @@ def checks(path: str):
     while time.monotonic() < end:
         region_3d.view_rotation = region_3d.view_rotation @ Quaternion((0, 1, 0), 0.02)
         yield STEP_S
-        sizes |= {(id(port._shown[0]), port._shown[1]) for port in service("engine.viewport")._ports if port._shown}
+        sizes |= {
+            (id(viewport._shown[0]), viewport._shown[1])
+            for viewport in service("engine.viewport")._viewports
+            if viewport._shown
+        }
     print(f"moving: {len(sizes)} pictures in 5 s", flush=True)
     assert len(sizes) > 1
 
@@ -77,13 +85,13 @@ def checks(path: str):
     asked = []
     for frame in (10, 20, 30):
         scene.frame_set(frame)
-        before = live._asked
-        yield from wait(lambda before=before: live._asked is not before and live._job is None, "live preview")
-        asked.append(live._asked)
+        before = live._last_steps
+        yield from wait(lambda before=before: live._last_steps is not before and live._job is None, "live preview")
+        asked.append(live._last_steps)
     assert asked[0] != asked[1] != asked[2] and live.message() == ""
     bpy.ops.wm.read_homefile(app_template="")
     yield 2.0
-    assert not live.running() and not bpy.app.timers.is_registered(service("engine.viewport").look)
+    assert not live.running() and not bpy.app.timers.is_registered(service("engine.viewport").poll)
     print("closed: nothing goes on", flush=True)
 
 

@@ -72,7 +72,7 @@ def run_bench(
         threads: Threads of the kernels; see `options.use_threads`.
         remeasure: Bake and measure finished runs again.
         progress_kind: Form of progress output (`progress.make`).
-        **plan: Other fields of `bench.cases.Plan`.
+        **plan: Other fields of `bench.cases.BenchmarkRequest`.
 
     Returns:
         The content of ``bench.json`` (docs/user/bench.md).
@@ -93,5 +93,5 @@ def run_bench(
 
     options.use_threads(threads)
     plan |= {"overrides": tuple(plan["overrides"]), "seeds": tuple(plan["seeds"])}
-    work = cases.Plan(scenes=tuple(scenes), out=out, variants=tuple(variants), modes=tuple(modes), **plan)
+    work = cases.BenchmarkRequest(scenes=tuple(scenes), out=out, variants=tuple(variants), modes=tuple(modes), **plan)
     return benchmark.run_bench(work, remeasure=remeasure, progress_kind=progress_kind)

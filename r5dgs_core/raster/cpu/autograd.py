@@ -18,7 +18,7 @@ _EMPTY = np.empty((0, 0), np.float32)
 
 
 def rasterize(
-    inputs: Sequence[torch.Tensor | None], plan: forward.Plan, stats: RasterStats | None
+    inputs: Sequence[torch.Tensor | None], plan: forward.CallArguments, stats: RasterStats | None
 ) -> tuple[torch.Tensor, ...]:
     """Image, alpha, depth and ids of means, quats, scales, opacities, channels and background, float32."""
     return _Rasterize.apply(*inputs, plan, stats)
@@ -75,7 +75,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _backward(
-    state: forward.ForwardState, plan: forward.Plan, inputs, results, d_image, d_alpha, d_depth, with_geometry
+    state: forward.ForwardState, plan: forward.CallArguments, inputs, results, d_image, d_alpha, d_depth, with_geometry
 ):  # fmt: skip
     """Gradients of means, quats, scales, opacities and channels, and the gradient norms for densification [N]."""
     means, quats, scales, opacities, channels = (to_array(t) for t in inputs[:5])

@@ -59,7 +59,7 @@ class CpuBackend(Backend):
         from . import forward
 
         inputs = (means, quats, scales, opacities, channels, background)
-        plan = forward.Plan.of(camera, settings, to_array(labels))
+        plan = forward.CallArguments.of(camera, settings, to_array(labels))
         if need_gradients(*inputs):
             from . import autograd
 

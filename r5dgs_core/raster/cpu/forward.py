@@ -29,7 +29,7 @@ _NO_FACTOR = np.empty(0, np.float32)
 
 
 @dataclass(frozen=True)
-class Plan:
+class CallArguments:
     """Arguments of a call other than its tensors."""
 
     camera: Camera
@@ -38,7 +38,7 @@ class Plan:
     names_votes: tuple[np.ndarray, np.ndarray]
 
     @classmethod
-    def of(cls, camera: Camera, settings: RasterSettings, labels: np.ndarray | None = None) -> Plan:
+    def of(cls, camera: Camera, settings: RasterSettings, labels: np.ndarray | None = None) -> CallArguments:
         """Pack the arguments of a call. Raises ValueError if a label is 2^24 or more."""
         return cls(camera, pack_view(camera, settings), pack_limits(settings), pack_labels(labels))
 
@@ -147,7 +147,7 @@ def segment_weights(
 
     ``segments`` are int32, -1 for none. [H, W]
     """
-    plan = Plan.of(camera, settings)
+    plan = CallArguments.of(camera, settings)
     state, *_ = rasterize([*shapes, shapes[3][:, None]], None, plan, True, with_slots=False)
     assert state is not None
     starts = np.append(0, np.cumsum(_kinds_per_tile(segments) * (state.tile_ends - state.tile_starts[:-1])))
@@ -175,7 +175,11 @@ def _kinds_per_tile(segments: np.ndarray) -> np.ndarray:
 
 
 def rasterize(
-    arrays: Sequence[np.ndarray], background: np.ndarray | None, plan: Plan, with_state: bool, with_slots: bool = True
+    arrays: Sequence[np.ndarray],
+    background: np.ndarray | None,
+    plan: CallArguments,
+    with_state: bool,
+    with_slots: bool = True,
 ) -> tuple[ForwardState | None, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Project, sort, assign and blend means, quats, scales, opacities and channels.
 

@@ -282,7 +282,7 @@ def test_a_stroke_selects_what_the_camera_shows_inside(blender, loaded, kind):
     bpy.context.view_layer.update()
     depsgraph = bpy.context.evaluated_depsgraph_get()
     projection = np.array(camera.calc_matrix_camera(depsgraph, x=320, y=240))
-    view = strokes.View(projection @ np.linalg.inv(np.array(camera.matrix_world)), 320, 240)
+    view = strokes.StrokeView(projection @ np.linalg.inv(np.array(camera.matrix_world)), 320, 240)
     path = np.array([(100, 80), (240, 70), (230, 180), (150, 190)], float)
     for hidden in (None, cloud_of(loaded, 2)):
         if hidden is not None:

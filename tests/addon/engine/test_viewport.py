@@ -42,67 +42,67 @@ def run(module):
     while wait is not None:
         assert time.monotonic() < deadline
         time.sleep(wait)
-        wait = module.look()
-        for port in module._ports:
-            if port._pixels is not None and not any(port._pixels is known for known in pictures):
-                pictures.append(port._pixels)
+        wait = module.poll()
+        for image in module._viewports:
+            if image._pixels is not None and not any(image._pixels is known for known in pictures):
+                pictures.append(image._pixels)
     return [pixels.shape for pixels in pictures]
 
 
 def test_a_viewport_gets_a_small_picture_at_once_and_a_full_one_when_it_rests(blender, seen, viewport):
     picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
-    port, now = viewport.Port(), seen(20)
-    port.want(viewport.Wish(now, sky=True, transparent=False, moving=4))
+    image, now = viewport.ViewportImage(), seen(20)
+    image.request(viewport.ImageRequest(now, sky=True, transparent=False, moving=4))
     assert run(viewport) == [(10, 16, 4), (40, 64, 4)]
     expected = color.scene_linear(picture.render(now)[1]["color"])
-    np.testing.assert_array_equal(port._pixels, expected[::-1])
-    port.want(viewport.Wish(seen(20), sky=True, transparent=False, moving=4))
-    assert port.next() is None  # the same picture is not rendered again
+    np.testing.assert_array_equal(image._pixels, expected[::-1])
+    image.request(viewport.ImageRequest(seen(20), sky=True, transparent=False, moving=4))
+    assert image.next() is None  # the same picture is not rendered again
 
 
 def test_the_latest_request_wins(blender, seen, viewport):
     picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
-    port = viewport.Port()
+    image = viewport.ViewportImage()
     for frame in (1, 20, 40, 61):
         last = seen(frame)
-        port.want(viewport.Wish(last, sky=True, transparent=False, moving=1))
-        viewport.look()
+        image.request(viewport.ImageRequest(last, sky=True, transparent=False, moving=1))
+        viewport.poll()
     run(viewport)
-    np.testing.assert_array_equal(port._pixels, color.scene_linear(picture.render(last)[1]["color"])[::-1])
+    np.testing.assert_array_equal(image._pixels, color.scene_linear(picture.render(last)[1]["color"])[::-1])
 
 
 def test_a_viewport_shows_render_errors_and_retries_after_a_change(blender, seen, viewport, tmp_path):
-    port = viewport.Port()
-    wish = viewport.Wish(seen(20), sky=True, transparent=False, moving=1)
+    image = viewport.ViewportImage()
+    request = viewport.ImageRequest(seen(20), sky=True, transparent=False, moving=1)
     (tmp_path / "scene.r5dgs").rename(tmp_path / "gone.r5dgs")
-    port.want(wish)
+    image.request(request)
     run(viewport)
-    assert port._pixels is None and "scene.r5dgs" in port._message and port.next() is None
+    assert image._pixels is None and "scene.r5dgs" in image._message and image.next() is None
     (tmp_path / "gone.r5dgs").rename(tmp_path / "scene.r5dgs")
-    port.want(viewport.Wish(seen(21), sky=True, transparent=False, moving=1))
+    image.request(viewport.ImageRequest(seen(21), sky=True, transparent=False, moving=1))
     run(viewport)
-    assert port._pixels is not None and "Gaussians in" in port._message
+    assert image._pixels is not None and "Gaussians in" in image._message
 
 
 def test_a_closed_viewport_is_not_waited_for(blender, seen, viewport):
-    port = viewport.Port()
-    port.want(viewport.Wish(seen(20), sky=True, transparent=False, moving=1))
-    assert viewport.look() is not None
-    del port
+    image = viewport.ViewportImage()
+    image.request(viewport.ImageRequest(seen(20), sky=True, transparent=False, moving=1))
+    assert viewport.poll() is not None
+    del image
     run(viewport)
-    assert viewport.look() is None and len(viewport._ports) == 0
+    assert viewport.poll() is None and len(viewport._viewports) == 0
 
 
 def test_smaller_pictures_show_the_same_view(blender, seen, viewport):
-    wish = viewport.Wish(seen(20), sky=True, transparent=False, moving=4)
-    request = wish.requests(4)[-1][2]["camera"]
+    request = viewport.ImageRequest(seen(20), sky=True, transparent=False, moving=4)
+    camera = request.requests(4)[-1][2]["camera"]
     small = cameras.Camera(
-        request["width"], request["height"], np.array(request["intrinsics"]), np.array(request["T_cam_world"])
+        camera["width"], camera["height"], np.array(camera["intrinsics"]), np.array(camera["T_cam_world"])
     )
     points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
-    np.testing.assert_allclose(4 * cameras.project(small, points)[0], cameras.project(wish.camera, points)[0])
+    np.testing.assert_allclose(4 * cameras.project(small, points)[0], cameras.project(request.camera, points)[0])
 
 
 def test_the_live_preview_follows_frame_and_edits_and_is_off_after_loading(blender, seen):
@@ -110,11 +110,11 @@ def test_the_live_preview_follows_frame_and_edits_and_is_off_after_loading(blend
     picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
 
     def look():
-        live.look()
+        live.poll()
         deadline = time.monotonic() + 120
         while live._job is not None:
             assert time.monotonic() < deadline
-            time.sleep(live.look())
+            time.sleep(live.poll())
         image = blender.data.images[picture.IMAGE]
         pixels = np.empty(4 * 64 * 40, np.float32)
         image.pixels.foreach_get(pixels)
@@ -132,7 +132,7 @@ def test_the_live_preview_follows_frame_and_edits_and_is_off_after_loading(blend
         blender.data.objects["mug"].hide_viewport = True
         assert np.abs(look() - later).max() > 0.1
         blender.context.scene.camera.data.type = "PANO"
-        live.look()
+        live.poll()
         assert "Perspective" in live.message() and live.running()
         blender.ops.wm.read_homefile(app_template="")
         assert not live.running() and live.message() == ""

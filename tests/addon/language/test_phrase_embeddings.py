@@ -40,7 +40,7 @@ def loaded(blender, folders, monkeypatch):
 
 def wait_for_the_answer():
     """Run the timer until the response has been received."""
-    patience.wait_until(lambda: motions.addon("language.phrase_embeddings").look() is None)
+    patience.wait_until(lambda: motions.addon("language.phrase_embeddings").poll() is None)
 
 
 def ask(bpy, text):
@@ -89,12 +89,12 @@ def test_a_damaged_encoder_is_reported_and_names_are_still_searched(loaded, tmp_
 
 def test_with_a_window_the_answer_arrives_later(loaded, monkeypatch):
     phrases, told = motions.addon("language.phrase_embeddings"), []
-    phrases.begin(["zorb", "glorp"], told.append)
+    phrases.start(["zorb", "glorp"], told.append)
     assert phrases.missing(["zorb", "glorp"]) == ["zorb", "glorp"]
     wait_for_the_answer()
     assert told == [""] and phrases.missing(["zorb", "glorp", "other"]) == ["other"]
     monkeypatch.setenv("R5DGS_TEXT_ENCODER", "/nowhere")
-    phrases.begin(["zorb"], told.append)
+    phrases.start(["zorb"], told.append)
     wait_for_the_answer()
     assert "expected the folder of an encoder, found nothing" in told[1]
 
@@ -134,6 +134,6 @@ def test_late_encoder_errors_are_shown_beside_the_known_matches(windowed, monkey
 
 def test_opening_another_file_drops_pending_phrase_embeddings(loaded):
     phrases, told = motions.addon("language.phrase_embeddings"), []
-    phrases.begin(["zorb"], told.append)
+    phrases.start(["zorb"], told.append)
     loaded.ops.wm.read_homefile(app_template="")
-    assert not loaded.app.timers.is_registered(phrases.look) and told == []
+    assert not loaded.app.timers.is_registered(phrases.poll) and told == []

@@ -58,7 +58,7 @@ def picture_of(depsgraph):
     if found is None:
         return np.zeros((SIZE[1], SIZE[0], 4))
     camera, buffer = depsgraph.scene.camera.evaluated_get(depsgraph), renderer.SplatBuffer()
-    view = renderer.View(
+    view = renderer.ViewMatrices(
         np.linalg.inv(np.array(camera.matrix_world, np.float64)),
         np.array(camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), np.float64),
         *SIZE,

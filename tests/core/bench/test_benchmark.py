@@ -28,7 +28,7 @@ OVERRIDES = (*tiny_datasets.SETTINGS, "train.iterations=20", "identity.iteration
 
 
 def plan_for(tiny, out, **changes):
-    return cases.Plan(
+    return cases.BenchmarkRequest(
         **{"scenes": (tiny.root,), "out": out, "variants": ("tracks",), "overrides": OVERRIDES, **changes}
     )
 
@@ -241,7 +241,7 @@ def test_cases_run_seed_by_seed_and_their_variants_override_the_users_settings(t
 
 @pytest.mark.parametrize("preset", [None, *presets.PRESETS])
 def test_every_preset_can_be_benchmarked_and_the_method_is_the_same_in_all(tiny, tmp_path, preset):
-    made = cases.make(cases.Plan((tiny.root,), tmp_path, preset=preset))
+    made = cases.make(cases.BenchmarkRequest((tiny.root,), tmp_path, preset=preset))
     found = {case.variant: configs.load(None, case.overrides, preset) for case in made}
     assert tuple(found) == variants.DEFAULT_VARIANTS
     for name in ("r5dgs", "r5dgs_extra"):
@@ -264,14 +264,14 @@ def test_every_preset_can_be_benchmarked_and_the_method_is_the_same_in_all(tiny,
 
 def test_user_overrides_replace_the_exceptions_of_a_preset_for_tracks(tiny, tmp_path):
     overrides = ("train.shading=false", "identity.training=off", "identity.weight=0.3")
-    made = cases.make(cases.Plan((tiny.root,), tmp_path, preset="paper", overrides=overrides))
+    made = cases.make(cases.BenchmarkRequest((tiny.root,), tmp_path, preset="paper", overrides=overrides))
     found = {case.variant: configs.load(None, case.overrides, "paper") for case in made}
     assert not found["tracks"].train.shading and found["tracks"].identity.training == "off"
     assert found["r5dgs"].identity.training == "joint" and found["r5dgs"].identity.weight == 0.3
 
 
 def test_the_user_can_benchmark_the_absolute_form_of_the_rigidity_loss(tiny, tmp_path):
-    plan = cases.Plan((tiny.root,), tmp_path, ("r5dgs_extra",), overrides=("losses.rigid_form=absolute",))
+    plan = cases.BenchmarkRequest((tiny.root,), tmp_path, ("r5dgs_extra",), overrides=("losses.rigid_form=absolute",))
     (case,) = cases.make(plan)
     assert configs.load(None, case.overrides, None).losses.rigid_form == "absolute"
 

@@ -7,13 +7,15 @@ import pytest
 
 from r5dgs_core.data import colmap_model, transforms
 from r5dgs_core.formats import camera_files
-from r5dgs_core.formats.camera_files import View
+from r5dgs_core.formats.camera_files import CameraFrame
 from r5dgs_core.scene import cameras
 from tests.support.scenes import orbit_camera
 
 
 def views(widths=(96, 96, 96)):
-    return [View(f"images/view {k}.png", orbit_camera(0.4 * k, width), 0.25 * k) for k, width in enumerate(widths)]
+    return [
+        CameraFrame(f"images/view {k}.png", orbit_camera(0.4 * k, width), 0.25 * k) for k, width in enumerate(widths)
+    ]
 
 
 @pytest.mark.parametrize("widths", [(96, 96, 96), (96, 64, 128)])
@@ -31,7 +33,7 @@ def test_transforms_are_read_back(tmp_path, widths):
 
 
 def test_without_times_no_time_is_written(tmp_path):
-    still = [View(view.file_path, view.camera) for view in views()]
+    still = [CameraFrame(view.file_path, view.camera) for view in views()]
     path = camera_files.write_transforms(tmp_path / "transforms.json", still)
     assert all("time" not in frame for frame in json.loads(path.read_text())["frames"])
     camera_files.write_colmap(tmp_path, still)
