@@ -11,7 +11,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-if sys.dont_write_bytecode:  # otherwise every process that a test starts compiles all modules again
+if sys.dont_write_bytecode:  # else each process that a test starts compiles all modules
     sys.dont_write_bytecode = False
     sys.pycache_prefix = str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "bytecode")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -80,7 +80,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_report_header(config: pytest.Config) -> str:
-    """Report if Blender tests can run."""
+    """Report the version of bpy, or the reason for skipping Blender tests."""
     if importlib.util.find_spec("bpy") is not None:
         try:
             return f"blender: bpy {importlib.metadata.version('bpy')}"
@@ -95,7 +95,7 @@ def pytest_report_header(config: pytest.Config) -> str:
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
-    """Keep the status for the end."""
+    """Store the exit status for `pytest_unconfigure`."""
     session.config.stash[STATUS] = int(exitstatus)
 
 
@@ -103,11 +103,10 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 def pytest_unconfigure(config: pytest.Config) -> None:
     """End the process at once if the bpy module is loaded and pytest is the program.
 
-    The module frees Blender when the last reference to it goes; where one is left when Python has ended, 4.2 crashes,
-    and that would be the exit status instead of what pytest found. Two things leave one in a test run: pytest's
-    session, which its import hook keeps alive to the end with all that hangs on it, the tracebacks of a failure among
-    it; and a timer that is registered when another file is opened, which Blender lets go in the next pass of its event
-    loop, and the module has none. That the extension itself leaves none is for `addon/test_life.py` to say.
+    Blender 4.2 crashes at the end of Python if a reference to the module is left, and the crash would replace pytest's
+    exit status. A test run leaves two: pytest's import hook keeps the session and the tracebacks of failures alive, and
+    a timer that is registered while another file is opened is freed only by an event loop, which the module lacks.
+    `addon/test_life.py` checks that the extension itself leaves no reference.
     """
     bpy = sys.modules.get("bpy")
     if bpy is None or bpy.app.binary_path or config.invocation_params.plugins or STATUS not in config.stash:

@@ -20,7 +20,7 @@ CORE = "r5dgs.r5dgs_core"
 
 
 class _OneCore(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Resolves `r5dgs.r5dgs_core.x` to the one `r5dgs_core.x`, so that classes are the same on both sides."""
+    """Importer that resolves `r5dgs.r5dgs_core.x` to `r5dgs_core.x`, so that both names have the same classes."""
 
     def find_spec(self, fullname, path=None, target=None):
         if fullname == CORE or fullname.startswith(CORE + "."):
@@ -66,7 +66,7 @@ def extension():
 
 @pytest.fixture(autouse=True)
 def blender(extension):
-    """`bpy` with factory settings."""
+    """The module `bpy` with factory settings."""
     import bpy
 
     bpy.ops.wm.read_homefile(app_template="")
@@ -75,14 +75,14 @@ def blender(extension):
 
 @pytest.fixture(scope="session")
 def scene_contents(tmp_path_factory):
-    """Contents of the file of a synthetic scene of five objects."""
+    """Bytes of a scene file with five objects."""
     path = tmp_path_factory.mktemp("scene") / "synthetic.r5dgs"
     return scene_file.write(scenes.make_scene(n=400, objects=5, seed=1), path).read_bytes()
 
 
 @pytest.fixture
 def scene_path(scene_contents, tmp_path):
-    """File of a synthetic scene of five objects, of the test's own."""
+    """File of a synthetic scene of five objects in the folder of the test."""
     path = tmp_path / "synthetic.r5dgs"
     path.write_bytes(scene_contents)
     return path
@@ -90,13 +90,13 @@ def scene_path(scene_contents, tmp_path):
 
 @pytest.fixture
 def loaded(blender, scene_path):
-    """Its collection in Blender."""
+    """Collection of the loaded scene."""
     return motions.load_again(blender, scene_path)
 
 
 @pytest.fixture
 def mug(blender, loaded):
-    """The anchor of its first object, selected."""
+    """Anchor of the loaded scene's first object, selected."""
     anchor = blender.data.objects["mug anchor"]
     motions.choose(blender, anchor)
     return anchor

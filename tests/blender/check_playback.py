@@ -2,10 +2,9 @@
 
     blender -b --python-exit-code 1 --python tests/blender/check_playback.py -- SCENE.r5dgs
 
-runs it in Blender, ``python tests/blender/check_playback.py SCENE.r5dgs`` in the bpy module; ``--worker PYTHON`` and
-``--no-preview`` are options. Where the extension is not enabled, the one that this file lies in is registered. The
-core's own pictures come from the worker's Python, in a process of its own, straight from the scene file. Ends with exit
-code 1 where anything differs by more than it may.
+runs it in Blender, ``python tests/blender/check_playback.py SCENE.r5dgs`` in the bpy module. Options are ``--worker
+PYTHON`` and ``--no-preview``. Registers the extension of this repository if none is enabled. A second process of the
+worker's Python renders the reference images from the scene file. Exits with 1 if a difference exceeds its limit.
 """
 
 import argparse
@@ -40,7 +39,7 @@ np.save(out, np.stack(images))
 
 
 def extension_package() -> str:
-    """Name of the extension's package, which is registered from this repository if it is not enabled."""
+    """Name of the extension's package. Registers the extension of this repository if none is enabled."""
     for name in list(sys.modules):
         if name.endswith(".r5dgs_addon") and "r5dgs_core" not in name:
             return name.removesuffix(".r5dgs_addon")
@@ -66,7 +65,7 @@ def times_to_check(scene) -> list[float]:
 
 
 def set_time(collection, t: float) -> None:
-    """Go to a scene time, sub-frame included."""
+    """Set the frame and sub-frame of a scene time."""
     state = collection.r5dgs
     frame = state.frame_zero + t * state.frames_per_unit
     bpy.context.scene.frame_set(int(np.floor(frame)), subframe=float(frame - np.floor(frame)))
@@ -164,7 +163,7 @@ def references(path: Path, times: list[float], python: str, package_root: Path) 
 
 
 def main(arguments: list[str]) -> int:
-    """Run the check; returns the exit code."""
+    """Run the check. Returns the exit code."""
     parser = argparse.ArgumentParser(description="Check a scene inside Blender against the core.")
     parser.add_argument("scene", type=Path)
     parser.add_argument("--worker", help="Python with torch for preview and reference; else the add-on's choice")

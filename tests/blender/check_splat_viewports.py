@@ -3,8 +3,8 @@
     xvfb-run -a -s "-screen 0 1280x800x24 +extension GLX" \\
         blender --factory-startup --python tests/blender/check_splat_viewports.py -- SCENE.r5dgs [PICTURES]
 
-Needs ImageMagick, but no worker: pictures are compared with those drawn after everything was forgotten. Ends with exit
-code 1 if one differs.
+Needs ImageMagick, but no worker: pictures are compared with those drawn after all cached data was dropped. Exits with 1
+if one differs.
 """
 
 import sys
@@ -22,20 +22,20 @@ out = Path()
 
 
 def seen(name: str) -> np.ndarray:
-    """Picture of the 3D view, kept under a name."""
+    """Screenshot of the 3D view, saved under a name."""
     redraw()
     return shown_region(screenshot(out / f"{name}.png"))[0]
 
 
 def compare(what: str, found: np.ndarray, wanted: np.ndarray) -> None:
-    """Say how equal two pictures are, and fail if they are not."""
+    """Print the difference of two pictures, and fail if it is too large."""
     value = psnr(found, wanted)
     print(f"{what}: {value:.1f} dB", flush=True)
     assert value > LEAST_DB
 
 
 def checks(path: str, folder: str = ""):
-    """The checks, step by step; yields seconds to wait."""
+    """Run the checks. Yields the seconds to wait after each step."""
     global out
     out = Path(folder or tempfile.mkdtemp())
     bpy.context.preferences.view.show_splash = False
@@ -56,7 +56,7 @@ def checks(path: str, folder: str = ""):
 
 
 def check_projection():
-    """The orthographic view is that of a viewport that never was in perspective."""
+    """The orthographic view equals that of a viewport that was never in perspective."""
     with inside():
         bpy.ops.view3d.view_persportho()
     yield 0.5
@@ -69,7 +69,7 @@ def check_projection():
 
 
 def check_meshes(before: np.ndarray):
-    """A mesh that is hidden in the viewport only does not hide splats any more."""
+    """A mesh that is hidden in the viewport does not occlude splats."""
     space = area_of("VIEW_3D").spaces[0]
     bpy.ops.mesh.primitive_cube_add(size=0.2 * space.region_3d.view_distance, location=space.region_3d.view_location)
     cube = bpy.context.object
@@ -85,7 +85,7 @@ def check_meshes(before: np.ndarray):
 
 
 def check_quad_view():
-    """Each part of a quad view has a picture of its own."""
+    """Each part of a quad view shows its own view."""
     pictures = service("splats.viewport_splats")._state.pictures
     with inside():
         bpy.ops.screen.region_quadview()
@@ -99,7 +99,7 @@ def check_quad_view():
 
 
 def check_windows(before: np.ndarray):
-    """A second window with another scene and frame leaves the first alone, and nothing behind."""
+    """A second window with another scene and frame changes nothing in the first, and leaves no data when it closes."""
     layers, pictures = service("splats.visible_splats")._layers, service("splats.viewport_splats")._state.pictures
     scene = main_window().scene
     bpy.ops.wm.window_new_main()
@@ -127,7 +127,7 @@ def check_windows(before: np.ndarray):
 
 
 def check_render(before: np.ndarray):
-    """Rendering an animation in a thread leaves the viewport as it was."""
+    """Rendering an animation in a thread does not change the viewport."""
     scene, done = main_window().scene, []
     scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(scene.camera)

@@ -3,8 +3,8 @@
     xvfb-run -a -s "-screen 0 1280x800x24 +extension GLX" \\
         blender --factory-startup --python tests/blender/check_splats.py -- SCENE.r5dgs [PICTURES]
 
-Needs ImageMagick. `R5DGS_PYTHON` names the worker's Python where that is not found by itself. Pictures of the window go
-to the folder PICTURES. Ends with exit code 1 if a viewport differs from the worker's picture of the same view.
+Needs ImageMagick. `R5DGS_PYTHON` sets the worker's Python if it is not found automatically. Screenshots are saved in
+the folder PICTURES. Exits with 1 if a viewport differs from the worker's picture of the same view.
 """
 
 import subprocess
@@ -25,7 +25,7 @@ TIMES = (0.0, 0.3, 0.6, 0.95, 1.15)  # in observed spans
 
 
 def screenshot(path: Path) -> np.ndarray:
-    """Picture of the screen. [H, W, 3] in [0, 1]"""
+    """Screenshot of the screen. [H, W, 3] in [0, 1]"""
     subprocess.run(["import", "-window", "root", str(path)], check=True)
     image = bpy.data.images.load(str(path))
     values = np.empty(4 * image.size[0] * image.size[1], np.float32)
@@ -36,13 +36,13 @@ def screenshot(path: Path) -> np.ndarray:
 
 
 def redraw():
-    """Draw the window twice, the second time with all anti-aliasing samples begun."""
+    """Draw the window twice, so that all anti-aliasing samples are started."""
     with inside():
         bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=2)
 
 
 def shown_region(picture: np.ndarray) -> tuple[np.ndarray, tuple[slice, slice]]:
-    """Pixels of the 3D view that no header or sidebar covers."""
+    """Pixels of the 3D view that are not covered by a header or sidebar."""
     area, region = area_of("VIEW_3D"), region_of(area_of("VIEW_3D"))
     height = main_window().height
     tops = [r.height for r in area.regions if r.type in ("HEADER", "TOOL_HEADER") and r.height > 1]
@@ -78,7 +78,7 @@ def worker_depth() -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_meshes(out: Path, size: float):
-    """A plane that cuts the scene and a ball in it: the nearer of mesh and Gaussians wins."""
+    """A plane that cuts the scene, and a ball in it: the nearer of mesh and Gaussians is visible."""
     space = area_of("VIEW_3D").spaces[0]
     space.shading.light, space.shading.color_type, space.shading.single_color = "FLAT", "SINGLE", (0.0, 1.0, 0.0)
     view_3d = space.region_3d
@@ -138,7 +138,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def checks(path: str, folder: str = ""):
-    """The check, step by step; yields seconds to wait."""
+    """Run the check. Yields the seconds to wait after each step."""
     out = Path(folder or tempfile.mkdtemp())
     bpy.context.preferences.view.show_splash = False
     for obj in list(bpy.data.objects):

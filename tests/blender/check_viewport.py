@@ -3,8 +3,8 @@
     xvfb-run -a -s "-screen 0 1280x800x24 +extension GLX" \\
         blender --factory-startup --python tests/blender/check_viewport.py -- SCENE.r5dgs
 
-`R5DGS_PYTHON` names the worker's Python where that is not found by itself. Ends with exit code 1 where a picture does
-not come, F12 is not the worker's own, or something goes on after the file is closed.
+`R5DGS_PYTHON` sets the worker's Python if it is not found automatically. Exits with 1 if a picture is missing, F12
+differs from the worker's picture, or a timer or job is still active after the file is closed.
 """
 
 import sys
@@ -30,7 +30,7 @@ def full_picture():
 
 
 def checks(path: str):
-    """The check, step by step; yields seconds to wait."""
+    """Run the check. Yields the seconds to wait after each step."""
     window = bpy.context.window_manager.windows[0]
     area = max((a for a in window.screen.areas if a.type == "VIEW_3D"), key=lambda a: a.width * a.height)
     region, space = next(r for r in area.regions if r.type == "WINDOW"), area.spaces[0]

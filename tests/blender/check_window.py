@@ -3,8 +3,8 @@
     xvfb-run -a -s "-screen 0 1280x800x24 +extension GLX" blender --factory-startup --window-geometry 0 0 1280 800 \\
         --python tests/blender/check_window.py -- SCENE.r5dgs [CHECK ...]
 
-Needs ``xdotool``, and a worker's Python (`R5DGS_PYTHON`) where that is not found by itself. Each check is a function
-named below, of which some may be asked for. Ends with exit code 1 where one fails.
+Needs ``xdotool``. `R5DGS_PYTHON` sets the worker's Python if it is not found automatically. CHECK is the name of a
+function in `CHECKS`; all run by default. Exits with 1 if one fails.
 """
 
 import contextlib
@@ -44,7 +44,7 @@ def nothing_runs() -> bool:
 
 
 def choose(folder: Path, name: str = ""):
-    """Choose a file or folder in the open file browser, by Enter."""
+    """Choose a file or folder in the open file browser, and press Enter."""
     yield from w.wait(lambda: any(area.type == "FILE_BROWSER" for area in w.main_window().screen.areas), "browser")
     yield 0.5
     params = w.area_of("FILE_BROWSER").spaces.active.params
@@ -70,7 +70,7 @@ def browsing(path: Path, folder: Path):
     yield from w.press("ctrl+shift+z")
     assert len(loaded()) == 1, "Ctrl+Shift+Z did not bring the scene back"
     yield from w.press("ctrl+z")
-    with w.inside():  # the call that Blender makes for a dropped file
+    with w.inside():  # Blender calls this operator for a dropped file
         bpy.ops.wm.drop_import_file("INVOKE_DEFAULT", directory=str(path.parent), files=[{"name": path.name}])
     yield 1.0
     assert len(loaded()) == 1, "a drop loaded nothing"
@@ -154,7 +154,7 @@ def rendering(path: Path, folder: Path):
         if stop:
             print(f"F12: stopped {time.monotonic() - began:.1f} s after Esc", flush=True)
         yield 0.5
-        yield from w.press("Escape")  # back from the picture
+        yield from w.press("Escape")  # return from the render view
         yield 0.5
     assert nothing_runs()
 
@@ -250,7 +250,7 @@ def looking(path: Path, folder: Path):
 
 
 def render_by_key():
-    """F12, until the picture is there, and back to the 3D view."""
+    """Press F12, wait for the picture, and return to the 3D view."""
     yield from w.hover(w.region_of(w.area_of("VIEW_3D")))
     yield from w.press("F12")
     yield from w.wait(lambda: not w.service("worker.jobs").busy() and not bpy.app.is_job_running("RENDER"), "F12")
@@ -259,10 +259,10 @@ def render_by_key():
 
 
 def saved_pictures(scene: bpy.types.Scene, stem: Path) -> list[np.ndarray]:
-    """Images that Blender saves of the last render, one for each view. [H, W, 3] each"""
+    """Images of the last render as saved by Blender, one per view. [H, W, 3] each"""
     settings = scene.render.image_settings
     settings.file_format, settings.views_format = "PNG", "INDIVIDUAL"
-    with contextlib.suppress(RuntimeError):  # 4.3 misses the file without a view's name
+    with contextlib.suppress(RuntimeError):  # 4.3 reports an error for the missing file without a view's name
         bpy.data.images["Render Result"].save_render(f"{stem}.png", scene=scene)
     return [pixels(bpy.data.images.load(str(file))) for file in sorted(stem.parent.glob(f"{stem.name}*.png"))]
 
@@ -273,7 +273,7 @@ def exporting(path: Path, folder: Path):
     scene.render.resolution_x, scene.render.resolution_y = 320, 240
     scene.frame_set(7)
     running = w.service("ui.stepwise_operator")
-    blink, running.BLINK_S = running.BLINK_S, 1e-4  # the window is drawn after each step: there is time for Esc
+    blink, running.BLINK_S = running.BLINK_S, 1e-4  # each step draws the window and processes Esc
     for operator, name in (("export_masks", ""), ("export_ply", "a.ply"), ("export_scene", "b.r5dgs")):
         target = folder / operator
         target.mkdir()
@@ -372,7 +372,7 @@ def merging(path: Path, folder: Path):
 
 
 def combine_by_depth(first: bpy.types.Scene, second: bpy.types.Scene) -> None:
-    """Set up the first scene's compositor to show the nearer of both."""
+    """Set up the first scene's compositor to combine both renders by depth."""
     if "compositing_node_group" in first.bl_rna.properties:  # Blender 5
         tree = first.compositing_node_group = bpy.data.node_groups.new("merge", "CompositorNodeTree")
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
@@ -427,7 +427,7 @@ CHECKS = (
 
 
 def checks(path: Path, chosen: list):
-    """The checks one after the other; yields seconds to wait."""
+    """Run the checks in order. Yields the seconds to wait after each step."""
     view = bpy.context.preferences.view
     view.filebrowser_display_type = view.render_display_type = "SCREEN"
     with tempfile.TemporaryDirectory(prefix="r5dgs-window-") as folder:
@@ -443,7 +443,7 @@ def checks(path: Path, chosen: list):
 
 
 def main(arguments: list[str]) -> None:
-    """Run the checks that are named, or all."""
+    """Run the checks named on the command line, or all."""
     unknown = set(arguments[1:]) - {check.__name__ for check in CHECKS}
     if unknown:
         raise SystemExit(f"{', '.join(unknown)}: expected some of {', '.join(check.__name__ for check in CHECKS)}")

@@ -4,8 +4,8 @@
         --python tests/blender/pictures.py -- demo.r5dgs FOLDER [PICTURE ...]
 
 Needs ImageMagick's ``import`` (Blender's own screenshots are black under software rendering) and a worker's Python
-(`R5DGS_PYTHON`). Each picture is a function that sets the window up and is followed by a while in which Blender draws;
-a function may be a generator, whose values are seconds to wait in between.
+(`R5DGS_PYTHON`). Each picture is a function that sets up the window; the screenshot follows after Blender has drawn. A
+function may be a generator of seconds to wait between its steps.
 """
 
 import argparse
@@ -28,7 +28,7 @@ SIDEBAR = "R5DGS"
 
 
 def register_extension() -> None:
-    """Register the extension from this repository, where it is not enabled already."""
+    """Register the extension of this repository if none is enabled."""
     if hasattr(bpy.types, "R5DGS_PT_scene"):
         return
     spec = importlib.util.spec_from_file_location("r5dgs", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)])
@@ -39,7 +39,7 @@ def register_extension() -> None:
 
 
 class Window:
-    """Blender's window: its areas, and operators called in them."""
+    """Areas of Blender's window, and context overrides for operators in them."""
 
     @property
     def window(self):
@@ -72,7 +72,7 @@ def collection():
 
 
 def load(path: Path, window: Window) -> None:
-    """Load a scene into an empty file, seen by the captured camera that loading chooses."""
+    """Load a scene into an empty file, viewed through the captured camera that the operator activates."""
     for obj in list(bpy.data.objects):
         bpy.data.objects.remove(obj)
     bpy.ops.wm.save_as_mainfile(filepath=str(path.with_suffix(".blend")))  # the sidebar shows paths from here
@@ -119,7 +119,7 @@ def nothing(window: Window):
 
 
 def physics(window: Window):
-    """The physics of one object, and the predicted paths with their uncertainty."""
+    """Physics panel of one object, and the predicted paths with their uncertainty."""
     window.area("VIEW_3D").spaces.active.shading.type = "SOLID"
     window.area("VIEW_3D").spaces.active.shading.color_type = "OBJECT"
     with window.inside():
@@ -200,7 +200,7 @@ SHOTS = (loaded, prompt, nothing, physics, ellipsoids, viewport, preview, merge)
 
 
 def run(path: Path, folder: Path, shots: list):
-    """Set up, wait, take, one picture after the other; yields the seconds to wait."""
+    """Set up and take one picture after the other. Yields the seconds to wait."""
     window = Window()
     load(path, window)
     yield 2.0

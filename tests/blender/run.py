@@ -2,11 +2,11 @@
 
     blender -b --factory-startup --python-exit-code 1 --python tests/blender/run.py -- [--scene FILE.r5dgs]
 
-runs in a Blender, ``python tests/blender/run.py`` in the bpy module. The figures are the times of loading 40,000 and a
-million Gaussians (processor time where the machine is busy), the distance of every point from the core's playback on
-every frame and between frames, the number of keys beside one key per frame, and frame changes per second. Those of
-positions and keys are of ``--scene`` where it is given, else of a synthetic one. Tests run where pytest can be
-imported; those that need torch are left out where it is absent. The exit code is not 0 where anything failed.
+runs in a Blender, ``python tests/blender/run.py`` in the bpy module. It measures the time of loading 40,000 and a
+million Gaussians (the smaller of clock and processor time), the largest distance of points from the core's playback on
+and between frames, the number of keys relative to one key per frame, and frame changes per second. Positions and keys
+are measured on ``--scene``, by default on a synthetic scene. Tests run if pytest is installed; tests that need torch
+are left out if it is missing. The exit code is 0 if nothing failed.
 """
 
 import argparse
@@ -40,13 +40,13 @@ BODIES = 12
 
 
 class Table:
-    """Measured rows, printed one by one."""
+    """Table of measurements, printed row by row."""
 
     def __init__(self):
         self.rows: list[dict] = []
 
     def add(self, what: str, value: float, text: str, wanted: str, good: bool) -> None:
-        """Add a value and True if it is within its limit."""
+        """Add a value, with True if it is within its limit."""
         self.rows.append({"what": what, "value": value, "wanted": wanted, "good": good})
         print(f"  {what:<52} {text:>14}   {wanted:<24} {'ok' if good else 'FAILED'}", flush=True)
 
@@ -56,7 +56,7 @@ class Table:
 
 
 def load(path: Path, **options):
-    """Load a scene into an empty file: its collection, and the seconds on the clock and of the processor."""
+    """Load a scene into an empty file. Returns its collection, clock seconds and processor seconds."""
     bpy.ops.wm.read_homefile(app_template="", use_empty=True)
     wall, processor = time.perf_counter(), time.process_time()
     if bpy.ops.r5dgs.load_scene(filepath=str(path), **options) != {"FINISHED"}:
@@ -66,13 +66,13 @@ def load(path: Path, **options):
 
 
 def synthetic(count: int, folder: Path, sh_degree: int = 0) -> Path:
-    """A scene of twelve bodies and a floor."""
+    """Scene of twelve bodies and a floor."""
     scene = scenes.make_scene(n=count, objects=BODIES, sh_degree=sh_degree, seed=1, identities=False)
     return scene_file.write(scene, folder / f"synthetic_{count}_{sh_degree}.r5dgs")
 
 
 def measure_loading(table: Table, folder: Path) -> None:
-    """Seconds until a scene is there, keys included; the best of three for the small one."""
+    """Measure the seconds of loading, keys included; best of three for the small scene."""
     for count, limit in LOAD_LIMITS_S.items():
         path = synthetic(count, folder)
         times = [load(path)[1:] for _ in range(3 if count < 1_000_000 else 1)]
@@ -84,7 +84,7 @@ def measure_loading(table: Table, folder: Path) -> None:
 
 
 def measure_positions(table: Table, path: Path, modules) -> None:
-    """Largest distance from playback on every frame of the timeline and at two places between each two frames."""
+    """Measure the largest distance from playback, on every frame and at two sub-frames after each frame."""
     scene = modules["scene_file"].read(path)
     collection, *_ = load(path)
     blender, state = bpy.context.scene, collection.r5dgs
@@ -104,7 +104,7 @@ def measure_positions(table: Table, path: Path, modules) -> None:
 
 
 def measure_keys(table: Table, path: Path, modules, package: str) -> None:
-    """Keys under a tolerance of 0.1 % of the smallest object that moves, beside one key per frame."""
+    """Count keys for a tolerance of 0.1 % of the smallest moving object, relative to one key per frame."""
     compat = importlib.import_module(f"{package}.r5dgs_addon.compat")
     scene = modules["scene_file"].read(path)
     sizes = []
@@ -129,7 +129,7 @@ def measure_keys(table: Table, path: Path, modules, package: str) -> None:
 
 
 def measure_playing(table: Table, path: Path) -> None:
-    """Frame changes per second, the better of clock and processor, over the timeline and back."""
+    """Measure frame changes per second over the timeline and back, by the smaller of clock and processor time."""
     load(path)
     blender = bpy.context.scene
     order = [*range(blender.frame_start, blender.frame_end + 1), *range(blender.frame_end, blender.frame_start - 1, -1)]

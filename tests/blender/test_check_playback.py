@@ -1,4 +1,4 @@
-"""The headless check of `check_playback.py`, run in a process of its own through the bpy module."""
+"""`check_playback.py` in the bpy module, in a second process."""
 
 import subprocess
 import sys

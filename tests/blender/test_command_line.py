@@ -1,4 +1,4 @@
-"""Build, install, use and remove the extension with Blender's own command line. Needs a program named `blender`."""
+"""Build, install, use and remove the extension by Blender's command line. Needs a program `blender` in the path."""
 
 import os
 import shutil

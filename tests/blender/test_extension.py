@@ -1,4 +1,4 @@
-"""The extension as users get it: built, validated, installed into an empty user folder, used without torch, removed."""
+"""Build, validate and install the extension into an empty user folder, use it without torch, and remove it."""
 
 import json
 import os
@@ -83,7 +83,7 @@ if reloading:
 
 
 def cli(*arguments):
-    """Blender's extension command line, without Blender's window."""
+    """Run Blender's extension command line without a window."""
     import bl_pkg
 
     script = Path(bl_pkg.__file__).parent / "cli" / "blender_ext.py"
@@ -137,9 +137,9 @@ def test_installs_works_without_torch_and_goes_away_twice_in_a_row(archive, tmp_
     result = json.loads(line.removeprefix("RESULT "))
     assert result["loaded"] == []
     assert result["seen"][0] == result["seen"][1] and result["seen"][0][3] > 0
-    assert named_after_us(tmp_path / "user") == []
+    assert leftovers(tmp_path / "user") == []
 
 
-def named_after_us(folder):
-    """Files and folders that the extension left in a user's folder."""
+def leftovers(folder):
+    """Files and folders in a user folder whose names contain the extension's id."""
     return [str(path) for path in folder.rglob("*r5dgs*")]

@@ -1,10 +1,10 @@
 """Run `tests/blender/run.py` in every Blender that the extension is tested on: `python tests/blender/versions.py`.
 
-For each version of the bpy module an environment is made once in ``--folder`` (about 1.5 GB each) and used again; the
-module's Python has to be installed (3.11 up to 5.0, 3.13 from 5.1 on). ``--blender PROGRAM`` adds Blender programs.
-Previews use ``--worker``, by default the Python that runs this; torch is not installed beside the modules unless
-``--torch`` says so, and without it the tests that draw pictures themselves are left out. What follows ``--`` goes to
-`run.py`. Ends with exit code 1 where a version failed.
+Each version of the bpy module gets an environment in ``--folder`` (about 1.5 GB), which later calls reuse. Its Python
+has to be installed (3.11 up to 5.0, 3.13 from 5.1 on). ``--blender PROGRAM`` adds Blender programs. Previews use the
+Python of ``--worker``, by default the running one. ``--torch`` installs torch in each environment; without it, tests
+that render in Blender's process are left out. Arguments after ``--`` are passed to `run.py`. Exits with 1 if a version
+failed.
 """
 
 from __future__ import annotations
@@ -18,21 +18,23 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = Path(__file__).with_name("run.py")
-MODULES = {"4.2.23": "3.11", "4.5.15": "3.11", "5.0.1": "3.11", "5.2.3": "3.13"}  # bpy, and the Python that it is for
+MODULES = {"4.2.23": "3.11", "4.5.15": "3.11", "5.0.1": "3.11", "5.2.3": "3.13"}  # version of bpy to version of Python
 TORCH = next(line for line in (ROOT / "constraints.txt").read_text().splitlines() if line.startswith("torch=="))
 BESIDE = ("pytest", "hypothesis", "OpenImageIO", "rich", "packaging", "scipy", "trimesh")
 
 
 def python_of(version: str) -> str:
-    """A Python of a version such as "3.13"."""
+    """Path of a Python of a version such as "3.13"."""
     found = shutil.which(f"python{version}")
-    if found is None or subprocess.run([found, "-c", ""], capture_output=True).returncode:  # a shim may lead nowhere
+    if (
+        found is None or subprocess.run([found, "-c", ""], capture_output=True).returncode
+    ):  # a shim may point to a missing Python
         raise SystemExit(f"python{version}: not found; the bpy module of this version is for it alone, so install it")
     return found
 
 
 def environment(bpy: str, folder: Path, torch: bool) -> Path:
-    """The Python of an environment with a version of bpy, which is created if missing."""
+    """Python of an environment with a version of bpy, which is created if missing."""
     place = folder / bpy
     python = place / "bin" / "python"
     done = place / "installed"
@@ -45,7 +47,7 @@ def environment(bpy: str, folder: Path, torch: bool) -> Path:
 
 
 def main(arguments: list[str]) -> int:
-    """Run all; returns the exit code."""
+    """Run all versions. Returns the exit code."""
     split = arguments.index("--") if "--" in arguments else len(arguments)
     parser = argparse.ArgumentParser(description="The extension's figures and tests in every version of Blender.")
     parser.add_argument("versions", nargs="*", help=f"versions of bpy, by default {', '.join(MODULES)}")

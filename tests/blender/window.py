@@ -1,6 +1,6 @@
 """Helpers of checks that run inside Blender's window: the extension, waiting, and simulated keys and mouse.
 
-Keys and mouse are X's own, by ``xdotool``; without a window manager they go to the window that the mouse is in.
+Keys and mouse events are sent by ``xdotool``. Without a window manager they go to the window under the pointer.
 """
 
 import importlib
@@ -16,13 +16,13 @@ from pathlib import Path
 import bpy
 
 ROOT = Path(__file__).resolve().parents[2]
-PATIENCE_S = 240.0  # the first picture may have to compile the rasterizer
+PATIENCE_S = 240.0  # the first picture may compile the rasterizer
 STEP_S = 0.02
 KEY_S = 0.3  # until Blender has processed an action of the user
 
 
 def register() -> None:
-    """Register the extension that this file lies in."""
+    """Register the extension of this repository."""
     spec = importlib.util.spec_from_file_location("r5dgs", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)])
     module = importlib.util.module_from_spec(spec)
     sys.modules["r5dgs"] = module
@@ -31,7 +31,7 @@ def register() -> None:
 
 
 def service(name: str):
-    """A module of the add-on."""
+    """Module of the add-on."""
     return importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
 
 
@@ -66,7 +66,7 @@ def inside(kind: str = "VIEW_3D", region: str = "WINDOW"):
 
 
 def hover(region: bpy.types.Region, x: float | None = None, y: float | None = None) -> Iterator[float]:
-    """Move the mouse into a region, to a pixel from its lower left corner; by default to its middle."""
+    """Move the mouse to a pixel of a region, counted from its lower left corner; by default to its middle."""
     x = region.width / 2 if x is None else x
     y = region.height / 2 if y is None else y
     place = round(region.x + x), round(main_window().height - 1 - region.y - y)
@@ -75,7 +75,7 @@ def hover(region: bpy.types.Region, x: float | None = None, y: float | None = No
 
 
 def press(*keys: str) -> Iterator[float]:
-    """Press keys, such as ``ctrl+z``, where the mouse is."""
+    """Press keys, such as ``ctrl+z``, in the region under the mouse."""
     for key in keys:
         _xdotool("key", key)
         yield KEY_S
@@ -88,7 +88,7 @@ def write(text: str) -> Iterator[float]:
 
 
 def click() -> Iterator[float]:
-    """Click with the left button where the mouse is."""
+    """Click the left button at the position of the mouse."""
     _xdotool("click", 1)
     yield KEY_S
 
@@ -104,7 +104,7 @@ def drag(region: bpy.types.Region, start: tuple[float, float], end: tuple[float,
 
 
 def run(checks: Callable[..., Iterator[float]], *arguments) -> None:
-    """Run checks, whose values are seconds to wait, from a timer, and end Blender with 0, or 1 where one failed."""
+    """Run a generator of seconds to wait from a timer, then exit Blender with 0, or with 1 if it raised an error."""
     bpy.context.preferences.view.show_splash = False
     register()
     steps = checks(*arguments)
@@ -120,7 +120,7 @@ def run(checks: Callable[..., Iterator[float]], *arguments) -> None:
         service("worker.jobs").stop()
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(code)  # quitting would end with 0
+        os._exit(code)  # quitting exits with 0
 
     bpy.app.timers.register(step, first_interval=1.0, persistent=True)
 

@@ -1,4 +1,4 @@
-"""Shared fixtures: the tiny data set, one training of it, a synthetic scene and a data set of its pictures."""
+"""Shared fixtures: the tiny data set, a run on it, a synthetic scene and a data set of its images."""
 
 import copy
 import hashlib
@@ -17,7 +17,7 @@ from tests.support import pictures, scenes, tiny_datasets
 
 @pytest.fixture(scope="session", autouse=True)
 def no_plots():
-    """Train without plots of learning curves, which take a third of a tiny run; returns the function left out."""
+    """Disable plots of learning curves, which take a third of a tiny run. Returns the original function."""
     update = learning_curves.LearningCurves.update
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learning_curves.LearningCurves, "update", lambda self, *, finished=False: None)
@@ -26,7 +26,7 @@ def no_plots():
 
 @pytest.fixture(scope="session", autouse=True)
 def few_views():
-    """Bake by the evidence of a dozen images."""
+    """Limit the image evidence of baking to a dozen images."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(image_evidence, "FEWEST", 8)
         patch.setattr(image_evidence, "MOST", 12)
@@ -35,7 +35,7 @@ def few_views():
 
 @pytest.fixture(scope="session", autouse=True)
 def short_playback():
-    """Measure the playback speed over a dozen frames."""
+    """Limit the measurement of playback speed to a dozen frames."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(playback_speed, "LEAST_FRAMES", 12)
         yield
@@ -43,9 +43,10 @@ def short_playback():
 
 @pytest.fixture(scope="session", autouse=True)
 def shared_starts():
-    """Place the Gaussians of equal runs once and give trainers copies.
+    """Compute the initial Gaussians of equal runs once, and give trainers copies.
 
-    Views without masks or motion are placed anew, as that warns. Settings that the start does not read may differ.
+    Data without masks or motion is initialised each time, because that logs a warning. Settings that the
+    initialisation does not read may differ.
     """
     start, made = initialize.start, {}
 
@@ -67,7 +68,7 @@ def shared_starts():
 
 @pytest.fixture
 def plots(no_plots, monkeypatch):
-    """Training plots its learning curves, as it does for users."""
+    """Enable plots of learning curves."""
     monkeypatch.setattr(learning_curves.LearningCurves, "update", no_plots)
 
 
@@ -79,36 +80,36 @@ def tiny(tmp_path_factory):
 
 @pytest.fixture
 def copied(tiny, tmp_path):
-    """The folder of a copy of it, to be changed."""
+    """Folder of a copy of the tiny data set that a test may change."""
     return shutil.copytree(tiny.root, tmp_path / "data")
 
 
 @pytest.fixture(scope="session")
 def trained(tiny, tmp_path_factory):
-    """A finished run on it."""
+    """Finished run on the tiny data set."""
     folder = tmp_path_factory.mktemp("runs") / "trained"
     return run.train(tiny.root, folder, tiny_datasets.settings("train.iterations=300"))
 
 
 @pytest.fixture(scope="session")
 def baked(trained, tiny):
-    """The scene of that run."""
+    """Scene baked from `trained`."""
     return bake.bake(trained, datasets.read(tiny.root))
 
 
 @pytest.fixture(scope="session")
 def kept(trained, tiny):
-    """The scene of that run with its motion as it was trained."""
+    """Scene of `trained` with unsimplified motion."""
     return bake.bake(tiny_datasets.as_trained(trained), datasets.read(tiny.root))
 
 
 @pytest.fixture(scope="session")
 def scene():
-    """A synthetic scene of three objects."""
+    """Synthetic scene of three objects."""
     return scenes.make_scene(n=240, objects=3, seed=5)
 
 
 @pytest.fixture(scope="session")
 def data(scene, tmp_path_factory):
-    """Data set of the pictures of `scene`."""
+    """Data set of images of `scene`."""
     return pictures.write_dataset(tmp_path_factory.mktemp("own pictures"), scene)
