@@ -3,18 +3,22 @@
 An image shows the depsgraph (see `render_request`), so a frame of an animation equals the frame that F12 renders.
 """
 
-import functools
+import math
 import time
+from collections.abc import Sequence
 
 import bpy
+import numpy as np
 
 from ...r5dgs_core import errors
+from ...r5dgs_core.color import view_inverse
 from .. import compat
 from ..color import display_to_linear, inverse_loss, view_transform
 from ..scene import loaded_scenes, render_settings
 from ..ui import plural
 from ..worker import jobs
 from . import (
+    blur_samples,
     cryptomatte,
     mesh_merge,
     render_notes,
@@ -70,11 +74,11 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         self._viewport_image.draw(self, context, depsgraph)
 
     def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
-        for view, eye in stereo.eyes(self, depsgraph):
+        for view, camera in stereo.cameras(self, depsgraph.scene):
             if not self.test_break():
-                self._render_view(depsgraph, view, eye)
+                self._render_view(depsgraph, view, camera)
 
-    def _render_view(self, depsgraph: bpy.types.Depsgraph, view: str, eye: view_cameras.Eye | None) -> None:
+    def _render_view(self, depsgraph: bpy.types.Depsgraph, view: str, camera: bpy.types.Object | None) -> None:
         scene, layer = depsgraph.scene, depsgraph.view_layer
         if not loaded_scenes.scene_collections():
             raise errors.ConfigError("expected a loaded R5DGS scene, found none; load one from File > Import first")
@@ -86,33 +90,96 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
                 f"R5DGS: colors are not as trained with {', '.join(objections)}; press 'Show Colors as "
                 "Trained' in the render properties",
             )
-        merged, transparent = mesh_merge.of(scene) is not None, scene.render.film_transparent
-        passes = render_passes.of_layer(layer, merged)
+        transparent = scene.render.film_transparent
+        passes = render_passes.of_layer(layer, mesh_merge.of(scene) is not None)
         mattes = cryptomatte.pass_names(layer)
-        seen = render_request.shown(depsgraph, functools.partial(view_cameras.of_camera, depsgraph, eye=eye))
+        seen = self._seen(depsgraph, camera)
         render_notes.report(self, render_notes.of(scene, depsgraph))
-        if seen.scenes:
-            sky = render_settings.of(scene).sky and not transparent
-            steps = render_request.steps(seen, render_passes.wanted(passes, transparent), sky)
-            if merged:
-                steps[-1][-1]["meshes"] = visible_meshes.of(depsgraph).to_json()
-            if mattes:
-                steps[-1][-1]["coverage"] = cryptomatte.request(seen, len(mattes))
-            arrays = self._ask(steps)
-        else:
+        if not seen.scenes:
             self.report({"WARNING"}, f"R5DGS: view layer {layer.name} shows no R5DGS scene")
-            arrays = render_passes.empty(seen.camera, cryptomatte.RANKS * len(mattes))
+        arrays = self._arrays(depsgraph, seen, passes, mattes)
         if arrays is None:
             return
+        filled = {one.name: render_passes.pixels(one, arrays, seen, transparent, inverse) for one in passes}
+        if seen.scenes and blur_samples.are_needed(depsgraph, camera or scene.camera):
+            colors = [one for one in passes if one in render_passes.COLORS]
+            blurred = self._mean_of_samples(depsgraph, camera, colors, inverse)
+            if blurred is None:
+                return
+            filled |= blurred
         for one in passes[1:]:
             self.add_pass(one.name, len(one.channels), one.channels, layer=layer.name)
         rendered = self.begin_result(0, 0, seen.camera.width, seen.camera.height, layer=layer.name, view=view)
-        filled = {one.name: render_passes.pixels(one, arrays, seen, transparent, inverse) for one in passes}
         render_passes.fill(rendered.layers[0], filled)
         self.end_result(rendered)
         if mattes:
             cryptomatte.write_names(self.get_result(), layer, seen)
         self.update_progress(1.0)
+
+    def _seen(
+        self, depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object | None, point: np.ndarray | None = None
+    ) -> render_request.VisibleParts:
+        """Return the visible parts, seen by a stereo camera or else by the scene's, and by a point of its lens."""
+
+        def view(points):
+            found = view_cameras.of_camera(depsgraph, points, eye=stereo.eye(self, camera))
+            lens = None if point is None else blur_samples.lens_of(camera or depsgraph.scene.camera, depsgraph)
+            return found if lens is None else blur_samples.through_lens(found, lens, point)
+
+        return render_request.shown(depsgraph, view)
+
+    def _arrays(
+        self,
+        depsgraph: bpy.types.Depsgraph,
+        seen: render_request.VisibleParts,
+        passes: Sequence[render_passes.Pass],
+        mattes: Sequence[str] = (),
+    ) -> dict[str, np.ndarray] | None:
+        """Render the arrays of passes. Returns None if the user stops the render."""
+        if not seen.scenes:
+            return render_passes.empty(seen.camera, cryptomatte.RANKS * len(mattes))
+        scene = depsgraph.scene
+        transparent = scene.render.film_transparent
+        sky = render_settings.of(scene).sky and not transparent
+        steps = render_request.steps(seen, render_passes.wanted(passes, transparent), sky)
+        if mesh_merge.of(scene) is not None:
+            steps[-1][-1]["meshes"] = visible_meshes.of(depsgraph).to_json()
+        if mattes:
+            steps[-1][-1]["coverage"] = cryptomatte.request(seen, len(mattes))
+        return self._ask(steps)
+
+    def _mean_of_samples(
+        self,
+        depsgraph: bpy.types.Depsgraph,
+        camera: bpy.types.Object | None,
+        passes: Sequence[render_passes.Pass],
+        inverse: view_inverse.Inverse | None,
+    ) -> dict[str, np.ndarray] | None:
+        """Return the mean of passes over samples of lens and shutter, or None if the user stops the render."""
+        scene = depsgraph.scene
+        frame, shutter = scene.frame_current + scene.frame_subframe, blur_samples.shutter_of(scene)
+        transparent, samples = scene.render.film_transparent, blur_samples.samples(render_settings.of(scene).samples)
+        sums: dict[str, np.ndarray] = {}
+        try:
+            for number, sample in enumerate(samples):
+                if shutter is not None:
+                    self._set_frame(frame + shutter[0] + sample.time * (shutter[1] - shutter[0]))
+                seen = self._seen(depsgraph, camera, sample.point)
+                arrays = self._arrays(depsgraph, seen, passes)
+                if arrays is None:
+                    return None
+                for one in passes:
+                    added = render_passes.pixels(one, arrays, seen, transparent, inverse)
+                    sums[one.name] = sums.get(one.name, 0) + added
+                self.update_progress((number + 1) / len(samples))
+        finally:
+            if shutter is not None:
+                self._set_frame(frame)
+        return {name: total / np.float32(len(samples)) for name, total in sums.items()}
+
+    def _set_frame(self, frame: float) -> None:
+        """Evaluate the scene at a frame, sub-frame included."""
+        self.frame_set(math.floor(frame), frame - math.floor(frame))
 
     def _ask(self, steps):
         """Return the worker's arrays, or None if the user stops the render."""

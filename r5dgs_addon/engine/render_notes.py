@@ -16,10 +16,6 @@ def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> 
         depsgraph: Evaluated depsgraph, or None to skip the check for hold-outs other than point clouds.
     """
     notes = []
-    if scene.camera is not None and scene.camera.type == "CAMERA" and scene.camera.data.dof.use_dof:
-        notes.append("Depth of field is not rendered")
-    if scene.render.use_motion_blur:
-        notes.append("Motion blur is not rendered")
     solid = ("MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME")
     others = [obj.original for obj in depsgraph.objects if obj.type in solid] if depsgraph is not None else []
     held = sorted({obj.name for obj in others if visible_clouds.is_held_out(obj, None, depsgraph)})

@@ -36,6 +36,7 @@ class Pass:
 COMBINED = Pass("Combined", "RGBA", "COLOR")
 DEPTH = Pass("Depth", "Z", "VALUE", "depth")
 FRONT = Pass("In Front of Meshes", "RGBA", "COLOR", "front")  # alpha is the visible part of the meshes behind
+COLORS = (COMBINED, FRONT)  # passes that depth of field and motion blur apply to
 INDEX = Pass(compat.OBJECT_INDEX, "X", "VALUE", "owners")
 
 

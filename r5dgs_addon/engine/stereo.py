@@ -17,24 +17,23 @@ def names(scene: bpy.types.Scene) -> list[str]:
     return [view.name for view in found if view.use] or [""]
 
 
-def eyes(
-    engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph
-) -> Iterator[tuple[str, view_cameras.Eye | None]]:
+def cameras(engine: bpy.types.RenderEngine, scene: bpy.types.Scene) -> Iterator[tuple[str, bpy.types.Object | None]]:
     """Iterate over the views, making each the active view of the engine.
 
-    Args:
-        depsgraph: Evaluated depsgraph.
-
     Yields:
-        Name of the view, and its eye, or None for the camera itself (without multi-view).
+        Name of the view, and its camera, selected by the view's suffix, or None without multi-view.
     """
-    for name in names(depsgraph.scene):
+    for name in names(scene):
         camera = None
         if name:
             engine.active_view_set(name)
-            camera = engine.camera_override  # camera selected by the view's suffix
-        if camera is None or camera.type != "CAMERA":
-            yield name, None
-        else:
-            matrix = np.array(engine.camera_model_matrix(camera), np.float64)
-            yield name, view_cameras.Eye(camera, matrix, engine.camera_shift_x(camera))
+            camera = engine.camera_override
+        yield name, camera if camera is not None and camera.type == "CAMERA" else None
+
+
+def eye(engine: bpy.types.RenderEngine, camera: bpy.types.Object | None) -> view_cameras.Eye | None:
+    """Return the eye of a camera in the active view at the evaluated frame, or None without a camera."""
+    if camera is None:
+        return None
+    matrix = np.array(engine.camera_model_matrix(camera), np.float64)
+    return view_cameras.Eye(camera, matrix, engine.camera_shift_x(camera))

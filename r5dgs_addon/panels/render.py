@@ -64,6 +64,10 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
         column.prop(settings, "sky")
         column.prop(scene.render, "film_transparent", text="Transparent")
         column.prop(settings, "moving")
+        row = column.row()
+        has_lens = scene.camera is not None and scene.camera.type == "CAMERA" and scene.camera.data.dof.use_dof
+        row.active = has_lens or scene.render.use_motion_blur
+        row.prop(settings, "samples")
         if jobs.notice():
             status_bar.wrapped(layout, context, jobs.notice().capitalize(), "SORTTIME")
 

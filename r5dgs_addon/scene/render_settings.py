@@ -1,7 +1,7 @@
 """Scene settings of the R5DGS render engine."""
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, PointerProperty
+from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty
 
 MOVING = (
     ("1", "Full", "Full resolution"),
@@ -31,6 +31,13 @@ class R5DGS_PG_render(bpy.types.PropertyGroup):
         description="Resolution of the viewport while the view moves",
         items=MOVING,
         default="4",
+    )
+    samples: IntProperty(
+        name="Blur Samples",
+        description="Number of images that are averaged for depth of field and motion blur",
+        default=32,
+        min=1,
+        soft_max=256,
     )
     meshes: PointerProperty(
         name="Meshes",

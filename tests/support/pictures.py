@@ -1,4 +1,4 @@
-"""Data set of a synthetic scene's own pictures, id maps and poses, for which all measurements are known."""
+"""Data set of the images of a synthetic scene, for which all measurements are known, and readers of rendered images."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO
 
 from r5dgs_core.data import dataset, images
 from r5dgs_core.evaluation import evaluate
@@ -56,3 +57,14 @@ def write_dataset(root: Path, scene: Scene) -> dataset.Dataset:
         rows.append({"id": group.object_id, "name": scene.object(group.object_id).name, "matrices": matrices})
     (root / "ground_truth.json").write_text(json.dumps({"t_max": 0.75, "times": times, "objects": rows}))
     return dataset.read(root)
+
+
+def read_exr(path, parts=2):
+    """Channels of all images of an EXR by pass and channel, with 3 parts of a name by layer, too. [H, W] each"""
+    source, found, part = OpenImageIO.ImageInput.open(str(path)), {}, 0
+    while source.seek_subimage(part, 0):
+        pixels = source.read_image("float").reshape(source.spec().height, source.spec().width, -1)
+        for index, name in enumerate(source.spec().channelnames):
+            found[".".join(name.split(".")[-parts:])] = pixels[..., index]
+        part += 1
+    return found

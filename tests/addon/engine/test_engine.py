@@ -15,7 +15,7 @@ from r5dgs_core.data import images
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import cameras, scene_file
-from tests.support import layouts, motions, scenes
+from tests.support import layouts, motions, pictures, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -76,7 +76,7 @@ def render_passes(bpy, folder):
         settings.image_settings.media_type = "MULTI_LAYER_IMAGE"
     settings.image_settings.file_format, settings.image_settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
     assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
-    found = read_exr(settings.filepath)
+    found = pictures.read_exr(settings.filepath)
     return types.SimpleNamespace(
         combined=np.stack([found[f"Combined.{c}"] for c in "RGBA"], -1),
         depth=found.get("Depth.Z"),
@@ -84,17 +84,6 @@ def render_passes(bpy, folder):
         names={name.split(".")[0] for name in found},
         found=found,
     )
-
-
-def read_exr(path, parts=2):
-    """Channels of all images of an EXR by pass and channel, with 3 parts of a name by layer, too. [H, W] each"""
-    source, found, part = OpenImageIO.ImageInput.open(str(path)), {}, 0
-    while source.seek_subimage(part, 0):
-        pixels = source.read_image("float").reshape(source.spec().height, source.spec().width, -1)
-        for index, name in enumerate(source.spec().channelnames):
-            found[".".join(name.split(".")[-parts:])] = pixels[..., index]
-        part += 1
-    return found
 
 
 def metadata_of(path):
@@ -230,7 +219,7 @@ def test_each_view_layer_has_its_own_picture(blender, loaded, tmp_path):
     other.use_pass_z = other.use_pass_object_index = other.use_pass_cryptomatte_object = True
     other.layer_collection.children[loaded.name].exclude = True
     render_passes(blender, tmp_path)
-    layers = read_exr(tmp_path / "out.exr", parts=3)
+    layers = pictures.read_exr(tmp_path / "out.exr", parts=3)
     assert (layers["nothing.Depth.Z"] == NOTHING).all() and not layers["nothing.Combined.R"].any()
     assert layers["ViewLayer.Depth.Z"].min() < 10 and layers["ViewLayer.Combined.R"].any()
     assert {"nothing.CryptoObject02.a"} <= set(layers) and "ViewLayer.CryptoObject00.r" not in layers

@@ -435,11 +435,9 @@ def test_an_animation_follows_nodes_and_reports_ignored_parts_once(blender, load
     scene = blender.context.scene
     nodes(blender, mug, swaying)
     scene.frame_start, scene.frame_end = 1, 3
-    scene.render.use_motion_blur = scene.camera.data.dof.use_dof = True
     mug.data.points[0].radius = 2.0
     render(blender, tmp_path, "frame_", animation=True)
     first, second, third = (images.read(tmp_path / f"frame_000{frame}.png") for frame in (1, 2, 3))
     assert psnr(first, second) < 40 and psnr(second, third) < 40
     said = capfd.readouterr().out
-    for note in ("Depth of field is not rendered", "Motion blur is not rendered", "the radius of points"):
-        assert said.count(note) == 1
+    assert said.count("the radius of points") == 1
