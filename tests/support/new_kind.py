@@ -6,10 +6,12 @@ import re
 import shutil
 from pathlib import Path
 
+from r5dgs_core.motion.models import MENU_NUMBERS
 from tests.support import pages
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME = "rolling"
+NUMBER = max(MENU_NUMBERS.values()) + 1
 
 
 def add(folder: Path) -> Path:
@@ -21,7 +23,7 @@ def add(folder: Path) -> Path:
     kind, rate = pages.blocks(pages.EXTENDING, "Motion model")
     models = folder / "r5dgs_core/motion/models"
     (models / f"{NAME}.py").write_text(kind)
-    _insert(models / "__init__.py", r"MENU_NUMBERS = \{\n(?:    .*\n)*", f'    "{NAME}": 11,\n')
+    _insert(models / "__init__.py", r"MENU_NUMBERS = \{\n(?:    .*\n)*", f'    "{NAME}": {NUMBER},\n')
     _insert(models / "motion_model.py", r"class MotionModel:\n(?:.*\n)*?(?=    inertia: )", rate)
     return folder
 

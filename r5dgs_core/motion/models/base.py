@@ -123,7 +123,7 @@ class MotionKind:
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
         """Poses and their exact derivatives without offsets, at times of either sign. [..., 1]
 
-        The rates broadcast against the times. At time 0 the pose is the identity.
+        Rates and times broadcast, and all results have the broadcast shape. At time 0 the pose is the identity.
         """
         raise NotImplementedError
 

@@ -12,7 +12,7 @@ import sys
 
 import bpy
 
-root, scene_path = sys.argv[1:]
+root, scene_path, number = sys.argv[1:]
 spec = importlib.util.spec_from_file_location("r5dgs", root + "/__init__.py", submodule_search_locations=[root])
 extension = importlib.util.module_from_spec(spec)
 sys.modules["r5dgs"] = extension
@@ -22,7 +22,7 @@ assert bpy.ops.r5dgs.load_scene(filepath=scene_path) == {"FINISHED"}
 anchor = next(o for o in bpy.data.objects if o.r5dgs.role == "ANCHOR" and o.r5dgs.motion_id == 1)
 state = anchor.r5dgs_motion
 state.kind, state.belt_velocity = "rolling", (0.6, 0.0, 0.0)
-assert state["kind"] == 11
+assert state["kind"] == int(number)
 rate = state.stored_belt_velocity[0]
 assert 0 < rate != 0.6  # per unit of scene time
 bpy.context.view_layer.objects.active = anchor
@@ -38,6 +38,7 @@ extension.unregister()
 
 def test_the_kind_of_the_page_is_edited_and_saved_in_blender(tmp_path):
     scene_file.write(scenes.make_scene(), tmp_path / "scene.r5dgs")
-    command = [sys.executable, "-c", USE, str(new_kind.add(tmp_path / "r5dgs")), str(tmp_path / "scene.r5dgs")]
+    arguments = new_kind.add(tmp_path / "r5dgs"), tmp_path / "scene.r5dgs", new_kind.NUMBER
+    command = [sys.executable, "-c", USE, *map(str, arguments)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

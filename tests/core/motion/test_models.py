@@ -3,6 +3,7 @@ import itertools
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -70,6 +71,18 @@ def test_batches_of_models_equal_single_models(tau):
     assert [len(x) for x in models.evaluate_all([], tau)] == [0, 0]
     with pytest.raises(ValueError, match="tau"):
         models.evaluate_all(group, -0.1)
+
+
+@pytest.mark.parametrize("kind", models.KINDS)
+def test_curves_have_the_shape_of_the_broadcast_rates_and_times(kind):
+    group = [model for model in CASES.values() if model.kind == kind]
+    tau = np.array([0.1, 0.4, 0.9])
+    for model in group:
+        for shape, found in zip(((4,), (3,), (3,), (3,)), models.curve(model, tau), strict=True):
+            assert found.shape == (*tau.shape, *shape)
+    if type(models.KINDS[kind]).motion is not models.MotionKind.motion:
+        found = models.KINDS[kind].motion(Rates(*(rate[:, None] for rate in Rates.of(2 * group[:1]))), tau[:, None])
+        assert [part.shape for part in found] == [(2, 3, 4), (2, 3, 3), (2, 3, 3), (2, 3, 3)]
 
 
 @pytest.mark.parametrize("tau", [1.0, 10.0, 30.0])
@@ -433,7 +446,15 @@ def test_the_numbers_that_blend_files_store_stay():
         *("drag", "friction", "precession", "bounce", "two_oscillations"),
     )
     assert [models.MENU_NUMBERS[name] for name in released] == list(range(len(released)))
-    assert len(set(models.MENU_NUMBERS.values())) == len(models.MENU_NUMBERS)
+    numbers = list(models.MENU_NUMBERS.values())
+    assert len(set(numbers)) == len(numbers), "two kinds of motion have one number in MENU_NUMBERS"
+
+
+@pytest.mark.parametrize("kind", models.KINDS)
+def test_the_pages_describe_each_kind(kind):
+    pages = Path(__file__).parents[3] / "docs"
+    assert f"| `{kind}` |" in (pages / "reference/conventions.md").read_text()
+    assert f"*{models.KINDS[kind].label}*" in (pages / "user/motion.md").read_text()
 
 
 @pytest.mark.parametrize("data", [{"kind": "teleport"}, {"kind": "static", "jump": [1, 0, 0]}])
