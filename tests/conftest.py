@@ -55,6 +55,14 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.loadscopereorder = False
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark the cases of a test as slow that its marker `default_cases` does not name."""
+    marker = item.get_closest_marker("default_cases")
+    if marker is not None and item.callspec.id not in marker.args:
+        item.add_marker("slow")
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect long tests with ``--quick``, and begin with the longest files if several processes share them.
 

@@ -304,6 +304,7 @@ def dying(loaded):
     return kill
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="signals are those of POSIX")
 def test_a_worker_killed_during_a_render_raises_and_the_next_render_works(loaded, dying):
     pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")

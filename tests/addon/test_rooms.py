@@ -117,6 +117,7 @@ def test_keyed_poses_match_the_laws_at_the_frames(built, blender):
             np.testing.assert_allclose(pose, Matrix.LocRotScale(place, turn, None), atol=1e-5, err_msg=actor.ob.name)
 
 
+@pytest.mark.default_cases("dining", "nonrigid")
 def test_most_views_show_every_object_large_enough_to_follow(built, examples, blender, tmp_path):
     name, actors = built
     script, stage = examples("build_rooms"), examples("building.stage")

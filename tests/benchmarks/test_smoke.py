@@ -37,12 +37,14 @@ PROGRAMS = {
     "words": ("--encoder", "{encoder}"),
 }
 LONG = (  # more than five seconds each
+    "association.large_scene",
     "association.synthetic",
     "extrapolation.appearance",
     "extrapolation.modes",
     "raster.first_frame",
     "training.curve",
     "training.held_out_times",
+    "training.memory",
     "training.network_playback",
     "words",
 )

@@ -120,6 +120,7 @@ def test_the_archive_validates_and_holds_the_extension_only(archive):
     assert archive.stat().st_size < 2_000_000
 
 
+@pytest.mark.default_cases("plain")
 @pytest.mark.parametrize("options", [[], ["reloading"]], ids=["plain", "reloading scripts"])
 def test_installs_works_without_torch_and_goes_away_twice_in_a_row(archive, tmp_path, options):
     scene_path = scene_file.write(scenes.make_scene(n=300), tmp_path / "scene.r5dgs")

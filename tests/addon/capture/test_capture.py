@@ -586,6 +586,7 @@ def test_the_operator_has_the_defaults_of_the_settings(service, blender):
 # The bundled example
 
 
+@pytest.mark.slow
 def test_the_bundled_data_set_matches_its_script(service, blender, tmp_path):
     folder = Path(__file__).resolve().parents[3] / "examples"
     spec = importlib.util.spec_from_file_location("build_tabletop", folder / "build_tabletop.py")

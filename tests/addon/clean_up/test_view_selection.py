@@ -47,13 +47,13 @@ def test_a_lasso_of_two_corners_holds_nothing(views):
 @pytest.mark.parametrize("corners", [1, 2, 12])
 def test_a_brush_covers_the_points_near_its_path(views, corners):
     random = np.random.default_rng(1)
-    points, path = random.uniform(0, 100, (3000, 2)), random.uniform(20, 80, (corners, 2))
+    points, path = random.uniform(0, 100, (400, 2)), random.uniform(20, 80, (corners, 2))
     fine = path if corners == 1 else np.concatenate(
-        [a + np.linspace(0, 1, 2001)[:, None] * (b - a) for a, b in zip(path[:-1], path[1:], strict=True)]
+        [a + np.linspace(0, 1, 401)[:, None] * (b - a) for a, b in zip(path[:-1], path[1:], strict=True)]
     )  # fmt: skip
     distances = np.sqrt(np.min([((points - place) ** 2).sum(1) for place in fine], axis=0))
     found = views.under_brush(points, path, 9.0)
-    clear = np.abs(distances - 9) > 0.01
+    clear = np.abs(distances - 9) > 0.05
     assert found.any()
     np.testing.assert_array_equal(found[clear], (distances < 9)[clear])
 

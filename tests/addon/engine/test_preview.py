@@ -313,6 +313,7 @@ def test_an_error_of_a_preview_in_the_window_is_reported(blender, loaded, worker
     assert "ended unexpectedly" in window.reports[-1][1]
 
 
+@pytest.mark.slow
 def test_a_worker_that_died_is_started_again_by_the_next_preview(blender, loaded, worker):
     preview(blender)
     first = worker.current()
@@ -371,6 +372,7 @@ def test_a_wrong_python_is_named(blender, loaded, monkeypatch, tmp_path, kind):
         blender.ops.r5dgs.preview()
 
 
+@pytest.mark.slow
 def test_worker_test_reports_readiness_and_unregistering_stops_the_worker(blender, worker, capfd):
     assert blender.ops.r5dgs.check_worker() == {"FINISHED"}
     told = capfd.readouterr().out

@@ -51,6 +51,7 @@ def notes(bpy):
     return [note.name for note in bpy.context.window_manager.r5dgs_words.notes]
 
 
+@pytest.mark.slow
 def test_the_encoder_of_the_preferences_matches_words_not_stored_in_the_scene(loaded):
     assert ask(loaded, "zorb") == {"FINISHED"}
     (match,) = [m for m in loaded.context.window_manager.r5dgs_words.matches if m.object_id == 2]

@@ -387,6 +387,7 @@ TILTING = models.MotionModel(
 )
 
 
+@pytest.mark.default_cases("1-60.0", "1-1000000.0", "1-1e-06")
 @pytest.mark.parametrize("bodies, frames_per_unit", [(1, 60.0), (1, 1e6), (1, 1e-6), (100, 60.0)])
 def test_a_small_file_never_blocks_blender(blender, tmp_path, monkeypatch, capfd, bodies, frames_per_unit):
     path = wild_scene(tmp_path / "wild.r5dgs", TILTING, bodies, frames_per_unit=frames_per_unit)

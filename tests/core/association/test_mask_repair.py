@@ -80,6 +80,7 @@ def test_a_numbering_per_video_becomes_one(scene_path, tiny, tmp_path):
     assert repaired.ground_truth is None
 
 
+@pytest.mark.slow
 def test_a_single_switch_is_found_and_named(trained, tiny, switched, tmp_path, capsys):
     out = tmp_path / "out"
     assert main.main(["associate", str(trained.folder), "--masks", str(switched), "--out", str(out)]) == 0
@@ -122,6 +123,7 @@ def test_an_object_that_was_missed_gets_its_pixels_back(scene_path, tiny, tmp_pa
     assert json.loads((out / mask_repair.SUMMARY).read_text())["mended"] == 1
 
 
+@pytest.mark.slow
 def test_a_scene_file_does_as_well_as_its_run(scene_path, trained, tiny, switched, tmp_path):
     one = cli_associate.run_associate(scene_path, tiny.root, masks=switched, out=tmp_path / "one", progress_kind="json")
     two = cli_associate.run_associate(trained.folder, masks=switched, out=tmp_path / "two")

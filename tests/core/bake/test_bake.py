@@ -62,6 +62,7 @@ def test_a_baked_scene_renders_like_the_trained_state(baked, trained):
     assert_shows_what_was_trained(trained, baked)
 
 
+@pytest.mark.default_cases("overrides0")
 @pytest.mark.parametrize("overrides", [("train.sh_degree=2",), ("train.shading=false", "train.shadows=false")])
 def test_unfinished_runs_with_other_options_bake_to_their_current_state(tiny, tmp_path, monkeypatch, overrides):
     def stop(*args):
@@ -180,6 +181,7 @@ def test_values_that_are_not_finite_are_refused(trained, tmp_path):
         bake.bake(made)
 
 
+@pytest.mark.slow
 def test_an_object_that_comes_late_moves_on_smoothly_before_and_is_measured_where_it_was_seen(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path / "data", ball_from=0.4)
     scene = bake.bake(train_briefly(data, tmp_path / "run"))

@@ -73,6 +73,7 @@ def with_noise(scene, turn=0.0, shift=0.0):
     return scene.with_arrays(track_poses=poses)
 
 
+@pytest.mark.default_cases("turn")
 def test_noise_is_simplified_to_rest_and_slow_motion_is_kept(given):
     name, truth, data = given
     scene, rows = simplified(with_noise(truth, 3e-4, 3e-5), data)
@@ -89,6 +90,7 @@ def test_noise_is_simplified_to_rest_and_slow_motion_is_kept(given):
     assert model.kind == {"rest": "static", "turn": "ballistic_spin", "slide": "translation"}[name]
 
 
+@pytest.mark.default_cases("slide")
 def test_overrides_of_the_user_keep_motion_below_the_noise(given):
     name, truth, data = given
     noisy = with_noise(truth, 3e-4, 3e-5)

@@ -101,6 +101,7 @@ def test_finished_runs_are_neither_trained_nor_measured_again(made, monkeypatch)
     assert contents(case.run) == before
 
 
+@pytest.mark.slow
 def test_remeasure_keeps_the_run_and_measures_it_again(made, monkeypatch):
     plan, case, _, result = made
     monkeypatch.setattr(process, "train", None)
@@ -114,6 +115,7 @@ def test_remeasure_keeps_the_run_and_measures_it_again(made, monkeypatch):
     assert all(one["splits"][split]["psnr"] == other["splits"][split]["psnr"] for split in ("val", "test"))
 
 
+@pytest.mark.slow
 def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path, monkeypatch):
     plan, _, _, _ = made
     shutil.copytree(plan.out, tmp_path / "out")
@@ -136,6 +138,7 @@ def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path
     assert standard["test"]["psnr"] == literal["test"]["psnr"] != pytest.approx(rigid["test"]["psnr"])
 
 
+@pytest.mark.slow
 def test_a_case_that_fails_is_reported_and_the_others_continue(made, tiny, capsys):
     plan, case, _, _ = made
     blocked = case.run.with_name("tracks_seed1")

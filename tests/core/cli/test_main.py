@@ -175,6 +175,7 @@ def test_a_cap_and_a_preset_reach_the_run(tiny, tmp_path, capsys):
     assert "--preset slow: unknown preset" in complaint(capsys, *fresh, "--preset", "slow", status=ExitStatus.USAGE)
 
 
+@pytest.mark.slow
 def test_a_need_can_be_overridden_when_baking(made, tmp_path, capsys):
     bare = tmp_path / "bare.r5dgs"
     assert main.main(["bake", str(made[0]), "--out", str(bare), "--set", "needs.classifier=off"]) == 0
@@ -271,6 +272,7 @@ def test_an_evaluation_that_could_not_be_written_is_refused_before_the_work(made
     assert "--json" in complaint(capsys, "evaluate", made[0], "--json", tmp_path / place)
 
 
+@pytest.mark.slow
 def test_the_table_is_shown_even_if_the_file_cannot_be_written(made, tmp_path, capsys, monkeypatch):
     def full_disk(*args):
         raise OSError(28, "No space left on device")
@@ -294,6 +296,7 @@ def test_baking_with_other_data_raises_and_evaluating_on_it_warns(made, tmp_path
         ]
 
 
+@pytest.mark.slow
 def test_evaluate_counts_its_images(made, tmp_path, capsys):
     assert main.main(["evaluate", str(made[0]), "--json", str(tmp_path / "e.json"), "--progress", "json"]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
@@ -311,7 +314,14 @@ def small_demo(tiny, monkeypatch):
     return ["demo", *OPTIONS, "--progress", "json"]
 
 
-def test_the_demo_may_be_run_twice_and_does_not_replace_other_runs(small_demo, made, tmp_path, capsys, monkeypatch):
+def test_the_demo_does_not_replace_other_runs(small_demo, made, capsys, monkeypatch):
+    monkeypatch.setattr(demo, "DATASET", "another data set")
+    line = complaint(capsys, *small_demo, "--out", made[0])
+    assert "add --resume to continue, or --overwrite" in line
+
+
+@pytest.mark.slow
+def test_the_demo_may_be_run_twice(small_demo, tmp_path, capsys):
     out = tmp_path / "my demo"
     for _ in range(2):
         assert main.main([*small_demo, "--out", str(out), "--set", "train.seed=3"]) == 0
@@ -327,11 +337,9 @@ def test_the_demo_may_be_run_twice_and_does_not_replace_other_runs(small_demo, m
         assert all((out / name).stat().st_size > 0 for name in ("demo.r5dgs", "evaluation.json", "contact_sheet.png"))
     line = complaint(capsys, *small_demo, "--out", out, "--resume", status=ExitStatus.USAGE)
     assert "leave out --preset, --config, --set, --iterations" in line
-    monkeypatch.setattr(demo, "DATASET", "another data set")
-    line = complaint(capsys, *small_demo, "--out", made[0])
-    assert "add --resume to continue, or --overwrite" in line
 
 
+@pytest.mark.default_cases("moment0")
 @pytest.mark.parametrize("moment", [{"event": "step", "iteration": 10}, {"event": "evaluate", "done": 1}])
 def test_a_stopped_demo_prints_the_command_that_continues_it(small_demo, tmp_path, capsys, monkeypatch, moment):
     out = tmp_path / "my demo"

@@ -106,6 +106,7 @@ def measured(baked, tiny):
     return evaluate.evaluate(baked, datasets.read(tiny.root))
 
 
+@pytest.mark.default_cases("1e-06-shift3")
 @pytest.mark.parametrize(("scale", "shift"), WORLDS)
 def test_a_run_gives_the_same_results_in_any_world(trained, baked, measured, tmp_path, scale, shift):
     data = datasets.read(made(tmp_path / "data", scale, shift).root)
@@ -139,6 +140,8 @@ def near(tiny, tmp_path_factory):
     return train_briefly(tiny.root, tmp_path_factory.mktemp("near") / "run")
 
 
+@pytest.mark.slow
+@pytest.mark.default_cases("1000000000000.0-shift2")
 @pytest.mark.parametrize(
     ("scale", "shift"), [(1.0, 20 * FAR), pytest.param(1e-12, HERE, marks=pytest.mark.slow), (1e12, HERE)]
 )

@@ -97,6 +97,7 @@ def only(rows, **wanted):
 # Integrators.
 
 
+@pytest.mark.default_cases("Magnus-4-4.0", "trace_rk2, per group-2.0")
 @pytest.mark.parametrize(
     ("method", "order"),
     [("Magnus-4", 4.0), ("Magnus-2", 2.0), ("trace_rk2, per group", 2.0), ("trace_rk2, per Gaussian", 2.0)],
@@ -196,6 +197,7 @@ def truth_of(scene):
     )
 
 
+@pytest.mark.slow
 def test_modes_of_single_gaussians_have_poses_too(field, data):
     rows, absent = pose_task.measure(field, data.ground_truth, 1)
     assert {row.mode for row in rows} >= {"standard", "rigid_paper", "rigid/median", "rigid"}

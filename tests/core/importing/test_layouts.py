@@ -95,6 +95,7 @@ def test_gaussian_grouping_gives_objects_by_its_classifier(tmp_path):
     assert_pictured(scene, 0.0, cloud, sorted_rule, 0.0)
 
 
+@pytest.mark.default_cases("screws")
 @pytest.mark.parametrize(
     ("inputs", "time", "screws"), [(93, 13, False), (84, 0, False), (93, 13, True)], ids=["blender", "real", "screws"]
 )
@@ -128,6 +129,7 @@ def test_deformable_does_not_normalise_its_rotations(tmp_path):
         assert_drawn(imported(folder, tmp_path, knots=2), 0.0, other)
 
 
+@pytest.mark.default_cases("complex")
 @pytest.mark.parametrize("light", [True, False], ids=["light", "complex"])
 def test_trace_rotates_before_the_canonical_rotation_and_extrapolates(tmp_path, light):
     cloud = foreign.cloud(2)
@@ -203,6 +205,7 @@ def silu_row(weights, x, hidden):
     return x
 
 
+@pytest.mark.default_cases("full")
 @pytest.mark.parametrize(("width", "depth"), [(256, 8), (128, 6)], ids=["full", "light"])
 def test_freegave_rotates_against_the_sign_of_its_weights(tmp_path, width, depth):
     cloud, size = foreign.cloud(8), 16

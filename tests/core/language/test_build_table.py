@@ -257,6 +257,7 @@ def test_pictures_make_the_table_of_an_image_encoder(seen):
     assert back == []
 
 
+@pytest.mark.default_cases("clip")
 @pytest.mark.parametrize("kind", ["clip", "siglip", "sentences"])
 def test_tiny_encoders_run_through_all_stages(kind, seen, tmp_path):
     folder = getattr(encoder_folders, kind)(tmp_path / kind)

@@ -159,6 +159,7 @@ def test_a_lost_file_is_named(copied, kind, file, message):
         registry.open_encoder(folder)
 
 
+@pytest.mark.default_cases("clip", "text")
 @pytest.mark.parametrize("kind", MAKERS)
 def test_a_missing_vocabulary_is_an_error(copied, kind):
     folder = copied(kind)

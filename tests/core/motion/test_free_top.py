@@ -43,6 +43,7 @@ def direct(body, w, tau):
     return rotations.normalize(solution.y[:, -1])
 
 
+@pytest.mark.default_cases("tilted box", "disc", "rod")
 @pytest.mark.parametrize("name", BODIES)
 def test_tumbling_solves_eulers_equations(name):
     body = BODIES[name]

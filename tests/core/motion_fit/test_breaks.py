@@ -58,6 +58,7 @@ CASES = {
 }
 
 
+@pytest.mark.default_cases("impact", "start", "bounce")
 @pytest.mark.parametrize("name", CASES)
 def test_a_break_is_found_within_a_step_and_the_last_law_goes_on(name):
     path, kind = CASES[name]
@@ -71,6 +72,7 @@ def test_a_break_is_found_within_a_step_and_the_last_law_goes_on(name):
     assert fit.history.band.widths(END) > 0
 
 
+@pytest.mark.default_cases("stop", "throw", "falls from a table")
 @pytest.mark.parametrize("name", CASES)
 def test_a_break_without_noise_is_exact(name):
     fit, error = observed(CASES[name][0], sigma=(1e-7 * SIZE, 1e-7))
@@ -78,6 +80,7 @@ def test_a_break_without_noise_is_exact(name):
     assert error < 0.1
 
 
+@pytest.mark.default_cases("3")
 @pytest.mark.parametrize("left", [2, 3])
 def test_few_poses_after_a_break_suffice(left):
     errors = []
@@ -126,6 +129,7 @@ def test_the_last_part_may_have_a_law_of_its_own():
     assert error < 5
 
 
+@pytest.mark.default_cases("0.7")
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
 def test_smooth_motions_have_no_events(correlation):
     rng, found = np.random.default_rng(1), 0

@@ -21,6 +21,19 @@ def fitted(name, rng, sigma_t=0.0, sigma_r=0.0, times=TIMES, **options):
     return fit, problems.error_percent(fit.model, truth, HORIZON, last_quat, last)
 
 
+@pytest.mark.default_cases(
+    "static",
+    "ballistic, spinning",
+    "hinge, accelerating",
+    "rolling",
+    "screw",
+    "pendulum",
+    "damped spring",
+    "fall with drag",
+    "rolling friction",
+    "precession",
+    "two oscillations",
+)
 @pytest.mark.parametrize("name", MOTIONS)
 def test_each_motion_is_recovered_without_noise(name):
     fit, error = fitted(name, np.random.default_rng(0), 1e-7 * SIZE, 1e-7)
@@ -29,6 +42,7 @@ def test_each_motion_is_recovered_without_noise(name):
     assert not fit.rested
 
 
+@pytest.mark.default_cases("hinge")
 @pytest.mark.parametrize("name", ["uniform", "hinge", "ballistic, spinning"])
 def test_uneven_times_and_gaps_are_supported(name):
     times = np.concatenate([UNEVEN[UNEVEN < 0.3], UNEVEN[UNEVEN > 0.45]])
@@ -40,17 +54,19 @@ def test_uneven_times_and_gaps_are_supported(name):
 def test_the_right_family_is_chosen_in_noise_and_beats_the_largest():
     rng = np.random.default_rng(2)
     right, ours, full = 0, [], []
-    for truth, names in MOTIONS.values():
+    chosen = list(MOTIONS.values())[::3]
+    for truth, names in chosen:
         quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
         fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
         largest = model_selection.fit(TIMES, quats, d, radius=RADIUS, candidates=["full, free centre"])
         right += fit.chosen in names
         ours.append(problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0])
         full.append(problems.error_percent(largest.model, truth, HORIZON[:1], last_quat, last)[0])
-    assert right >= 0.85 * len(MOTIONS)
+    assert right >= 0.85 * len(chosen)
     assert np.median(ours) < 0.6 * np.median(full)
 
 
+@pytest.mark.slow
 def test_at_low_noise_the_choice_is_never_clearly_worse_than_the_largest():
     rng = np.random.default_rng(3)
     for name in ("static", "rolling, slowing", "hinge, accelerating", "free axis", "screw"):
@@ -83,14 +99,15 @@ def observe_tumbling(rng, sigma_t, sigma_r):
 
 
 def test_a_tumbling_box_is_predicted_by_its_inertia():
-    rng, ours, without = np.random.default_rng(20), [], []
-    for _ in range(3):
-        quats, d, last_quat, last, inertia = observe_tumbling(rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
-        for result, body in ((ours, inertia), (without, None)):
-            fit = model_selection.fit(TIMES, quats, d, radius=RADIUS, inertia=body)
-            assert (fit.chosen == "free top") == (body is not None)
-            result.append(problems.error_percent(fit.model, problems.TUMBLING, HORIZON, last_quat, last)[1])
-    assert np.median(ours) < 0.5 * np.median(without)
+    quats, d, last_quat, last, inertia = observe_tumbling(
+        np.random.default_rng(20), 0.005 * SIZE, np.radians(1) / 3**0.5
+    )
+    errors = []
+    for body in (inertia, None):
+        fit = model_selection.fit(TIMES, quats, d, radius=RADIUS, inertia=body)
+        assert (fit.chosen == "free top") == (body is not None)
+        errors.append(problems.error_percent(fit.model, problems.TUMBLING, HORIZON, last_quat, last)[1])
+    assert errors[0] < 0.5 * errors[1]
 
 
 def test_a_tumbling_box_is_recovered_without_noise():
@@ -101,6 +118,7 @@ def test_a_tumbling_box_is_recovered_without_noise():
     assert np.isfinite(fit.history.band.half_width).all()
 
 
+@pytest.mark.slow
 def test_the_inertia_changes_nothing_for_bodies_that_do_not_tumble():
     box = np.diag([0.4, 0.8, 1.0])
     rng = np.random.default_rng(22)
@@ -116,16 +134,17 @@ def test_the_inertia_changes_nothing_for_bodies_that_do_not_tumble():
 def test_one_gross_outlier_has_little_effect():
     rng = np.random.default_rng(4)
     truth = MOTIONS["ballistic, spinning"][0]
-    clean, dirty = [], []
-    for _ in range(2):
-        quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.005 * SIZE, np.radians(0.5))
-        spoiled_quats, spoiled = quats.copy(), d.copy()
-        spoiled[6] += [0.5, -0.4, 0.3]
-        spoiled_quats[6] = rotations.multiply(rotations.rotvecs_to_quats(np.array([0, 1.5, 0])), quats[6])
-        for result, (q, x) in ((clean, (quats, d)), (dirty, (spoiled_quats, spoiled))):
-            model = model_selection.fit(TIMES, q, x, radius=RADIUS).model
-            result.append(problems.error_percent(model, truth, HORIZON[:1], last_quat, last)[0])
-    assert np.median(dirty) <= max(1.3 * np.median(clean), 2.5)
+    quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.005 * SIZE, np.radians(0.5))
+    spoiled_quats, spoiled = quats.copy(), d.copy()
+    spoiled[6] += [0.5, -0.4, 0.3]
+    spoiled_quats[6] = rotations.multiply(rotations.rotvecs_to_quats(np.array([0, 1.5, 0])), quats[6])
+    clean, dirty = (
+        problems.error_percent(
+            model_selection.fit(TIMES, q, x, radius=RADIUS).model, truth, HORIZON[:1], last_quat, last
+        )[0]
+        for q, x in ((quats, d), (spoiled_quats, spoiled))
+    )
+    assert dirty <= max(1.3 * clean, 2.5)
 
 
 def test_weight_zero_leaves_a_pose_out():
@@ -139,10 +158,11 @@ def test_weight_zero_leaves_a_pose_out():
     assert problems.error_percent(fit.model, truth, HORIZON, last_quat, last).max() < 0.1
 
 
+@pytest.mark.slow
 def test_a_stop_is_found_and_slow_movers_keep_moving():
     rng = np.random.default_rng(6)
     stopped = []
-    for _ in range(4):
+    for _ in range(2):
         path = np.minimum(TIMES, 0.42)[:, None] * [0.8, 0.1, 0] + 0.003 * rng.normal(size=(15, 3))
         turns = rotations.rotvecs_to_quats(
             np.minimum(TIMES, 0.42)[:, None] * [0, 0, 2.0] + 0.01 * rng.normal(size=(15, 3))
@@ -150,18 +170,18 @@ def test_a_stop_is_found_and_slow_movers_keep_moving():
         quats = rotations.multiply(turns, rotations.conjugate(turns[-1]))
         fit = model_selection.fit(TIMES, quats, path - path[-1], radius=RADIUS)
         stopped.append(fit.chosen == "static" and fit.rested)
-    assert sum(stopped) >= 3
+    assert all(stopped)
     slow = models.MotionModel("translation", velocity=[0.1 * SIZE, 0, 0])
     frozen = []
-    for _ in range(5):
+    for _ in range(2):
         quats, d, _, _ = problems.observe(slow, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
         frozen.append(model_selection.fit(TIMES, quats, d, radius=RADIUS).chosen == "static")
-    assert sum(frozen) <= 1
+    assert not all(frozen)
 
 
 def test_a_body_that_brakes_and_stands_in_its_last_three_poses_stays():
     rng = np.random.default_rng(11)
-    for _ in range(4):
+    for _ in range(2):
         left = np.maximum(TIMES[-3] - TIMES, 0.0)[:, None]
         path = -3.0 * left**2 * [1.0, 0.2, 0.0] + 0.001 * SIZE * rng.normal(size=(15, 3))
         fit = model_selection.fit(TIMES, rotations.identity(15), path - path[-1], radius=RADIUS)
@@ -170,6 +190,7 @@ def test_a_body_that_brakes_and_stands_in_its_last_three_poses_stays():
         assert np.abs(displacements).max() < 0.01 * SIZE
 
 
+@pytest.mark.default_cases("2.0")
 @pytest.mark.parametrize("acceleration", [0.5, 2.0, 8.0])
 def test_the_apex_of_a_throw_is_not_a_stop(acceleration):
     rng = np.random.default_rng(12)
@@ -220,24 +241,20 @@ def test_less_than_a_quarter_of_a_period_is_no_swing():
 
 def test_noise_that_swings_by_chance_is_no_swing():
     rng = np.random.default_rng(17)
-    for name in ("uniform", "spin", "hinge", "ballistic"):
-        for _ in range(2):
-            quats, d, _, _ = problems.observe(MOTIONS[name][0], TIMES, rng, 0.005 * SIZE, np.radians(0.6), 0.7)
-            assert model_selection.fit(TIMES, quats, d, radius=RADIUS).model.frequency == 0
+    for name in ("uniform", "hinge"):
+        quats, d, _, _ = problems.observe(MOTIONS[name][0], TIMES, rng, 0.005 * SIZE, np.radians(0.6), 0.7)
+        assert model_selection.fit(TIMES, quats, d, radius=RADIUS).model.frequency == 0
 
 
 def test_the_band_holds_the_true_error():
     rng = np.random.default_rng(7)
     inside = []
-    for name in ("uniform", "ballistic", "spin", "hinge", "rolling", "ballistic, spinning"):
-        for correlation in (0.0, 0.5):
-            truth = MOTIONS[name][0]
-            quats, d, last_quat, last = problems.observe(
-                truth, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5, correlation
-            )
-            fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
-            error = problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0]
-            inside.append(error <= 100 / SIZE * fit.history.band.widths(TIMES[-1] + HORIZON[0]))
+    for name in ("uniform", "hinge", "rolling", "ballistic, spinning"):
+        truth = MOTIONS[name][0]
+        quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
+        fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
+        error = problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0]
+        inside.append(error <= 100 / SIZE * fit.history.band.widths(TIMES[-1] + HORIZON[0]))
     assert np.mean(inside) >= 0.9
     assert fit.history.band.half_width[-1] > fit.history.band.half_width[4] > 0
 
@@ -256,7 +273,7 @@ def test_a_drift_of_the_track_widens_the_band_and_not_the_fit():
 def test_a_law_that_contradicts_earlier_poses_is_rejected():
     """A path of five random waves, three of them too fast to be resolved."""
     rng, trusted = np.random.default_rng(0), []
-    for _ in range(4):
+    for _ in range(2):
         frequencies, ways = rng.uniform(5, 40, 5), 0.4 * rng.normal(size=(5, 3))
         path = np.sin(frequencies * TIMES[:, None] + rng.uniform(0, 6, 5)) @ ways
         fit = model_selection.fit(TIMES, rotations.identity(15), path - path[-1], radius=RADIUS)

@@ -65,6 +65,7 @@ def test_bodies_that_fall_share_gravity_and_are_predicted_better(falls, up):
     assert np.median(together) < 0.75 * np.median(alone)
 
 
+@pytest.mark.slow
 def test_bodies_with_deviating_acceleration_do_not_share_gravity():
     tracks, fits, _ = observed([*FALLING[:2], SPEEDING, SLIDING], np.random.default_rng(1), 0.002 * SIZE)
     assert fits[2].chosen == "translation, quadratic"

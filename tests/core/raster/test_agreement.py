@@ -114,6 +114,7 @@ def _opacities(random, n, kind):
     return random.uniform(0, 1, n)
 
 
+@pytest.mark.default_cases("near", "around", "same")
 @pytest.mark.parametrize("place", PLACES)
 @given(st.data())
 @settings(max_examples=100 // len(PLACES), derandomize=True, deadline=None)

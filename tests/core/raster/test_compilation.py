@@ -59,6 +59,7 @@ def run_toy(tmp_path, script=TOY, **environment):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the other systems' user caches follow other variables")
 def test_a_home_that_cannot_be_written_moves_the_cache_to_an_own_temporary_folder(tmp_path):
     temporary = tmp_path / "tmp"
@@ -121,10 +122,12 @@ assert not gc.isenabled() and compilation.compiled() == 3 and len(told) == 1
 """
 
 
+@pytest.mark.slow
 def test_only_kernel_compilations_are_announced(tmp_path):
     assert run_toy(tmp_path, TOLD, NUMBA_CACHE_DIR=tmp_path / "cache").stderr == ""
 
 
+@pytest.mark.slow
 def test_without_a_cache_folder_every_process_announces_compilation(tmp_path):
     script = TOY.replace(
         "from r5dgs_core",

@@ -137,6 +137,7 @@ def test_a_cold_worker_announces_compilation_in_the_background(cold):
     assert cold[said.index("compiling")]["text"] == compilation.NOTICE
 
 
+@pytest.mark.slow
 def test_a_warm_worker_announces_no_compilation(warm_ups, cache, scene_path):
     assert [header.get("event", header.get("id")) for header in talk(cache, scene_path)] == [0, 1, 2, 3]
 

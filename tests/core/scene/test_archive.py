@@ -75,6 +75,7 @@ def test_a_bomb_of_consistent_zeros_is_refused_before_it_is_inflated(path, tmp_p
     assert_refused_cheaply(bomb, "declared")
 
 
+@pytest.mark.slow
 def test_a_scene_json_of_gigabytes_is_refused(path, tmp_path):
     others = members(path)
     text = others.pop("scene.json")
@@ -157,6 +158,7 @@ def test_duplicate_members_are_refused(path, tmp_path):
     assert_refused_cheaply(target, r"'means\.npy' twice")
 
 
+@pytest.mark.slow
 def test_a_scene_whose_json_compresses_like_a_bomb_can_be_read_again(tmp_path):
     scene = dataclasses.replace(make_scene(n=60), provenance={"zeros": [0] * 600_000})
     assert scene_file.read(scene_file.write(scene, tmp_path / "zeros.r5dgs")).provenance == scene.provenance
@@ -200,6 +202,7 @@ def test_a_pipe_and_an_unreadable_place_are_refused(tmp_path):
     assert_refused_cheaply(tmp_path / "pipe.r5dgs", "expected a .r5dgs file")
 
 
+@pytest.mark.slow
 def test_scenes_that_compress_too_well_remain_readable(tmp_path):
     count = 1_500_000
     scene = make_scene(n=1, objects=0, unassigned=0, shadows=False, shading=False, identities=False)

@@ -134,6 +134,7 @@ def test_signs_that_jump_fail_the_rows_on_signs(monkeypatch):
     assert broken == {("signs", "ten turns in steps of 20 degrees")}
 
 
+@pytest.mark.slow
 def test_a_fit_that_mirrors_fails_for_points_in_a_plane(monkeypatch):
     def mirrored(source, target, weights):
         center, moved = weights @ source, weights @ target

@@ -87,6 +87,7 @@ def unsealed(state):
     return buffer.getvalue()
 
 
+@pytest.mark.default_cases("with a digest")
 @pytest.mark.parametrize("sealed", [True, False], ids=["with a digest", "of an earlier version"])
 def test_no_flipped_bit_changes_a_number(reference, tmp_path, pytestconfig, sealed):
     whole, path = checkpoint.load(reference), tmp_path / checkpoint.CHECKPOINT_FILE
@@ -146,6 +147,7 @@ def stopped_run(tiny, tmp_path_factory):
     return folder
 
 
+@pytest.mark.default_cases("flipped")
 @pytest.mark.parametrize("damage", ["flipped", "empty", "missing"])
 def test_a_run_with_a_damaged_newest_checkpoint_continues_from_the_previous_one(
     tiny, reference, stopped_run, tmp_path, caplog, damage

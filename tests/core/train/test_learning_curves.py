@@ -33,6 +33,7 @@ def test_each_measured_curve_has_a_panel():
     assert size(three)[0] == size(two)[0] and size(three)[1] * 2 == size(two)[1] * 3
 
 
+@pytest.mark.slow
 def test_some_steps_may_have_no_measurement_of_held_out_views():
     mixed = [BLIND[0], ROWS[1], BLIND[2], ROWS[3]]
     assert size(learning_curves.draw(mixed)) == size(learning_curves.draw(ROWS)) and learning_curves.draw(

@@ -77,6 +77,7 @@ def test_found_masks_start_a_run_like_given_ones(unmasked, tiny):
     assert all(view.mask is None for view in found.views) and found.object_ids.tolist() == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_a_resumed_run_keeps_the_masks_that_it_began_with(unmasked, tiny, tmp_path, monkeypatch):
     calls = []
 
@@ -124,6 +125,7 @@ def test_found_objects_are_measured_against_the_true_ones(tiny):
     assert max(row["position_error"] for row in found) < 1e-3 and [row["id"] for row in found] == [1, 2]
 
 
+@pytest.mark.slow
 def test_a_field_without_masks_groups_moving_gaussians_at_the_end(unmasked, tmp_path, monkeypatch):
     """The parts become objects with groups of their own, and nobody takes their ids for those of the data."""
     config = tiny_datasets.settings(

@@ -38,6 +38,7 @@ def off(trainer, body, before):
     return np.degrees(rotations.angle_between(quats(trainer, body), before))
 
 
+@pytest.mark.default_cases("knots1-axis1-35")
 @pytest.mark.parametrize(
     "knots, axis, degrees", [((2,), (0, 0, 1), 40), ((4, 5), (0.6, 0.8, 0), 35), ((0,), (1, 0, 0), 45)]
 )
@@ -95,6 +96,7 @@ def test_a_hidden_knot_is_not_suspicious_and_predicts_nothing():
     assert len(pose_repair.suspicious(errors, turns, times)) == 0
 
 
+@pytest.mark.slow
 def test_a_fast_body_is_not_lost_as_times_enter(tmp_path, monkeypatch):
     spin = {"velocity": [0.9, 0.35, 0.0], "angular_velocity": [0, 0, 3.5], "radius": 0.5}  # 30 degrees per knot
     monkeypatch.setitem(tiny_datasets.MOTIONS, BRICK, MotionModel("ballistic_spin", **spin))

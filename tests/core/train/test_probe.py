@@ -35,6 +35,7 @@ def test_measuring_held_out_views_does_not_change_a_run(tiny, tmp_path):
     assert logged == looking and {10, 20, 30, 40} < {event["iteration"] for event in logged}
 
 
+@pytest.mark.slow
 def test_training_raises_the_psnr_of_held_out_views(tiny, tmp_path):
     found = [e["val_psnr"] for e in events_of(tiny.root, tmp_path / "run", "train.probe_every=5") if "val_psnr" in e]
     assert 5 < found[0] < found[-1] < 60

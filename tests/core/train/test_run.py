@@ -60,6 +60,7 @@ def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+@pytest.mark.default_cases("kill")
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=["kill", "terminate"])
 def test_a_stopped_run_resumes_to_the_same_bits(tiny, unbroken, tmp_path, capsys, number):
     folder = tmp_path / "run"
@@ -108,6 +109,7 @@ def stop_at(step, number, options, folder):
         )
 
 
+@pytest.mark.slow
 def test_a_run_killed_before_its_first_checkpoint_starts_again(tiny, unbroken, tmp_path):
     folder = tmp_path / "run"
     stop_at(30, signal.SIGKILL, arguments(tiny, folder, "train.checkpoint_every=1000"), folder)
@@ -117,6 +119,7 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again(tiny, unbroken, t
     assert log_of(folder) == log_of(unbroken[0])
 
 
+@pytest.mark.default_cases("placing", "identities")
 @pytest.mark.parametrize(
     ("moment", "number", "done"),
     [

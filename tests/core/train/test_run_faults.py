@@ -104,6 +104,7 @@ def assert_equal(ours, theirs):
     assert all(torch.equal(ours.tensors[name], tensor) for name, tensor in theirs.tensors.items())
 
 
+@pytest.mark.default_cases("half-10")
 @pytest.mark.parametrize(("moment", "kept"), [("half", 10), ("before", 10), ("between", 10), ("after", 20)])
 def test_a_kill_during_a_write_leaves_a_complete_checkpoint(tiny, reference, tmp_path, moment, kept):
     folder = tmp_path / "run"
@@ -115,6 +116,7 @@ def test_a_kill_during_a_write_leaves_a_complete_checkpoint(tiny, reference, tmp
     assert not list(folder.glob(".*.part"))
 
 
+@pytest.mark.slow
 @needs_limits
 def test_a_run_stopped_by_a_full_disk_resumes_after_space_is_freed(tiny, reference, tmp_path):
     folder = tmp_path / "run"
@@ -233,6 +235,7 @@ def spoil_camera(trainer):
         view.camera.T_cam_world[0, 3] = float("nan")
 
 
+@pytest.mark.default_cases("spoil_image-loss|gradient of")
 @pytest.mark.parametrize(
     ("spoil", "found"), [(spoil_image, "loss|gradient of"), (spoil_camera, "cannot be drawn|camera|finite")]
 )

@@ -93,6 +93,7 @@ def unbroken(tiny, tmp_path_factory):
     patch.undo()
 
 
+@pytest.mark.default_cases("30")
 @pytest.mark.parametrize("broken_at", [9, 30])
 def test_a_restored_trainer_continues_to_the_same_bits(tiny, unbroken, broken_at):
     folder, reference = unbroken

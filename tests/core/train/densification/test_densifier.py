@@ -298,6 +298,7 @@ SETTINGS = {
 }
 
 
+@pytest.mark.default_cases("share")
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_run_keeps_its_cap_and_resumes_to_the_same_bits(tiny, tmp_path, name):
     def begin():

@@ -90,6 +90,7 @@ def test_gaussians_without_object_stay_still_to_the_bit(tiny):
     assert len(everything.motion.movers(everything.gaussians)) == len(everything.gaussians)
 
 
+@pytest.mark.slow
 def test_positions_from_masks_are_learned_before_the_first_image(tiny):
     trainer = make(tiny, "field.place_steps=120")
     motion = trainer.motion
@@ -123,6 +124,7 @@ def test_only_the_true_twist_also_moves_the_other_gaussians_of_a_body():
     assert crossed[0] < 1e-8 and crossed[1] > 1e-5
 
 
+@pytest.mark.default_cases("overrides1")
 @pytest.mark.parametrize("overrides", [(), ("field.tracks_share=0.3", "field.distill_steps=20", "train.iterations=40")])
 def test_a_resumed_field_ends_with_the_same_numbers(tiny, tmp_path, overrides):
     extra = ("field.variant='r5dgs_extra'", "identity.training='joint'", "losses.rigid_start=0.1", *overrides)
@@ -143,6 +145,7 @@ def test_a_resumed_field_ends_with_the_same_numbers(tiny, tmp_path, overrides):
             assert torch.equal(tensor, expected.tensors[name]), (k, name)
 
 
+@pytest.mark.slow
 def test_a_field_that_starts_from_tracks_has_their_motion(tiny):
     trainer = make(
         tiny, "field.tracks_share=0.98", "field.distill_steps=200", "train.iterations=61", "densify.start=1000"
@@ -324,6 +327,7 @@ def test_a_horizon_outside_the_observed_times_is_refused(tiny, horizon):
         )
 
 
+@pytest.mark.slow
 def test_harmonics_rotate_with_their_moving_gaussians(tiny, tmp_path):
     """The scene plays colours that depend on the view as the trainer draws them, also of bodies that turned."""
     settings = tiny_datasets.settings(
@@ -372,6 +376,7 @@ def test_disabled_motion_does_not_return_as_residuals(made, scene, tiny):
     assert travel(bake.bake(changed, datasets.read(tiny.root))) < 1e-6
 
 
+@pytest.mark.slow
 def test_baking_a_field_regroups_gaussians_by_motion_and_stores_their_number(made, scene, tiny):
     """A third of the brick was created for the ball; only motion shows where these Gaussians belong."""
     data, state = datasets.read(tiny.root), checkpoint.load(made.folder)

@@ -83,6 +83,7 @@ def make(data, *overrides) -> Trainer:
     return Trainer(datasets.read(data.root), tiny_datasets.settings(*SHORT, *overrides))
 
 
+@pytest.mark.slow
 def test_the_picture_does_not_jump_and_resting_gaussians_are_never_evaluated_again(unmasked):
     trainer = make(unmasked, "field.still=0.0")
     while not trainer.done:
@@ -131,6 +132,7 @@ def test_the_gate_closes_once_every_time_takes_part_and_a_resumed_run_does_the_s
             assert torch.equal(tensor, expected.tensors[name]), (k, name)
 
 
+@pytest.mark.slow
 def test_labelled_gating_falls_back_to_measured_without_masks(unmasked, tiny):
     for data, expected in ((unmasked, "measured"), (tiny, "labelled")):
         trainer = make(data)

@@ -296,6 +296,7 @@ def error_on_the_ball(trainer, data):
     return total
 
 
+@pytest.mark.slow
 def test_residuals_improve_the_images_of_a_breathing_object(breathing):
     data, done, _ = breathing
     bent = make(data, *SETTINGS)
@@ -335,6 +336,7 @@ def test_the_scene_shows_what_was_trained_and_then_keeps_its_last_shape(breathin
     assert np.array_equal(later.log_scales, scene.gaussians.log_scales)
 
 
+@pytest.mark.slow
 def test_a_scene_may_be_baked_without_residuals(breathing, tmp_path):
     _, done, scene = breathing
     plain = bake.run_bake(done.folder, tmp_path / "plain.r5dgs", None, ["needs.residuals=off"])
@@ -364,6 +366,7 @@ def states(breathing, request):
     return settings, found
 
 
+@pytest.mark.default_cases("joint-0", "joint-1")
 @pytest.mark.parametrize("k", [0, 1])
 def test_a_run_with_residuals_resumes_to_the_same_bits(breathing, states, tmp_path, k):
     settings, found = states

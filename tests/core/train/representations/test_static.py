@@ -60,6 +60,7 @@ def baked_at_rest(still, tmp_path_factory):
     return folder, json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_training_a_scene_at_rest_loads_no_module_of_motion(baked_at_rest):
     parts = {name.rpartition(".")[2] for name in baked_at_rest[1]}
     assert not parts & set(MOVING_PARTS) and not [part for part in parts if part.startswith("field")]

@@ -159,6 +159,7 @@ def test_an_object_with_late_masks_is_tracked_in_earlier_images(tmp_path):
     assert path_error(trainer, data, tiny_datasets.BALL, 0.0) < 0.2  # 0.9 away from where it is first marked
 
 
+@pytest.mark.slow
 def test_an_object_that_appears_late_is_as_opaque_as_one_that_is_always_present(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path, ball_from=0.6)
     trainer = train(data)
