@@ -8,8 +8,8 @@ cube of static Gaussians and cover most of the image. In the ``room``, they are 
 
 ``fps`` is computed from the median time of whole frames, from scene time to picture. Medians of the parts:
 ``ms_motion`` poses the Gaussians, ``ms_colors`` evaluates harmonics and sky, ``ms_raster`` is the rest. ``fps_stage``
-and ``ms_stage`` are those of whole frames drawn by a `Stage`, which caches the static layer; each of its pictures is
-compared with a complete drawing. Results: docs/results/rasterizer.md.
+and ``ms_stage`` are those of whole frames drawn by an `IncrementalRenderer`, which caches the static layer; each of its
+pictures is compared with a complete drawing. Results: docs/results/rasterizer.md.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def compare(staged: RenderOutput, scene: Scene, instances: list[Instance], camer
 def measure(scene: Scene, camera: Camera, frames: int) -> dict[str, float]:
     """Medians over frames spread over twice the observed time, in milliseconds, and frames per second."""
     parts: dict[str, list[float]] = {"ms_frame": [], "ms_motion": [], "ms_colors": [], "ms_stage": []}
-    theatre = incremental_renderer.Stage(scene)
+    theatre = incremental_renderer.IncrementalRenderer(scene)
     for t in [0.1 * T_MAX, *np.linspace(0, 2 * T_MAX, frames)]:  # the first one warms up and is not counted
         start = time.perf_counter()
         frame = scene_player.frame(scene, float(t))

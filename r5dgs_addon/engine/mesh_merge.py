@@ -2,9 +2,10 @@
 
 F12 of the scene with the Gaussians renders both scenes, as its compositor uses both. The merged picture is
 
-    coverage * front + (1 - covered) * meshes + (1 - coverage) * Gaussians
+    coverage * (front + visible * meshes) + (1 - coverage) * Gaussians
 
-with the anti-aliased coverage of the meshes, and the pass `render_passes.FRONT` of the Gaussians in front of them.
+with the anti-aliased coverage of the meshes, their straight colours, and the pass `render_passes.FRONT`: the Gaussians
+in front of the meshes, premultiplied, and the visible share of the meshes behind them.
 """
 
 import bpy

@@ -23,8 +23,8 @@ ASKING = "Running the text encoder for "  # prefix of the note shown while the e
 STRANGER = (
     "{}: its table was made by the encoder {!r}, not by {!r} of the preferences; make the table again with that one"
 )
-_meanings: file_cache.Remembered[stored_embeddings.StoredEmbeddings | None] = file_cache.Remembered(
-    scene_file.read_meanings
+_embeddings: file_cache.Remembered[stored_embeddings.StoredEmbeddings | None] = file_cache.Remembered(
+    scene_file.read_embeddings
 )
 
 
@@ -91,19 +91,19 @@ def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> 
         there = object_names.present(collection)
         names = {label.object_id: label.name for label in labels}
         known += [label for label in labels if label.object_id in there]
-        meanings, note = _stored_meanings(collection)
+        embeddings, note = _stored_embeddings(collection)
         notes += [note] if note else []
         embed = None
-        if meanings is not None and meanings.table is not None:
-            card, unknown = meanings.table.encoder, object_search.unknown(labels, text, meanings)
+        if embeddings is not None and embeddings.table is not None:
+            card, unknown = embeddings.table.encoder, object_search.unknown(labels, text, embeddings)
             missing += phrase_embeddings.missing(unknown)
             lost += [] if phrase_embeddings.has_encoder() else unknown
             other = phrase_embeddings.other_encoder(unknown, card)
             notes += [STRANGER.format(collection.name, card.name, other)] if other else []
             embed = functools.partial(phrase_embeddings.of, card=card)
-        left.append(object_search.unanswered(labels, text, threshold, meanings, embed))
-        kept.append(object_search.not_excluded(labels, text, threshold, meanings, embed))
-        for found in object_search.search_labels(labels, text, threshold, meanings, embed):
+        left.append(object_search.unanswered(labels, text, threshold, embeddings, embed))
+        kept.append(object_search.not_excluded(labels, text, threshold, embeddings, embed))
+        for found in object_search.search_labels(labels, text, threshold, embeddings, embed):
             if found.object_id in there:
                 matches.append(Match(collection, found.object_id, names[found.object_id], found.score, found.why))
             elif not found.why.startswith(object_search.EVERYTHING):
@@ -209,15 +209,15 @@ def scope(context: bpy.types.Context) -> list[bpy.types.Collection]:
 
 def forget() -> None:
     """Clear the cache of scene file embeddings."""
-    _meanings.clear()
+    _embeddings.clear()
 
 
-def _stored_meanings(collection: bpy.types.Collection) -> tuple[stored_embeddings.StoredEmbeddings | None, str]:
+def _stored_embeddings(collection: bpy.types.Collection) -> tuple[stored_embeddings.StoredEmbeddings | None, str]:
     """Embeddings of a scene's file, or None and a message for the user."""
     if not collection.r5dgs_named.meanings:
         return None, ""
     try:
-        return _meanings.get(render_request.scene_path(collection)), ""
+        return _embeddings.get(render_request.scene_path(collection)), ""
     except errors.SceneFileError as error:
         return None, f"{collection.name}: searched by names only, because its scene file cannot be read: {error}"
 

@@ -103,7 +103,7 @@ def switch_off(context: bpy.types.Context, collection: bpy.types.Collection) -> 
     """Disable Exact Mode: restore the bind state, and remove the handlers if no other scene uses them."""
     state = collection.r5dgs_exact
     for cloud in loaded_scenes.members(collection, "CLOUD"):
-        exact_points.give_back(cloud.data)
+        exact_points.restore_bind_state(cloud.data)
     if state.enabled and not state.locked:
         context.scene.render.use_lock_interface = False
     state.enabled, state.problem = False, ""

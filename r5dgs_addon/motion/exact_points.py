@@ -172,7 +172,7 @@ def _bind_state(cloud: bpy.types.PointCloud) -> dict[str, np.ndarray]:
     return result
 
 
-def give_back(cloud: bpy.types.PointCloud) -> None:
+def restore_bind_state(cloud: bpy.types.PointCloud) -> None:
     """Restore the bind state."""
     for name, _, field, width in _PARTS:
         kept = cloud.attributes.get(point_clouds.BIND + name)

@@ -125,7 +125,7 @@ class ImageEvidence:
         octants = ((scene.gaussians.means > scene.groups[group].pivot) @ np.array([1, 2, 4])).astype(np.int32)
         return np.where(scene.gaussians.motion_ids == group, octants, np.int32(PATCHES))
 
-    def glance(self, changes: np.ndarray) -> list[int]:
+    def strongest_views(self, changes: np.ndarray) -> list[int]:
         """Return one view per cluster: the one with the largest change [S] at the knot nearest to its time."""
         knots = np.abs(self._scene.tracks.times[:, None] - [view.t for view in self._views]).argmin(0)
         clusters = range(int(self._clusters.max()) + 1)
@@ -199,7 +199,7 @@ def gather(scene: Scene, dataset: datasets.Dataset, config: Config) -> ImageEvid
         return None
 
 
-def painter(scene: Scene) -> Callable[[datasets.View], np.ndarray]:
+def make_renderer(scene: Scene) -> Callable[[datasets.View], np.ndarray]:
     """Return a function that renders the scene at a view. [H, W, 3]"""
     player = scene_player.Player(scene)
 

@@ -1,13 +1,13 @@
 """Standard deviations of the observed poses of bodies, from the training images.
 
-A small change of a pose changes the pixels of the body by J. With the misfit r of these pixels, the pose of least
-misfit has the covariance (J^T J)^-1 (sum g g^T) (J^T J)^-1, with the score g = J^T r of each view. Misfits of trained
-Gaussians are correlated over a view, so the score of a view counts as one number. The ratio to the covariance for
-independent pixels is pooled over the knots of a body, because single knots have few views. Tracks also drift, together
-with the texture that they shaped: `FACTORS` are the measured errors of tracks in these deviations. If the misfit is as
-large as the texture of the images, wrong rotations have blurred it, and the rotations are unknown.
+Notation: J is the derivative of the pixels of a body by its pose, r their misfit, g = J^T r the score of a view. The
+pose of least misfit has the covariance (J^T J)^-1 (sum g g^T) (J^T J)^-1, with the sum over views instead of pixels,
+because the misfits of trained Gaussians are correlated over a view. The ratio to the covariance for independent pixels
+is pooled over the knots of a body, because single knots have few views. A track also drifts together with the texture
+that is trained with it; `FACTORS` are measured ratios of true errors to these deviations. If the misfit is as large as
+the contrast of the texture, wrong rotations have blurred it, and the rotations are unknown.
 
-Notation: S knots, P values of pixels. A change of a pose is a rotation vector in world axes, and a displacement in
+S knots, P values of pixels. A change of a pose is a rotation vector in world axes, and a displacement in
 radii of the body.
 """
 
@@ -33,13 +33,13 @@ from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from ..train import train_views
 
-VIEWS = 4  # of a knot, spread evenly
+VIEWS = 4  # maximum number of views of a knot, spread evenly
 STEP = 0.03  # change of the pose for finite differences, rad or radii
 MARGIN = 2  # dilation of the pixels that show a body, px
-FEWEST_PIXELS = 8  # of a body in a view
-FACTORS = (2.0, 4.5)  # measured errors of displacements and rotations, in deviations from single views
-UNEXPLAINED = 0.5  # share of the texture from which the rotations are unknown
-LARGE = 2.0  # misfit, in that of all pixels, from which it counts as unexplained
+FEWEST_PIXELS = 8  # minimum number of pixels of a body in a view
+FACTORS = (2.0, 4.5)  # ratios of measured errors to deviations, for displacements and rotations
+UNEXPLAINED = 0.5  # misfit above which the rotations are unknown, as a share of the contrast of the texture
+LARGE = 2.0  # smallest misfit that counts as unexplained, relative to the mean misfit of all pixels
 UNKNOWN = 1.0  # standard deviation of an unknown rotation, rad, or displacement, radii
 EXACT = 1e-6  # error that cannot be distinguished from zero, rad or radii
 _REACH = 3.0  # extent of a Gaussian, standard deviations

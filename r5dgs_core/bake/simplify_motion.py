@@ -206,7 +206,7 @@ def _judged(
         after[group] = poses
         largest = 2 * float(np.linalg.norm(dropped, axis=1).max()) / (unit if name != "rotation" else 2.0)
         free, seen = 3 * _independent(dropped[weights > 0]), True
-        for rows in (evidence.glance(np.linalg.norm(dropped, axis=1)), None):
+        for rows in (evidence.strongest_views(np.linalg.norm(dropped, axis=1)), None):
             support = evidence.support(group, scene.tracks.poses, _followed(scene, after), largest, rows)
             change = max(support.sigmas, 0.0) / np.sqrt(free)
             allowed = float(np.sqrt(stats.f.ppf(1 - LEVEL, free, max(support.clusters - 1, 1))))

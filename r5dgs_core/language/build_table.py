@@ -139,7 +139,7 @@ def _vocabulary(
     known = {tuple(english.words_of(noun)): row for row, noun in enumerate(common_nouns.words())}
     chosen: dict[tuple[str, ...], str] = {}
     for word in (*named, *words, *common_nouns.words()):
-        said = object_search.wishes(word)
+        said = object_search.phrases_of(word)
         if len(said) == 1:  # queries are split, so a phrase of several parts is never looked up
             chosen.setdefault(tuple(said[0]), word.strip())
     fresh = [word for said, word in chosen.items() if said not in known]

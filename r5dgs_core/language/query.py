@@ -33,8 +33,8 @@ def unanswered(
     scene: Scene, text: str, encoder: encoder_base.Encoder | None = None, threshold: float = object_search.THRESHOLD
 ) -> list[str]:
     """Phrases of a text that no object matches; arguments as in `find`."""
-    meanings = stored_embeddings.StoredEmbeddings.of(scene)
-    return object_search.unanswered(object_search.labels_of(scene), text, threshold, meanings, _embed(scene, encoder))
+    embeddings = stored_embeddings.StoredEmbeddings.of(scene)
+    return object_search.unanswered(object_search.labels_of(scene), text, threshold, embeddings, _embed(scene, encoder))
 
 
 def check(stored: EncoderCard, asked: EncoderCard, place: str) -> None:

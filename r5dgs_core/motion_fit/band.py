@@ -14,7 +14,7 @@ import numpy as np
 
 from ..motion import rotations, se3
 from ..motion.history import MOST_KNOTS, Band
-from . import rolling
+from . import backtest
 from .candidates import Noise, Solution
 from .evidence import Evidence
 from .fitted_motion import FADE_PER_SPAN
@@ -50,7 +50,7 @@ def of(selected: Selected, variance: float, drift: Noise) -> Widths:
     place2, turn2 = _spread(chosen, selected.solutions, evidence, tau)
     fading = np.exp(-2 * tau / FADE_PER_SPAN)  # of the bind state, which is a noisy pose
     last = evidence.level * fading
-    scale = min(max(rolling.misses(chosen, selected.track, noise, variance), 1.0), _MOST_SCALE)
+    scale = min(max(backtest.relative_error(chosen, selected.track, noise, variance), 1.0), _MOST_SCALE)
     growth = 3 * (0.5 + tau) ** 2
     turn = scale * turn + turn2 + 3 * noise.turn**2 * last + growth * drift.turn**2
     place = scale * place + place2 + 3 * noise.place**2 * last + growth * drift.place**2

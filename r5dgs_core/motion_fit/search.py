@@ -10,9 +10,9 @@ import numpy as np
 
 from ..motion import rotations
 from ..motion.pose_track import PoseTrack
+from . import backtest, kinks, noise
 from . import candidates as families
 from . import evidence as evidences
-from . import kinks, noise, rolling
 from .candidates import Candidate, Noise, Solution
 from .evidence import Evidence
 
@@ -299,7 +299,7 @@ def _simplest(laws: Sequence[Solution], evidence: Evidence, track: PoseTrack, le
     """
     best = min(evidence.score(s) for s in laws)
     near = [s for s in laws if evidence.score(s) <= best + evidences.NEAR]
-    misses = [rolling.misses(s, track, level, evidence.variance) for s in near]
+    misses = [backtest.relative_error(s, track, level, evidence.variance) for s in near]
     limit = _CONTRADICTED * max(min(misses), 1.0)
     fit = [s for s, miss in zip(near, misses, strict=True) if miss <= limit]
     return min(fit, key=lambda s: (s.parameters, evidence.score(s)))

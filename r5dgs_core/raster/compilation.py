@@ -5,7 +5,7 @@ Plain Python threads run the shares. Compared with numba's parallel loops, this 
 allows calls from several threads, and gives results that do not depend on a threading layer.
 
 Machine code is cached between processes. The first compilation of a process is announced by a warning, or as set by
-`telling`.
+`announcing`.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class _Watch(numba_events.Listener):
     def __init__(self) -> None:
         self.kernels: weakref.WeakSet = weakref.WeakSet()
         self.compiled = 0
-        self.tell: Callable[[str], object] = log.warning
+        self.announce: Callable[[str], object] = log.warning
         self._depth = 0  # nesting: a kernel and its helpers
         self._collects = False
 
@@ -101,7 +101,7 @@ class _Watch(numba_events.Listener):
         gc.disable()
         self.compiled += 1
         if self.compiled == 1:
-            self.tell(NOTICE if cache_folder() else NOTICE_UNKEPT)
+            self.announce(NOTICE if cache_folder() else NOTICE_UNKEPT)
 
     def on_end(self, event) -> None:
         if self._depth == 1 and self._collects:
@@ -119,13 +119,13 @@ def compiled() -> int:
 
 
 @contextlib.contextmanager
-def telling(tell: Callable[[str], object]) -> Iterator[None]:
-    """Announce the process's first compilation, in any thread, by ``tell(text)`` instead of a warning in the log."""
-    before, _watch.tell = _watch.tell, tell
+def announcing(announce: Callable[[str], object]) -> Iterator[None]:
+    """Announce the process's first compilation, in any thread, by ``announce(text)`` instead of a logged warning."""
+    before, _watch.announce = _watch.announce, announce
     try:
         yield
     finally:
-        _watch.tell = before
+        _watch.announce = before
 
 
 def cache_folder() -> Path | None:

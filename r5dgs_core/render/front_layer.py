@@ -1,8 +1,8 @@
-"""The part of a picture in front of meshes: Gaussians between the camera and the nearest surface of each pixel.
+"""Image of the Gaussians in front of meshes, that is, between the camera and the nearest surface of each pixel.
 
-A Gaussian contributes with the share of its density along the ray of a pixel that lies before the surface, so it fades
-where a surface passes through it. The layer is laid over the picture of the meshes, whose coverage decides their
-anti-aliased edges.
+A Gaussian contributes the share of its density along the ray of the pixel that lies before the surface, so it fades
+out across a surface that cuts it. The image is composited over the render of the meshes, whose coverage anti-aliases
+the edges.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from ..scene.scene import Scene
 from . import scene_renderer
 from .posed_scene import PosedScene
 
-THINNEST = 1e-3  # smallest ratio of two axes of a Gaussian in the depth of its density
-SKY_TOLERANCE = 0.1  # distance from the sky's colour, per channel, up to which a Gaussian may be a part of the sky
-SKY_LOGIT = 0.0  # logit of the opacity below which it is, wherever it lies
+THINNEST = 1e-3  # lower limit of the ratio of two axes of a Gaussian, for its extent in depth
+SKY_TOLERANCE = 0.1  # maximum difference of colour from the sky, per channel, of a Gaussian of the sky
+SKY_LOGIT = 0.0  # opacity logit below which a Gaussian of the sky's colour belongs to the sky at any distance
 
 
 def render(
@@ -68,7 +68,7 @@ def render(
 
 
 def of_sky(scenes: Sequence[Scene], instances: Sequence[Instance], posed: PosedScene, camera: Camera) -> np.ndarray:
-    """Return a mask of the Gaussians that have learned the sky, which no mesh can be behind.
+    """Return a mask of the Gaussians that represent the sky; meshes are always in front of them.
 
     These are background or unassigned Gaussians with the colour of the sky behind them that are faint, or farther from
     the middle of their scene than all its cameras.

@@ -26,7 +26,7 @@ OWN_SKY = Sky()  # of the first scene
 WORTH_A_LAYER = 0.7  # maximum share of moving Gaussians; above it, the static layer costs more than it saves
 
 
-class Stage:
+class IncrementalRenderer:
     """Renderer of frame sequences of one or several scenes in one world, on the CPU in float32. Thread-safe.
 
     Args:

@@ -68,7 +68,7 @@ def check(
     known = {name: shape for name, shape in shapes.items() if name in expected and name not in bad_harmonics}
     sound = _fitting({name: known[name] for name in expected if name in known}, expected, place, guard)
     words = _number(guard, lambda: len(vocabulary))
-    return sound | check_meanings(shapes, _number(guard, lambda: len(objects)), words, table, place, guard)
+    return sound | check_embeddings(shapes, _number(guard, lambda: len(objects)), words, table, place, guard)
 
 
 def _bases(
@@ -86,7 +86,7 @@ def _bases(
     return bases
 
 
-def check_meanings(
+def check_embeddings(
     shapes: Mapping[str, tuple[int, ...]],
     objects: int | None,
     words: int | None,

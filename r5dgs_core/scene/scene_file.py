@@ -90,7 +90,7 @@ def is_exact(path: str | Path) -> bool:
     return any(header.dtype == "<f4" for header in headers.values())
 
 
-def read_meanings(path: str | Path) -> StoredEmbeddings | None:
+def read_embeddings(path: str | Path) -> StoredEmbeddings | None:
     """Read only the stored embeddings of a scene; returns None if it has none. Raises as `read` does."""
     place = str(path)
     with Archive(Path(path)) as archive:
@@ -99,9 +99,9 @@ def read_meanings(path: str | Path) -> StoredEmbeddings | None:
         ids = top.each("objects", lambda row: row.get("id", int))
         vocabulary = top.words("vocabulary")
         table = scene_json.table(top)
-        array_shapes.check_meanings(_shapes(headers), len(ids), len(vocabulary), table, place)
+        array_shapes.check_embeddings(_shapes(headers), len(ids), len(vocabulary), table, place)
         arrays = _read_arrays(archive, headers, EMBEDDINGS)
-    validation.check_meanings(arrays, table, place)
+    validation.check_embeddings(arrays, table, place)
     objects, words = arrays["embeddings"], arrays["vocabulary_embeddings"]
     if objects is None or words is None:
         return None

@@ -95,7 +95,7 @@ def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> 
         with guard():
             if name in arrays:
                 check_range(name, arrays[name], place)
-    check_meanings({name: arrays.get(name) for name in EMBEDDINGS}, scene.lookup, place, guard)
+    check_embeddings({name: arrays.get(name) for name in EMBEDDINGS}, scene.lookup, place, guard)
     _check_groups(given, place, guard)
     for check_part in (_check_ids, _check_residuals, _check_units, _check_times, _check_objects):
         check_part(scene, place, guard)
@@ -142,7 +142,7 @@ def _check_ids(scene: Scene, place: str, guard: findings.Guard) -> None:
             _fail(place, "world_convention", f"one of {sorted(cameras.WORLD_TO_BLENDER)}", repr(scene.world_convention))
 
 
-def check_meanings(
+def check_embeddings(
     arrays: Mapping[str, np.ndarray | None],
     table: Table | None,
     place: str,

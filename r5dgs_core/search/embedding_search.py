@@ -42,17 +42,17 @@ class EmbeddingMatch:
     relevancy: float | None
 
 
-def ask(meanings: StoredEmbeddings, query: np.ndarray) -> list[EmbeddingMatch]:
+def ask(embeddings: StoredEmbeddings, query: np.ndarray) -> list[EmbeddingMatch]:
     """Score each object that has an embedding against a phrase, best first.
 
     An object whose cosine is more than the table's margin below the best one does not match.
 
     Args:
-        meanings: Stored embeddings of the scene.
+        embeddings: Stored embeddings of the scene.
         query: Embedding of the phrase, unit. [D]
     """
-    query, table = np.asarray(query, np.float64), meanings.table
-    answers = [one for row in range(len(meanings.object_ids)) if (one := _answer(meanings, row, query)) is not None]
+    query, table = np.asarray(query, np.float64), embeddings.table
+    answers = [one for row in range(len(embeddings.object_ids)) if (one := _answer(embeddings, row, query)) is not None]
     if table is not None and answers:
         least = max(one.cosine for one in answers) - table.margin
         answers = [one if one.cosine >= least else replace(one, score=min(one.score, _BESIDE)) for one in answers]
@@ -64,19 +64,19 @@ def relevancy(cosine: float, canonical: np.ndarray, scale: float) -> float:
     return float(1.0 / (1.0 + np.exp(min(-scale * (cosine - float(np.max(canonical))), _MOST_EXPONENT))))
 
 
-def _answer(meanings: StoredEmbeddings, row: int, query: np.ndarray) -> EmbeddingMatch | None:
+def _answer(embeddings: StoredEmbeddings, row: int, query: np.ndarray) -> EmbeddingMatch | None:
     """Best match among an object's embeddings, or None if it has none. query: float64"""
-    rows, thresholds = _rows(meanings, row)
+    rows, thresholds = _rows(embeddings, row)
     if not len(rows):
         return None
     cosines = np.clip(rows @ query, -1, 1)
     best = int(np.argmax(cosines - thresholds))
     cosine, above = float(cosines[best]), float(cosines[best] - thresholds[best])
-    table, canonical, found = meanings.table, meanings.canonical_embeddings, None
+    table, canonical, found = embeddings.table, embeddings.canonical_embeddings, None
     if table is not None and canonical is not None and len(canonical):
         found = relevancy(cosine, canonical @ rows[best], table.encoder.scale)
     spread = _SPREAD if table is None else table.margin
-    return EmbeddingMatch(meanings.object_ids[row], _score(above, spread), cosine, found)
+    return EmbeddingMatch(embeddings.object_ids[row], _score(above, spread), cosine, found)
 
 
 def _score(above: float, spread: float) -> float:
@@ -85,11 +85,11 @@ def _score(above: float, spread: float) -> float:
     return PASS + (_BEST - PASS) * (1 - share) if above >= 0 else PASS * share
 
 
-def _rows(meanings: StoredEmbeddings, row: int) -> tuple[np.ndarray, np.ndarray]:
+def _rows(embeddings: StoredEmbeddings, row: int) -> tuple[np.ndarray, np.ndarray]:
     """Embeddings to compare for an object and their thresholds; empty if it has none. [R, D], [R]"""
-    table, views = meanings.table, meanings.view_embeddings
+    table, views = embeddings.table, embeddings.view_embeddings
     if table is None:
-        own = np.asarray(meanings.embeddings[row], np.float64)[None]
+        own = np.asarray(embeddings.embeddings[row], np.float64)[None]
         return (own if own.any() else own[:0]), np.full(int(own.any()), UNCALIBRATED)
     threshold = table.thresholds[row]
     if threshold is None:
@@ -97,4 +97,4 @@ def _rows(meanings: StoredEmbeddings, row: int) -> tuple[np.ndarray, np.ndarray]
     if table.pooling == "max" and views is not None and table.views[row]:
         count = len(table.views[row])
         return np.asarray(views[row, :count], np.float64), np.array([view.threshold for view in table.views[row]])
-    return np.asarray(meanings.embeddings[row], np.float64)[None], np.array([threshold])
+    return np.asarray(embeddings.embeddings[row], np.float64)[None], np.array([threshold])

@@ -75,16 +75,16 @@ def search(scene: Scene, text: str, threshold: float = THRESHOLD, embed: Embed |
     Raises:
         ConfigError: An excluded phrase has no match.
     """
-    labels, meanings = labels_of(scene), StoredEmbeddings.of(scene)
-    check_exclusions(labels, text, not_excluded(labels, text, threshold, meanings, embed))
-    return search_labels(labels, text, threshold, meanings, embed)
+    labels, embeddings = labels_of(scene), StoredEmbeddings.of(scene)
+    check_exclusions(labels, text, not_excluded(labels, text, threshold, embeddings, embed))
+    return search_labels(labels, text, threshold, embeddings, embed)
 
 
 def search_labels(
     labels: Sequence[Label],
     text: str,
     threshold: float = THRESHOLD,
-    meanings: StoredEmbeddings | None = None,
+    embeddings: StoredEmbeddings | None = None,
     embed: Embed | None = None,
 ) -> list[Match]:
     """Same as `search`, on names and aliases, and on stored embeddings if given.
@@ -95,10 +95,10 @@ def search_labels(
     if prompt.everything:
         why = f"{EVERYTHING} others" if prompt.excluded else EVERYTHING
         best = {label.object_id: Match(label.object_id, 1.0, why) for label in labels if label.object_id > 0}
-    for match in _matches(labels, prompt.wanted, threshold, meanings, embed):
+    for match in _matches(labels, prompt.wanted, threshold, embeddings, embed):
         if match.object_id not in best or match.score > best[match.object_id].score:
             best[match.object_id] = match
-    for match in _matches(labels, prompt.excluded, threshold, meanings, embed):
+    for match in _matches(labels, prompt.excluded, threshold, embeddings, embed):
         best.pop(match.object_id, None)
     return _ranked(best.values())
 
@@ -107,24 +107,32 @@ def unanswered(
     labels: Sequence[Label],
     text: str,
     threshold: float = THRESHOLD,
-    meanings: StoredEmbeddings | None = None,
+    embeddings: StoredEmbeddings | None = None,
     embed: Embed | None = None,
 ) -> list[str]:
     """Wanted phrases without a match; arguments as for `search_labels`."""
     wanted = _parsed(labels, text).wanted
-    return [phrase for phrase, wish in wanted if not _matches(labels, [(phrase, wish)], threshold, meanings, embed)]
+    return [
+        phrase
+        for phrase, phrase_words in wanted
+        if not _matches(labels, [(phrase, phrase_words)], threshold, embeddings, embed)
+    ]
 
 
 def not_excluded(
     labels: Sequence[Label],
     text: str,
     threshold: float = THRESHOLD,
-    meanings: StoredEmbeddings | None = None,
+    embeddings: StoredEmbeddings | None = None,
     embed: Embed | None = None,
 ) -> list[str]:
     """Excluded phrases without a match; arguments as for `search_labels`."""
     excluded = _parsed(labels, text).excluded
-    return [phrase for phrase, wish in excluded if not _matches(labels, [(phrase, wish)], threshold, meanings, embed)]
+    return [
+        phrase
+        for phrase, phrase_words in excluded
+        if not _matches(labels, [(phrase, phrase_words)], threshold, embeddings, embed)
+    ]
 
 
 def check_exclusions(labels: Sequence[Label], text: str, missing: Sequence[str]) -> None:
@@ -147,14 +155,14 @@ def is_nothing(labels: Sequence[Label], text: str) -> bool:
     return bool(english.words_of(text)) and not prompt.wanted and not prompt.everything
 
 
-def unknown(labels: Sequence[Label], text: str, meanings: StoredEmbeddings | None) -> list[str]:
+def unknown(labels: Sequence[Label], text: str, embeddings: StoredEmbeddings | None) -> list[str]:
     """Phrases that need an encoder: no name matches them completely and no stored word has an embedding for them."""
     prompt = _parsed(labels, text)
     return [
         phrase
-        for phrase, wish in (*prompt.wanted, *prompt.excluded)
-        if not any(match.score >= _SETTLED for match in _named(labels, wish))
-        and (meanings is None or vocabulary_row(meanings.vocabulary, wish) is None)
+        for phrase, phrase_words in (*prompt.wanted, *prompt.excluded)
+        if not any(match.score >= _SETTLED for match in _named(labels, phrase_words))
+        and (embeddings is None or vocabulary_row(embeddings.vocabulary, phrase_words) is None)
     ]
 
 
@@ -186,14 +194,14 @@ def explain_nothing(labels: Sequence[Label], text: str) -> str:
     return f"{problem}; the scene has: {', '.join(label.name for label in labels) or 'no objects'}"
 
 
-def wishes(text: str) -> list[list[str]]:
+def phrases_of(text: str) -> list[list[str]]:
     """Normalised words of each phrase of a text, without fillers."""
     return [words for _, words in english.phrases(text)]
 
 
-def vocabulary_row(vocabulary: Sequence[str], wish: Sequence[str]) -> int | None:
+def vocabulary_row(vocabulary: Sequence[str], phrase_words: Sequence[str]) -> int | None:
     """Row of the first vocabulary entry that equals a phrase, or None."""
-    return _vocabulary_rows(tuple(vocabulary)).get(tuple(wish))
+    return _vocabulary_rows(tuple(vocabulary)).get(tuple(phrase_words))
 
 
 @functools.lru_cache(maxsize=8)
@@ -201,7 +209,7 @@ def _vocabulary_rows(vocabulary: tuple[str, ...]) -> dict[tuple[str, ...], int]:
     """Row of each vocabulary entry that is a single phrase, by its normalised words."""
     rows: dict[tuple[str, ...], int] = {}
     for row, word in enumerate(vocabulary):
-        said = wishes(word)
+        said = phrases_of(word)
         if len(said) == 1:
             rows.setdefault(tuple(said[0]), row)
     return rows
@@ -215,31 +223,39 @@ def _matches(
     labels: Sequence[Label],
     phrases: Sequence[tuple[str, list[str]]],
     threshold: float,
-    meanings: StoredEmbeddings | None,
+    embeddings: StoredEmbeddings | None,
     embed: Embed | None,
 ) -> list[Match]:
     """Matches of any of the phrases with a score of at least ``threshold``."""
-    found = [match for phrase, wish in phrases for match in _phrase_matches(labels, phrase, wish, meanings, embed)]
+    found = [
+        match
+        for phrase, phrase_words in phrases
+        for match in _phrase_matches(labels, phrase, phrase_words, embeddings, embed)
+    ]
     return [match for match in found if match.score >= threshold]
 
 
 def _phrase_matches(
-    labels: Sequence[Label], phrase: str, wish: list[str], meanings: StoredEmbeddings | None, embed: Embed | None
+    labels: Sequence[Label],
+    phrase: str,
+    phrase_words: list[str],
+    embeddings: StoredEmbeddings | None,
+    embed: Embed | None,
 ) -> list[Match]:
     """All matches of one phrase, regardless of score."""
-    named = _named(labels, wish)
-    if meanings is None or any(match.score >= _SETTLED for match in named):
+    named = _named(labels, phrase_words)
+    if embeddings is None or any(match.score >= _SETTLED for match in named):
         return named
-    row = vocabulary_row(meanings.vocabulary, wish)
-    query = meanings.vocabulary_embeddings[row] if row is not None else embed(phrase) if embed is not None else None
+    row = vocabulary_row(embeddings.vocabulary, phrase_words)
+    query = embeddings.vocabulary_embeddings[row] if row is not None else embed(phrase) if embed is not None else None
     if query is None:
         return named
     known = {label.object_id: label for label in labels}
-    meant = [one for one in stored.ask(meanings, query) if one.object_id in known and one.object_id >= 0]
+    meant = [one for one in stored.ask(embeddings, query) if one.object_id in known and one.object_id >= 0]
     if row is not None:  # a word with a stored embedding is not matched as a typo or prefix of another word
         fitting = {one.object_id for one in meant if one.score >= stored.PASS}
-        named = [m for m in named if m.object_id in fitting or _ends_with(known[m.object_id], wish[-1])]
-    word = phrase if row is None else meanings.vocabulary[row]
+        named = [m for m in named if m.object_id in fitting or _ends_with(known[m.object_id], phrase_words[-1])]
+    word = phrase if row is None else embeddings.vocabulary[row]
     return [*named, *(_by_meaning(one, word) for one in meant)]
 
 
@@ -248,8 +264,8 @@ def _by_meaning(one: stored.EmbeddingMatch, phrase: str) -> Match:
     return Match(one.object_id, one.score, why, one.cosine, one.relevancy)
 
 
-def _named(labels: Sequence[Label], wish: list[str]) -> list[Match]:
-    asked = tuple(wish)
+def _named(labels: Sequence[Label], phrase_words: list[str]) -> list[Match]:
+    asked = tuple(phrase_words)
     return [match for label in labels if (match := _match(label, asked)) is not None]
 
 
@@ -263,22 +279,22 @@ def _ranked(matches: Iterable[Match]) -> list[Match]:
 
 
 @functools.lru_cache(maxsize=1 << 14)  # several public functions repeat the same comparisons
-def _match(label: Label, wish: tuple[str, ...]) -> Match | None:
+def _match(label: Label, phrase_words: tuple[str, ...]) -> Match | None:
     """Best match among the object's name and aliases for one phrase; aliases have slightly less weight."""
     best: Match | None = None
     for kind, text, weight in (("name", label.name, 1.0), *(("alias", alias, 0.97) for alias in label.aliases)):
         words = english.words_of(text)
         if not words:
             continue
-        table = [[spelling.similarity(word, present) for present in words] for word in wish]
+        table = [[spelling.similarity(word, present) for present in words] for word in phrase_words]
         whole = "".join(words)
-        said = [max(*row, spelling.similarity(word, whole)) for word, row in zip(wish, table, strict=True)]
+        said = [max(*row, spelling.similarity(word, whole)) for word, row in zip(phrase_words, table, strict=True)]
         covered = said[0] if len(said) == 1 else _HEAD_WEIGHT * said[-1] + (1 - _HEAD_WEIGHT) * _mean(said[:-1])
         named = _mean([max(column) for column in zip(*table, strict=True)])
         # Unmatched words of the name cost little; unmatched words of the phrase cost much.
         score = weight * covered * (0.85 + 0.15 * named)
         if score > 0 and (best is None or score > best.score):
-            spelled = "" if max(said) == 1 else f", near {' '.join(wish)!r}"
+            spelled = "" if max(said) == 1 else f", near {' '.join(phrase_words)!r}"
             best = Match(label.object_id, score, f"{kind} {text!r}{spelled}")
     return best
 
@@ -289,7 +305,7 @@ def _mean(values: list[float]) -> float:
 
 def _closeness(text: str, name: str) -> float:
     """Similarity of two texts in [0, 1]: maximum over pairs of words and over all words joined."""
-    asked = [word for wish in wishes(text) for word in wish]
+    asked = [word for phrase_words in phrases_of(text) for word in phrase_words]
     present = english.words_of(name)
     if not asked or not present:
         return 0.0

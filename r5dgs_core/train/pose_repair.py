@@ -1,12 +1,13 @@
-"""Repair of slipped poses: knots at which the track of a body fell into a neighbouring minimum of the picture error.
+"""Repair of slipped poses: knots at which the track of a body converged to a wrong local minimum of the image error.
 
-A knot is suspicious if the picture error of the body is unusual there, or if its rotation is far from the one that
-constant spin between its neighbours gives. Such a knot is registered anew (`registration`) from its own pose and from
-the one that its neighbours predict, and if the error stays unusual, from turns of the prediction. The pose of least
-picture error is taken; among similar errors, the one nearest to the prediction. After a repair the neighbours are
-suspicious, too, so that a run of slipped knots is repaired from its ends. Knots that keep their poses keep all bits.
+A knot is suspicious if the image error of the body is unusually large there, or if its rotation differs much from the
+rotation that constant spin between its neighbours predicts. Such a knot is registered again (`registration`) from its
+own pose and from the predicted one, and if the error remains large, from rotations of the prediction. The pose of
+least image error is taken; among similar errors, the one nearest to the prediction. After a repair, the neighbours
+become suspicious, so that a series of slipped knots is repaired from its ends. Other knots keep their poses bit for
+bit.
 
-A knot is looked at when it enters training, where a fast body is easily lost, and in some rounds over all knots.
+A knot is checked when it enters training, because a fast body is easily lost then, and in some rounds over all knots.
 """
 
 from __future__ import annotations
@@ -24,16 +25,18 @@ from .trainer import Trainer
 
 log = logging.getLogger(__name__)
 
-ROUNDS = (0.4, 0.7)  # shares of the run after which all knots are looked at
+ROUNDS = (0.4, 0.7)  # shares of the run after which all knots are checked
 JUMP = np.radians(8.0)  # angle from the prediction above which a knot is suspicious
-UNUSUAL = 1.5  # picture error above which it is, in the median of the body
-CLEARLY = 0.93  # picture error of a better pose, in that of the present one
-SIMILAR = 1.03  # picture error, in the least, up to which the prediction decides
-APART = np.radians(3.0)  # angle from which two poses are different
-TURNS = np.radians((25.0, 50.0))  # of the starts about each axis
-FEWEST_VIEWS, VIEWS = 2, 3  # of a knot; one view alone does not determine a place
-REFINED, STEPS = 2, 4  # turns that are refined, and steps
-MOST = 2  # registrations of a body in a round, in knots
+UNUSUAL = 1.5  # image error above which a knot is suspicious, relative to the median over the knots of the body
+CLEARLY = 0.93  # largest image error of a new pose that is accepted, relative to that of the present one
+SIMILAR = 1.03  # image error below which the pose nearest to the prediction is taken, relative to the smallest error
+APART = np.radians(3.0)  # smallest angle between different poses
+TURNS = np.radians((25.0, 50.0))  # rotations of the prediction about each axis that are tried as starts
+FEWEST_VIEWS = 2  # minimum number of views of a knot; a single view does not determine a position
+VIEWS = 3  # maximum number of views of a knot
+REFINED = 2  # number of starts that are refined
+STEPS = 4  # steps of a refinement
+MOST = 2  # maximum registrations of a body in a round, as a multiple of its knots
 
 
 def applies(trainer: Trainer) -> bool:

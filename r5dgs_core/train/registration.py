@@ -1,7 +1,7 @@
 """Registration of one body at one knot: the pose at which the canonical Gaussians reproduce the body's pixels.
 
-Only the pose changes; the Gaussians stay fixed. The pictures are cropped to the body's masks, only Gaussians that reach
-them are drawn, and harmonics of higher degree are left out. Notation: a change of a pose is a rotation vector about the
+Only the pose changes; the Gaussians stay fixed. Images are cropped to the body's masks, only Gaussians that reach the
+crop are drawn, and harmonics of higher degree are left out. Notation: a change of a pose is a rotation vector about the
 body's centre in world axes, and a displacement in radii of the body; P values of pixels.
 """
 
@@ -27,7 +27,7 @@ from .representations.tracks import TracksRepresentation
 from .trainer import Trainer
 
 MARGIN = 2  # dilation of masks, px
-FEWEST_PIXELS = 8  # of a mask that helps
+FEWEST_PIXELS = 8  # minimum number of pixels of a mask
 STEP = 0.02  # change of the pose for finite differences, rad or radii
 _LARGEST = 0.35  # step of the refinement, rad or radii
 _ENOUGH = 1e-2  # relative gain of a step below which the refinement ends

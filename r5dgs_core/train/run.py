@@ -41,7 +41,7 @@ def train(
     *,
     resume: bool = False,
     overwrite: bool = False,
-    go_on: str | None = None,
+    resume_command: str | None = None,
     progress: Progress | None = None,
 ) -> checkpoint.Run:
     """Train a run folder from a data set.
@@ -53,7 +53,7 @@ def train(
         resume: Continue from the last checkpoint. Does nothing if training is finished.
         overwrite: Start again if the folder contains a run. Its files are kept until training is ready for the first
             step.
-        go_on: Command that resumes this run, for messages; by default a call of ``r5dgs train``.
+        resume_command: Command that resumes this run, for messages; by default a call of ``r5dgs train``.
         progress: Called with a dictionary per event (docs/reference/run_folder.md#progress). If it is a
             `TimedProgress`, its estimate of the time left also counts phases that the caller has added.
 
@@ -74,7 +74,7 @@ def train(
                 checkpoint.remove_leftovers(folder)
 
         timed = progress if isinstance(progress, TimedProgress) else TimedProgress(progress or (lambda event: None))
-        return _train(dataset_root, folder, config, resume, overwrite, go_on, timed, claim)
+        return _train(dataset_root, folder, config, resume, overwrite, resume_command, timed, claim)
 
 
 def _train(
@@ -83,7 +83,7 @@ def _train(
     config: Config,
     resume: bool,
     overwrite: bool,
-    go_on: str | None,
+    resume_command: str | None,
     progress: TimedProgress,
     claim: Callable[[], None],
 ) -> checkpoint.Run:
@@ -104,7 +104,9 @@ def _train(
         claim()
         if not overwrite:
             checkpoint.refuse_to_lose(folder)  # another process may have created a run meanwhile
-    go_on = go_on or shlex.join(["r5dgs", "train", str(Path(dataset.root).resolve()), "--out", str(folder), "--resume"])
+    if resume_command is None:
+        root = str(Path(dataset.root).resolve())
+        resume_command = shlex.join(["r5dgs", "train", root, "--out", str(folder), "--resume"])
     run, state, replaces = _open(folder, dataset, dataset_root, config, resume)
     iterations = run.config.train.iterations
     done = 0 if state is None else state.iteration
@@ -114,7 +116,11 @@ def _train(
         count = len(state.tensors["gaussians.means"])
         progress({"event": "trained", "gaussians": count, "text": "already finished"})
         return run
-    kept = f"{folder} is unchanged; repeat the same command to start again" if replaces else f"continue with: {go_on}"
+    kept = (
+        f"{folder} is unchanged; repeat the same command to start again"
+        if replaces
+        else f"continue with: {resume_command}"
+    )
     with interrupt.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
         progress({"event": "prepare", "text": "kernels"})
         warm_up.warm_up()
@@ -131,8 +137,8 @@ def _train(
     began_cpu = step_log.processor_start(folder / checkpoint.LOG_FILE, began_cpu)
     pictures = learning_curves.LearningCurves(run.folder)
     _plan(trainer, progress)
-    _optimise(trainer, run, began, began_cpu, go_on, progress, probe, pictures)
-    with interrupt.at_once(f"stopped after the last step, before the labels; continue with: {go_on}"):
+    _optimise(trainer, run, began, began_cpu, resume_command, progress, probe, pictures)
+    with interrupt.at_once(f"stopped after the last step, before the labels; continue with: {resume_command}"):
         _save(trainer, run, began, finished=True, extra=finish.outcome(trainer, progress))
         pictures.update(finished=True)
     progress({"event": "trained", "gaussians": len(trainer.gaussians)})
@@ -225,7 +231,7 @@ def _optimise(
     run: checkpoint.Run,
     began: float,
     began_cpu: float | None,
-    go_on: str,
+    resume_command: str,
     progress: TimedProgress,
     probe: probe.Probe | None,
     pictures: learning_curves.LearningCurves,
@@ -261,7 +267,7 @@ def _optimise(
                 _save(trainer, run, began, finished=False)
                 pictures.update()
             if stop:
-                raise Interrupted(f"stopped at step {trainer.iteration}; continue with: {go_on}")
+                raise Interrupted(f"stopped at step {trainer.iteration}; continue with: {resume_command}")
 
 
 def _save(

@@ -13,11 +13,11 @@ from ..scene.instance import Instance
 from ..scene.scene import Scene
 
 if TYPE_CHECKING:
-    from ..render.incremental_renderer import Stage
+    from ..render.incremental_renderer import IncrementalRenderer
 
 
 def draw(
-    stage: Stage, wanted: RenderRequest, instances: Sequence[Instance], scenes: Sequence[Scene]
+    stage: IncrementalRenderer, wanted: RenderRequest, instances: Sequence[Instance], scenes: Sequence[Scene]
 ) -> dict[str, np.ndarray]:
     """Return the requested layers by name.
 
@@ -36,7 +36,7 @@ def draw(
 
 
 def _coverage(
-    stage: Stage, wanted: RenderRequest, coverage: Coverage, instances: Sequence[Instance]
+    stage: IncrementalRenderer, wanted: RenderRequest, coverage: Coverage, instances: Sequence[Instance]
 ) -> dict[str, np.ndarray]:
     """Groups of instances that share each pixel, and their shares."""
     found, shares = stage.coverage(instances, coverage.groups, wanted.camera, ranks=coverage.ranks, near=wanted.near)
@@ -44,7 +44,11 @@ def _coverage(
 
 
 def _front(
-    stage: Stage, wanted: RenderRequest, meshes: Meshes, instances: Sequence[Instance], scenes: Sequence[Scene]
+    stage: IncrementalRenderer,
+    wanted: RenderRequest,
+    meshes: Meshes,
+    instances: Sequence[Instance],
+    scenes: Sequence[Scene],
 ) -> np.ndarray:
     """Gaussians in front of meshes, without those of the sky. [H, W, 4]"""
     from ..render import front_layer, mesh_depths

@@ -48,7 +48,7 @@ from . import edited_points, further_layers
 from .warming import WarmUpThread
 
 if TYPE_CHECKING:
-    from ..render.incremental_renderer import Stage
+    from ..render.incremental_renderer import IncrementalRenderer
 
 NEEDED = ("numba",)
 
@@ -67,7 +67,7 @@ class Server:
         self._scenes: dict[tuple[str, int, int], Scene] = {}  # by path, time and size of the file; in load order
         self._failed: dict[tuple[str, int, int], str] = {}  # stamp and error of the last unreadable file
         self._points = edited_points.EditedPoints()
-        self._stage: Stage | None = None  # incremental renderer of `_staged`, created with the first picture
+        self._stage: IncrementalRenderer | None = None  # renderer of `_staged`, created with the first image
         self._staged: list[Scene] = []  # the scenes, extended by edited points
         self._numbers: list[int] = []  # scene number of each path of the last load
         self._errors: list[quality.Quality] = []  # known error of each scene
@@ -179,12 +179,12 @@ class Server:
             for k, (scene, known) in enumerate(zip(self._scenes.values(), self._errors, strict=True))
         ]
 
-    def _stage_of(self, scenes: list[Scene]) -> Stage:
-        """Stage of the loaded scenes, which is made again when they change."""
+    def _stage_of(self, scenes: list[Scene]) -> IncrementalRenderer:
+        """Renderer of the loaded scenes, created again when they change."""
         from ..render import incremental_renderer
 
         if self._stage is None or self._staged is not scenes:
-            self._stage, self._staged = incremental_renderer.Stage(scenes), scenes
+            self._stage, self._staged = incremental_renderer.IncrementalRenderer(scenes), scenes
         return self._stage
 
     def _play(self, wanted: messages.RenderRequest, t: float, scene: Scene):
@@ -281,11 +281,11 @@ def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:
         with lock:
             wire.write(answers, header, arrays or {})
 
-    def tell(event: dict[str, Any]) -> None:
+    def send_event(event: dict[str, Any]) -> None:
         with contextlib.suppress(OSError, ValueError):  # the client has closed the stream
             send(event)
 
-    warming = WarmUpThread(tell) if warm else None
+    warming = WarmUpThread(send_event) if warm else None
     server = Server(warming)
     while True:
         number = None

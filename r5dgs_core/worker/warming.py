@@ -14,11 +14,11 @@ class WarmUpThread:
     """Background thread that loads or compiles the rasterizer's kernels.
 
     Args:
-        tell: Called from that thread with an event when compilation starts, and when it is done or has failed.
+        on_event: Called from that thread with an event when compilation starts, and when it is done or has failed.
     """
 
-    def __init__(self, tell: Callable[[dict[str, Any]], None]):
-        self._tell = tell
+    def __init__(self, on_event: Callable[[dict[str, Any]], None]):
+        self._on_event = on_event
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -44,10 +44,10 @@ class WarmUpThread:
         except (ImportError, errors.ConfigError):  # the next render request reports it
             return
         try:
-            with compilation.telling(lambda text: self._tell({"event": "compiling", "text": text})):
+            with compilation.announcing(lambda text: self._on_event({"event": "compiling", "text": text})):
                 over = {"event": "ready", "seconds": round(warm_up.warm_up(gradients=False), 2)}
         except Exception as error:  # the next render request raises the same error; the traceback goes to the log
             traceback.print_exc()
             over = {"event": "failed", "text": f"{type(error).__name__}: {error}"}
         if compilation.compiled():  # every "compiling" event is followed by "ready" or "failed"
-            self._tell(over)
+            self._on_event(over)

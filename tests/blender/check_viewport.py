@@ -48,8 +48,8 @@ def checks(path: str):
         area.tag_redraw()
         yield 0.5
         yield from wait(full_picture, kind)
-        wish, smaller = full_picture()
-        assert smaller == 1 and (wish.camera.width, wish.camera.height) == (region.width, region.height), kind
+        request, smaller = full_picture()
+        assert smaller == 1 and (request.camera.width, request.camera.height) == (region.width, region.height), kind
         print(f"viewport {kind}: {region.width} x {region.height}", flush=True)
 
     region_3d.view_perspective = "PERSP"

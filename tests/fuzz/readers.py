@@ -131,7 +131,7 @@ def scene_reader() -> Reader:
 
     def read(folder: Path) -> None:
         path = folder / "scene.r5dgs"
-        for part in (scene_file.read_meanings, scene_file.is_exact):
+        for part in (scene_file.read_embeddings, scene_file.is_exact):
             with contextlib.suppress(errors.R5dgsError):
                 part(path)
         use_scene(scene_file.read(path), folder / "again.r5dgs")

@@ -89,7 +89,7 @@ def run_demo(
     from ...train import checkpoint, interrupt, run
 
     options.use_threads(threads)
-    go_on = shlex.join(["r5dgs", "demo", "--out", str(out), "--resume"])
+    resume_command = shlex.join(["r5dgs", "demo", "--out", str(out), "--resume"])
     with make(progress_kind) as progress:
         progress.estimate.add(*AFTER)
         trained = run.train(
@@ -98,15 +98,15 @@ def run_demo(
             settings,
             resume=resume,
             overwrite=overwrite or _is_demo(out / checkpoint.RUN_FILE),
-            go_on=go_on,
+            resume_command=resume_command,
             progress=progress,
         )
-        with interrupt.at_once(f"stopped after training; continue with: {go_on}"), folder_lock.hold(out):
+        with interrupt.at_once(f"stopped after training; continue with: {resume_command}"), folder_lock.hold(out):
             scene_path = out / "demo.r5dgs"
             scene, dataset, result = _bake_and_evaluate(trained, data, scene_path, progress)
     if progress_kind != "json":
         terminal.console().print(evaluation_table.make(result))
-    stopped = f"stopped before the contact sheet; continue with: {go_on}"
+    stopped = f"stopped before the contact sheet; continue with: {resume_command}"
     with make(progress_kind) as progress, interrupt.at_once(stopped), folder_lock.hold(out):
         json_path = evaluate.write(result, out / checkpoint.EVALUATION_FILE)
         progress({"event": "sheet", "text": "contact sheet"})

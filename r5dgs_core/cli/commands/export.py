@@ -145,7 +145,7 @@ def object_ids(scene: Scene, words: str) -> frozenset[int]:
     from ...language import query
     from ...search import object_search
 
-    if not object_search.wishes(words):
+    if not object_search.phrases_of(words):
         raise errors.UsageError(f"--objects {words!r}: expected words for the objects to export, such as 'red mug'")
     found = object_search.search(scene, words)
     missing = query.unanswered(scene, words) if found else [words]

@@ -107,7 +107,7 @@ def _find(
     from ...search import object_search
 
     least = object_search.THRESHOLD if threshold is None else threshold
-    if not object_search.wishes(text):
+    if not object_search.phrases_of(text):
         raise errors.UsageError(f"query {text!r}: expected words for the objects to find, such as 'red mug'")
     scene = scene_file.read(path)
     unknown = query.unknown(scene, text)

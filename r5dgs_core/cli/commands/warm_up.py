@@ -44,7 +44,10 @@ def run_warm_up(*, progress_kind: str) -> dict[str, Any]:
     except ImportError as error:
         raise errors.BackendError(f"warm-up: {sys.executable} lacks '{error.name}'; install r5dgs again") from error
 
-    with make(progress_kind) as progress, compilation.telling(lambda text: progress({"event": "notice", "text": text})):
+    with (
+        make(progress_kind) as progress,
+        compilation.announcing(lambda text: progress({"event": "notice", "text": text})),
+    ):
         seconds = warm_up.warm_up(lambda stage: progress({"event": "prepare", "text": stage}))
         folder = compilation.cache_folder()
         compiled = compilation.compiled()

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ...motion import rigid_fit, rotations, se3
-from ...motion_fit import rolling
+from ...motion_fit import backtest
 from ...scene import sh_color
 from ...scene.splats import to_opacities
 from ..observed_motion import GroupTrack, ObservedMotion, PointMotion
@@ -224,7 +224,7 @@ def follows(path: np.ndarray, weights: np.ndarray, leader: np.ndarray, normal: n
         leader: Displacements of the caster. [S, 3]
         normal: Normal of the plane. [3]
     """
-    last = len(leader) - 1 - max(2, round(rolling.HELD_OUT * len(leader)))
+    last = len(leader) - 1 - max(2, round(backtest.HELD_OUT * len(leader)))
     if last < 2 or len(path) == 0:
         return True
     matrix = _follow(path[:, : last + 1], weights, leader[: last + 1] - leader[last], normal)

@@ -70,7 +70,7 @@ def everything(scene, matrix, number=0):
 
 
 def core_color(several, instances, camera, sky=None):
-    return incremental_renderer.Stage(several).render(instances, camera, sky=sky).color
+    return incremental_renderer.IncrementalRenderer(several).render(instances, camera, sky=sky).color
 
 
 def test_two_loaded_scenes_are_both_in_the_picture(blender, picture, load, kitchen):

@@ -78,7 +78,7 @@ def test_nouns_have_their_kinds():
     assert common_nouns.known("the blue crates") == "crate" and common_nouns.known("press ram") is None
     assert len(WORDS) > 500 and list(WORDS) == sorted(set(WORDS))
     assert set(common_nouns.things()) < set(WORDS) and "fruit" not in common_nouns.things()
-    assert all(len(object_search.wishes(word)) == 1 for word in WORDS)
+    assert all(len(object_search.phrases_of(word)) == 1 for word in WORDS)
 
 
 def test_thresholds_let_so_many_false_nouns_pass_as_is_allowed():
@@ -131,8 +131,8 @@ def test_the_table_holds_names_extra_words_and_common_nouns_once():
     scene = named("lemon", "press ram")
     made = build_table.make(scene, Plain(), ["zeppelins", "Lemons", "salt and pepper", "  "]).scene
     assert made.vocabulary[:3] == ("lemon", "press ram", "zeppelins") and "salt and pepper" not in made.vocabulary
-    said = [tuple(object_search.wishes(word)[0]) for word in made.vocabulary]
-    assert len(set(said)) == len(said) and {tuple(object_search.wishes(word)[0]) for word in WORDS} <= set(said)
+    said = [tuple(object_search.phrases_of(word)[0]) for word in made.vocabulary]
+    assert len(set(said)) == len(said) and {tuple(object_search.phrases_of(word)[0]) for word in WORDS} <= set(said)
     np.testing.assert_allclose(np.linalg.norm(made.vocabulary_embeddings, axis=1), 1, atol=1e-3)
     assert made.lookup.pooling == "max" and made.lookup.canonical == encoder_base.CANONICAL
 

@@ -106,7 +106,7 @@ def tell(text):
     told.append(text)
     gc_inside.append(gc.isenabled())
 
-with compilation.telling(tell):
+with compilation.announcing(tell):
     other(1)
     assert not told and compilation.compiled() == 0
     threads = [threading.Thread(target=outer, args=(x,)) for x in (1, 1, 1.0)]

@@ -47,14 +47,14 @@ def assert_shows(theatre, scene, instances, camera, sky=True):
 
 
 def test_playback_shows_every_frame_and_draws_static_objects_once(scene, made):
-    theatre = incremental_renderer.Stage(scene)
+    theatre = incremental_renderer.IncrementalRenderer(scene)
     for t in (0.0, 0.1, 0.2, 0.9, 1.4):
         assert_shows(theatre, scene, group_instances(scene, t), CAMERA)
     assert len(made) == 1
 
 
 def test_another_camera_sky_or_selection_redraws_everything(scene, made):
-    theatre = incremental_renderer.Stage(scene)
+    theatre = incremental_renderer.IncrementalRenderer(scene)
     for t in (0.0, 0.3, 0.5):
         assert_shows(theatre, scene, group_instances(scene, t), CAMERA)
     assert_shows(theatre, scene, group_instances(scene, 0.5), OTHER)
@@ -66,7 +66,7 @@ def test_another_camera_sky_or_selection_redraws_everything(scene, made):
 
 
 def test_instances_that_start_to_move_leave_the_static_layer(scene, made):
-    theatre, instances = incremental_renderer.Stage(scene), group_instances(scene, 0.4)
+    theatre, instances = incremental_renderer.IncrementalRenderer(scene), group_instances(scene, 0.4)
     for moving in ((), (1,), (1, 2), (2,), ()):
         shown = []
         for i, instance in enumerate(instances):
@@ -78,7 +78,7 @@ def test_instances_that_start_to_move_leave_the_static_layer(scene, made):
 
 
 def test_without_static_instances_no_layer_is_cached(scene, made):
-    theatre = incremental_renderer.Stage(scene)
+    theatre = incremental_renderer.IncrementalRenderer(scene)
     for shift in (0.0, 0.1, 0.2):
         matrix = np.eye(4)
         matrix[0, 3] = shift
@@ -92,7 +92,7 @@ def test_bodies_at_equal_depths_keep_their_order_whichever_moves():
     above = scenes.looking_camera((0, 0, 5.0), (0, 0, -1.0), 0.8, 80, 72, up=(0, 1.0, 0))
     instances = group_instances(flat, 1.0)
     instances = [Instance(one.start, one.count, np.eye(4)) for one in instances]
-    theatre = incremental_renderer.Stage(flat)
+    theatre = incremental_renderer.IncrementalRenderer(flat)
     for shift in (0.0, 0.1, 0.2):
         shown = []
         for i, instance in enumerate(instances):
@@ -104,7 +104,7 @@ def test_bodies_at_equal_depths_keep_their_order_whichever_moves():
 
 
 def test_a_bad_instance_is_named_by_the_callers_index(scene):
-    theatre, instances = incremental_renderer.Stage(scene), group_instances(scene, 0.4)
+    theatre, instances = incremental_renderer.IncrementalRenderer(scene), group_instances(scene, 0.4)
     theatre.render(instances, CAMERA)
     theatre.render(group_instances(scene, 0.5), CAMERA)
     last = len(instances) - 1
@@ -134,7 +134,7 @@ def together(pair, t, tint=None):
 
 def test_two_scenes_are_sorted_by_depth_in_one_picture(pair, made):
     lit, plain, world = pair
-    theatre = incremental_renderer.Stage([lit, plain])
+    theatre = incremental_renderer.IncrementalRenderer([lit, plain])
     for t in (0.2, 0.5, 0.8):
         shown = together(pair, t)
         found = theatre.render(shown, CAMERA, sky=incremental_renderer.Sky(1, world))
@@ -172,19 +172,19 @@ def test_a_tint_is_that_of_the_harmonics(degree):
     sh[:, 0] = (tint * (0.5 + c0 * scene.gaussians.sh[:, 0]) - 0.5) / c0
     painted = scene.with_arrays(sh=sh.astype(np.float32))
     n = len(scene.gaussians.means)
-    one = incremental_renderer.Stage(scene).render([Instance(0, n, np.eye(4), tint=tuple(tint))], CAMERA)
-    other = incremental_renderer.Stage(painted).render([Instance(0, n, np.eye(4))], CAMERA)
+    one = incremental_renderer.IncrementalRenderer(scene).render([Instance(0, n, np.eye(4), tint=tuple(tint))], CAMERA)
+    other = incremental_renderer.IncrementalRenderer(painted).render([Instance(0, n, np.eye(4))], CAMERA)
     np.testing.assert_allclose(one.color, other.color, atol=1e-5)
 
 
 def test_owners_are_the_instances_in_front_whichever_of_them_move(pair, made):
-    theatre = incremental_renderer.Stage(pair[:2])
+    theatre = incremental_renderer.IncrementalRenderer(pair[:2])
     shown = [*together(pair, 0.4), *together(pair, 0.4, (1.0, 0.2, 0.2))[:2]]
     for t in (0.4, 0.5, 0.6):
         moved = together(pair, t)
         shown = [*moved[:3], *shown[3:]]
         found = theatre.render(shown, CAMERA)
-        anew = incremental_renderer.Stage(pair[:2]).render(shown, CAMERA)
+        anew = incremental_renderer.IncrementalRenderer(pair[:2]).render(shown, CAMERA)
         assert np.array_equal(found.ids, anew.ids) and np.array_equal(found.color, anew.color)
     assert len(made) >= 1 and found.ids.max() > 2 and found.ids.min() == -1
 
@@ -192,7 +192,7 @@ def test_owners_are_the_instances_in_front_whichever_of_them_move(pair, made):
 def test_another_tint_or_near_limit_is_another_picture(pair):
     lit = pair[0]
     whole, red = Instance(0, 500, np.eye(4)), Instance(0, 500, np.eye(4), tint=(1.0, 0.0, 0.0))
-    theatre = incremental_renderer.Stage(lit)
+    theatre = incremental_renderer.IncrementalRenderer(lit)
     for _ in range(2):
         plain = theatre.render([whole], CAMERA)
     tinted = theatre.render([red], CAMERA, sky=None)
@@ -207,14 +207,14 @@ def test_a_sky_rotates_with_its_world(pair):
     scene = lit.with_arrays(background_sh=sky)
     rigid = matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2), 1.0)
     eye = dataclasses.replace(CAMERA, T_cam_world=CAMERA.T_cam_world @ rigid)
-    found = incremental_renderer.Stage(scene).render([], CAMERA, sky=incremental_renderer.Sky(0, rigid))
+    found = incremental_renderer.IncrementalRenderer(scene).render([], CAMERA, sky=incremental_renderer.Sky(0, rigid))
     np.testing.assert_allclose(found.color, scene_renderer.sky(scene, eye), atol=1e-5)
-    scaled = incremental_renderer.Stage(scene).render([], CAMERA, sky=incremental_renderer.Sky(0, world))
+    scaled = incremental_renderer.IncrementalRenderer(scene).render([], CAMERA, sky=incremental_renderer.Sky(0, world))
     np.testing.assert_allclose(scaled.color, found.color, atol=1e-5)
 
 
 def test_without_any_scene_the_picture_is_black():
-    found = incremental_renderer.Stage([]).render([], CAMERA, sky=None)
+    found = incremental_renderer.IncrementalRenderer([]).render([], CAMERA, sky=None)
     assert np.abs(found.color).max() == 0 and found.ids.max() == -1
 
 
@@ -229,7 +229,7 @@ def test_without_any_scene_the_picture_is_black():
 )
 def test_impossible_instances_of_several_scenes_are_refused(pair, instance, message):
     with pytest.raises(ValueError, match=f"instance 0: .*{message}"):
-        incremental_renderer.Stage(pair[:2]).render([instance], CAMERA)
+        incremental_renderer.IncrementalRenderer(pair[:2]).render([instance], CAMERA)
 
 
 def bent_instances(scene, t):
@@ -252,11 +252,11 @@ def bending(request):
 
 @pytest.mark.parametrize("t", [-0.1, 0.13, 0.4, scenes.T_MAX, 0.9])
 def test_deformed_gaussians_match_playback(bending, t):
-    found = incremental_renderer.Stage(bending).render(bent_instances(bending, t), CAMERA)
+    found = incremental_renderer.IncrementalRenderer(bending).render(bent_instances(bending, t), CAMERA)
     expected = scene_renderer.render_frame(bending, scene_player.frame(bending, t), CAMERA)
     np.testing.assert_allclose(found.color, expected.color, atol=5e-3)  # a cut-off may fall differently
     if 0 < t < scenes.T_MAX:
-        stiff = incremental_renderer.Stage(bending).render(group_instances(bending, t), CAMERA)
+        stiff = incremental_renderer.IncrementalRenderer(bending).render(group_instances(bending, t), CAMERA)
         assert np.abs(stiff.color - expected.color).max() > 0.05
 
 
@@ -266,17 +266,17 @@ def test_deformed_gaussians_in_a_moved_world_give_the_same_image(bending):
         Instance(one.start, one.count, world @ one.matrix, 0, world, t=0.2) for one in bent_instances(bending, 0.2)
     ]
     eye = dataclasses.replace(CAMERA, T_cam_world=CAMERA.T_cam_world @ np.linalg.inv(world))
-    found = incremental_renderer.Stage(bending).render(shown, eye, sky=incremental_renderer.Sky(0, world))
-    expected = incremental_renderer.Stage(bending).render(bent_instances(bending, 0.2), CAMERA)
+    found = incremental_renderer.IncrementalRenderer(bending).render(shown, eye, sky=incremental_renderer.Sky(0, world))
+    expected = incremental_renderer.IncrementalRenderer(bending).render(bent_instances(bending, 0.2), CAMERA)
     np.testing.assert_allclose(found.color, expected.color, atol=5e-3)
 
 
 def test_deforming_gaussians_are_redrawn_and_others_stay_cached(bending, made):
-    theatre = incremental_renderer.Stage(bending)
+    theatre = incremental_renderer.IncrementalRenderer(bending)
     for t in (0.1, 0.2, 0.3):
         shown = [dataclasses.replace(one, matrix=np.eye(4)) for one in bent_instances(bending, t)]
         found = theatre.render(shown, CAMERA)
-        anew = incremental_renderer.Stage(bending).render(shown, CAMERA)
+        anew = incremental_renderer.IncrementalRenderer(bending).render(shown, CAMERA)
         assert np.array_equal(found.color, anew.color) and np.array_equal(found.ids, anew.ids)
 
 
@@ -286,11 +286,11 @@ def test_depths_may_count_from_before_a_far_camera(pair):
     eye = dataclasses.replace(CAMERA, intrinsics=CAMERA.intrinsics @ np.diag([far / 4, far / 4, 1.0]))
     eye = dataclasses.replace(eye, T_cam_world=CAMERA.T_cam_world + np.array([0, 0, 0, far]) * np.eye(4)[2][:, None])
     parts = [Instance(0, 400, np.eye(4)), Instance(400, 100, np.eye(4))]
-    theatre = incremental_renderer.Stage(lit)
+    theatre = incremental_renderer.IncrementalRenderer(lit)
     for shift in (0.0, 0.1, 0.2):
         parts[1].matrix[0, 3] = shift
         found = theatre.render(parts, eye, distance=far)
-        plain = incremental_renderer.Stage(lit).render(parts, eye)
+        plain = incremental_renderer.IncrementalRenderer(lit).render(parts, eye)
         assert np.array_equal(found.color, plain.color) and np.array_equal(found.ids, plain.ids)
         seen = found.alpha > 0
         np.testing.assert_allclose(found.depth[seen], plain.depth[seen] - far, atol=0.02)  # float32 at 1e4

@@ -79,7 +79,7 @@ def test_a_missing_required_feature_is_named_with_its_release(path, tmp_path):
         {"name": "parts", "required": True, "since": "0.10.0"},
     ]
     newer = with_features(path, tmp_path / "newer.r5dgs", listed, origin=[0, 0, 1e7])
-    for reader in (scene_file.read, scene_file.read_meanings, scene_file.is_exact):
+    for reader in (scene_file.read, scene_file.read_embeddings, scene_file.is_exact):
         with pytest.raises(errors.SceneFileError, match=r"'quantised' .*0\.9\.1.*update R5DGS to 0\.10\.0") as caught:
             reader(newer)
         assert "'origin'" not in str(caught.value) and str(newer) in str(caught.value)

@@ -93,7 +93,7 @@ def test_optional_members_may_be_absent_or_present(tmp_path):
 
 
 def test_embeddings_are_read_without_the_other_members(scene, path, tmp_path):
-    assert scene_file.read_meanings(path) is None
+    assert scene_file.read_embeddings(path) is None
     rng = np.random.default_rng(1)
     rich = dataclasses.replace(
         scene.with_arrays(
@@ -102,12 +102,12 @@ def test_embeddings_are_read_without_the_other_members(scene, path, tmp_path):
         ),
         vocabulary=("mug", "fruit"),
     )
-    meanings = scene_file.read_meanings(scene_file.write(rich, tmp_path / "rich.r5dgs"))
+    meanings = scene_file.read_embeddings(scene_file.write(rich, tmp_path / "rich.r5dgs"))
     assert meanings.object_ids == tuple(item.id for item in scene.objects) and meanings.vocabulary == rich.vocabulary
     np.testing.assert_array_equal(meanings.embeddings, rich.embeddings)
     np.testing.assert_array_equal(meanings.vocabulary_embeddings, rich.vocabulary_embeddings)
     with pytest.raises(errors.SceneFileError, match="nothing"):
-        scene_file.read_meanings(tmp_path / "gone.r5dgs")
+        scene_file.read_embeddings(tmp_path / "gone.r5dgs")
 
 
 def test_a_file_keeps_its_near_plane_and_one_without_has_the_default(scene, path, tmp_path):

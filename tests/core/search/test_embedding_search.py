@@ -107,10 +107,10 @@ def test_the_best_view_or_the_mean_of_the_views_decides():
 def test_a_phrase_with_a_name_is_not_searched_by_meaning():
     known = table_of([around(0.9), around(0.95)], [0.5, 0.5])
     labels = [object_search.Label(1, "ball"), object_search.Label(2, "globe")]
-    assert [m.object_id for m in object_search.search_labels(labels, "spheres", meanings=known)] == [2, 1]
+    assert [m.object_id for m in object_search.search_labels(labels, "spheres", embeddings=known)] == [2, 1]
     named = [object_search.Label(1, "ball", ("sphere",)), object_search.Label(2, "globe")]
-    assert [m.object_id for m in object_search.search_labels(named, "sphere", meanings=known)] == [1]
-    both = object_search.search_labels(labels, "ball and a sphere", meanings=known)
+    assert [m.object_id for m in object_search.search_labels(named, "sphere", embeddings=known)] == [1]
+    both = object_search.search_labels(labels, "ball and a sphere", embeddings=known)
     assert [(m.object_id, m.cosine is None) for m in both] == [(1, True), (2, False)]
 
 
@@ -118,10 +118,10 @@ def test_a_known_word_is_neither_a_typo_nor_a_prefix_of_another():
     labels = [object_search.Label(1, "cart"), object_search.Label(2, "racecar")]
     assert {m.object_id for m in object_search.search_labels(labels, "car")} == {1, 2}
     known = dataclasses.replace(table_of([around(0.1), around(0.1)], [0.5, 0.5]), vocabulary=("car",))
-    assert [m.object_id for m in object_search.search_labels(labels, "car", meanings=known)] == [2]
+    assert [m.object_id for m in object_search.search_labels(labels, "car", embeddings=known)] == [2]
     fitting = table_of([around(0.9), around(0.1)], [0.5, 0.5])
     fitting = dataclasses.replace(fitting, vocabulary=("car",))
-    assert {m.object_id for m in object_search.search_labels(labels, "car", meanings=fitting)} == {1, 2}
+    assert {m.object_id for m in object_search.search_labels(labels, "car", embeddings=fitting)} == {1, 2}
 
 
 def test_the_encoder_embeds_only_words_that_are_neither_names_nor_stored():
@@ -133,9 +133,9 @@ def test_the_encoder_embeds_only_words_that_are_neither_names_nor_stored():
         asked.append(phrase)
         return np.eye(4)[0]
 
-    found = object_search.search_labels(labels, "desk, sphere and something to throw", meanings=known, embed=embed)
+    found = object_search.search_labels(labels, "desk, sphere and something to throw", embeddings=known, embed=embed)
     assert asked == ["something to throw"] and [m.object_id for m in found] == [2, 1]
-    (meant,) = object_search.search_labels(labels, "something to throw", meanings=known, embed=embed)
+    (meant,) = object_search.search_labels(labels, "something to throw", embeddings=known, embed=embed)
     assert "something to throw" in meant.why and meant.relevancy > 0.9 and meant.cosine == pytest.approx(0.9)
     assert object_search.unknown(labels, "desk, sphere and something to throw", known) == ["something to throw"]
     assert object_search.unknown(labels, "desk and sphere", None) == ["sphere"]
@@ -186,7 +186,7 @@ def test_a_file_keeps_the_table(rich, tmp_path):
     assert back.lookup == rich.lookup
     for name in ("embeddings", "view_embeddings", "canonical_embeddings", "vocabulary_embeddings"):
         np.testing.assert_array_equal(getattr(back, name), getattr(rich, name))
-    light = scene_file.read_meanings(path)
+    light = scene_file.read_embeddings(path)
     assert light.table == rich.lookup
     np.testing.assert_array_equal(light.view_embeddings, rich.view_embeddings)
     assert scene_info.info(back)["lookup"] == "clip tiny"

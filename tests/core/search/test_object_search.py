@@ -270,15 +270,15 @@ def test_numbers_are_ignored_unless_they_are_part_of_a_name():
         object_search.Label(2, "mug two"),
         object_search.Label(3, "two towers"),
     ]
-    assert object_search.wishes("the two fruits and some mugs") == [["fruit"], ["mug"]]
+    assert object_search.phrases_of("the two fruits and some mugs") == [["fruit"], ["mug"]]
     assert [m.object_id for m in object_search.search_labels(labels, "mug two")][0] == 2
     assert [m.object_id for m in object_search.search_labels(labels, "two towers")] == [3]
     assert [m.object_id for m in object_search.search_labels(labels, "two mugs")] == [1, 2]
 
 
 def test_embeddings_match_after_labels_were_renamed():
-    meanings = stored_embeddings.StoredEmbeddings((1, 2), np.eye(2), ("sphere",), np.array([[1.0, 0.0]]))
+    embeddings = stored_embeddings.StoredEmbeddings((1, 2), np.eye(2), ("sphere",), np.array([[1.0, 0.0]]))
     labels = [object_search.Label(1, "planet"), object_search.Label(2, "desk")]
-    assert [m.object_id for m in object_search.search_labels(labels, "spheres", meanings=meanings)] == [1]
-    assert object_search.search_labels(labels[1:], "spheres", meanings=meanings) == []
-    assert object_search.search_labels(labels, "spheres", 0.96, meanings) == []
+    assert [m.object_id for m in object_search.search_labels(labels, "spheres", embeddings=embeddings)] == [1]
+    assert object_search.search_labels(labels[1:], "spheres", embeddings=embeddings) == []
+    assert object_search.search_labels(labels, "spheres", 0.96, embeddings) == []

@@ -105,7 +105,7 @@ def test_scenes_loaded_together_are_in_one_picture(path, tmp_path):
     request = {"command": "render", "camera": CAMERA_JSON, "instances": entries, "want": ["depth", "alpha", "owners"]}
     request["sky"] = {"scene": 1, "matrix": world.tolist()}
     both = [scene_file.read(path), scene_file.read(other)]
-    expected = incremental_renderer.Stage(both).render(
+    expected = incremental_renderer.IncrementalRenderer(both).render(
         [Instance(20, 60, world, 1, world, (0.5, 1.0, 2.0)), Instance(0, 200, np.eye(4))],
         CAMERA,
         sky=incremental_renderer.Sky(1, world),
@@ -254,7 +254,7 @@ def test_the_rasterizer_is_compiled_on_request():
 def test_an_announced_warm_up_that_fails_reports_the_reason(monkeypatch, capsys, compiled):
     def fail(gradients):
         if compiled:
-            compilation._watch.tell(compilation.NOTICE)
+            compilation._watch.announce(compilation.NOTICE)
         raise OSError("no space left")
 
     monkeypatch.setattr(warm_up, "warm_up", fail)

@@ -1,4 +1,4 @@
-"""Predictions of the last observed poses from earlier ones, as a test of a motion law."""
+"""Backtest of a motion law: predictions of the last observed poses from a fit to the earlier ones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FEWEST = 8  # minimum number of poses of a track for this test
 _MOST_SQUARE = 600.0  # maximum squared prediction error, in variances
 
 
-def misses(chosen: Solution, track: PoseTrack, noise: Noise, variance: float) -> float:
+def relative_error(chosen: Solution, track: PoseTrack, noise: Noise, variance: float) -> float:
     """Mean squared error, relative to its expectation, of predictions by the law refitted to earlier poses.
 
     The expected squared error is the variance of the noise plus that of the refitted prediction, both in units of
