@@ -23,7 +23,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one process per core, so each gets on
 
 BPY_PYTHON = (3, 11)
 STATUS = pytest.StashKey[int]()
-NOT_QUICK = ("blender", "heavy", "slow", "gpu", "browser", "cluster")
+NOT_QUICK = ("blender", "heavy", "slow", "nightly", "gpu", "browser", "cluster")
 
 # Files in the order in which two processes take them: the first one compiles kernels in test_warm_up.
 FIRST_FILES = ("test_warm_up.py", "test_breaks.py", "test_compilation.py", "test_model_selection.py")
@@ -44,7 +44,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add options for `--quick` and for the number of random draws."""
     group = parser.getgroup("r5dgs")
     group.addoption("--bit-flips", type=int, default=200, metavar="N", help="flipped bits of each checkpoint")
-    group.addoption("--kills", type=int, default=30, metavar="N", help="killed runs of the slow test")
+    group.addoption("--kills", type=int, default=30, metavar="N", help="killed runs of the nightly test")
     left_out = f"leave out tests marked {', '.join(NOT_QUICK)}, whatever -m chooses"
     group.addoption("--quick", action="store_true", help=left_out)
 
@@ -55,12 +55,24 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.loadscopereorder = False
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_itemcollected(item: pytest.Item) -> None:
-    """Mark the cases of a test as slow that its marker `default_cases` does not name."""
-    marker = item.get_closest_marker("default_cases")
-    if marker is not None and item.callspec.id not in marker.args:
-        item.add_marker("slow")
+@pytest.hookimpl(wrapper=True)
+def pytest_pycollect_makeitem(collector: pytest.Collector) -> object:
+    """Mark the cases of a test as slow that its marker `default_cases` does not name.
+
+    Raises:
+        pytest.Collector.CollectError: The marker names a case that does not exist.
+    """
+    made = yield
+    for item in made if isinstance(made, list) else ():
+        marker = item.get_closest_marker("default_cases")
+        if marker is None:
+            continue
+        unknown = set(marker.args) - {other.callspec.id for other in made}
+        if unknown:
+            raise collector.CollectError(f"{item.originalname}: default_cases names unknown cases: {sorted(unknown)}")
+        if item.callspec.id not in marker.args:
+            item.add_marker("slow")
+    return made
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

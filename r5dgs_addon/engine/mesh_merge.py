@@ -92,6 +92,7 @@ def _share_objects(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
         meshes.collection.children.link(child)
     for obj in scene.collection.objects:
         meshes.collection.objects.link(obj)
+    meshes.view_layers[0].update()  # Blender 5.2 creates the layer collections of linked collections here
     _share_visibility(scene.view_layers[0].layer_collection, meshes.view_layers[0].layer_collection)
 
 

@@ -56,7 +56,7 @@ def figures(tree):
     return [tree] if isinstance(tree, float | int) else [number for part in parts for number in figures(part)]
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in LONG)) for n in PROGRAMS])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in LONG)) for n in PROGRAMS])
 def test_a_benchmark_prints_a_table_and_writes_finite_figures(name, tiny, trained, tmp_path, monkeypatch, capsys):
     encoder = tmp_path / "encoder"
     if name == "words":

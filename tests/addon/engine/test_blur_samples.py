@@ -126,6 +126,8 @@ def test_passes_of_data_are_sharp(blender, view, tmp_path):
         view.data.dof.use_dof = settings.use_motion_blur = used
         view.data.dof.aperture_fstop, settings.motion_blur_shutter = 0.01, 4.0
         settings.filepath = str(tmp_path / f"{used}.exr")
+        if hasattr(settings.image_settings, "media_type"):  # Blender 5
+            settings.image_settings.media_type = "MULTI_LAYER_IMAGE"
         settings.image_settings.file_format = "OPEN_EXR_MULTILAYER"
         assert blender.ops.render.render(write_still=True) == {"FINISHED"}
         found.append(pictures.read_exr(settings.filepath))

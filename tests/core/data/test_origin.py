@@ -143,7 +143,7 @@ def near(tiny, tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.default_cases("1000000000000.0-shift2")
 @pytest.mark.parametrize(
-    ("scale", "shift"), [(1.0, 20 * FAR), pytest.param(1e-12, HERE, marks=pytest.mark.slow), (1e12, HERE)]
+    ("scale", "shift"), [(1.0, 20 * FAR), pytest.param(1e-12, HERE, marks=pytest.mark.nightly), (1e12, HERE)]
 )
 def test_training_gives_the_same_pictures_in_any_world(tiny, near, tmp_path, scale, shift):
     data = made(tmp_path / "data", scale, shift)

@@ -167,7 +167,7 @@ def test_points_of_a_reconstruction_are_not_judged_by_unknown_pixels(tiny, seen)
     assert 0 < len(kept[0]) < len(points)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_with_unknown_masks_learns_nearly_the_same_as_with_all_masks(tiny, tmp_path):
     """The ball is missing in two of three masks, which costs little if marked unknown, else most of its mIoU."""
     found = {}

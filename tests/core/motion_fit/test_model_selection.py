@@ -402,7 +402,7 @@ NOISE = 0.005 * SIZE, np.radians(1) / 3**0.5
 STUDIED = [name for name in MOTIONS if name not in ("pendulum", "spring", "screw")]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_over_many_seeds_the_right_family_is_chosen_and_costs_little():
     rng, right, ratios = np.random.default_rng(30), [], []
     for name in STUDIED:
@@ -420,7 +420,7 @@ def test_over_many_seeds_the_right_family_is_chosen_and_costs_little():
     assert np.exp(np.mean(np.log(ratios))) <= 1.3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_over_many_seeds_stops_are_found_and_slow_movers_move():
     rng, stopped, frozen = np.random.default_rng(31), [], []
     for _ in range(40):
@@ -438,7 +438,7 @@ def test_over_many_seeds_stops_are_found_and_slow_movers_move():
     assert np.mean(frozen) <= 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("correlation", [0.0, 0.5])
 def test_over_many_seeds_the_band_holds_the_true_error(correlation):
     rng, inside = np.random.default_rng(32), []
@@ -452,7 +452,7 @@ def test_over_many_seeds_the_band_holds_the_true_error(correlation):
     assert np.mean(inside) >= 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_over_many_seeds_an_outlier_costs_little():
     rng, clean, dirty = np.random.default_rng(33), [], []
     for name in ("uniform", "ballistic", "spin", "hinge", "rolling", "ballistic, spinning"):

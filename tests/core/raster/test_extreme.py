@@ -27,7 +27,7 @@ LARGE_IMAGES = (  # seconds to a minute of the reference
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LARGE_IMAGES)) for name in extreme_scenes.CASES]
+    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name in LARGE_IMAGES)) for name in extreme_scenes.CASES]
 )
 def test_backends_agree_within_bounds_and_stay_finite(name):
     case = extreme_scenes.CASES[name]()

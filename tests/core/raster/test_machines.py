@@ -19,7 +19,7 @@ for n_channels in (3, 19):
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="these are kinds of x86")
 @pytest.mark.parametrize("kind", ["haswell", "x86-64-v2"])
 def test_machines_with_shorter_vectors_draw_as_the_reference_does(kind, tmp_path):

@@ -53,7 +53,7 @@ def case(measure, tolerance=1.0, trace_rk2=None):
     return stability_cases.Case("topic", "name", "method", "quantity", tolerance, "source", measure, trace_rk2)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_case_of_millions_of_frames_passes():
     assert LONG and not failed(LONG)
 

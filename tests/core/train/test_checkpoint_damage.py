@@ -2,7 +2,7 @@
 
 More flips and kills than a plain run makes:
 
-    pytest tests/core/train/test_checkpoint_damage.py -m "slow or not slow" --bit-flips 1000 --kills 30
+    pytest tests/core/train/test_checkpoint_damage.py -m "nightly or not nightly" --bit-flips 1000 --kills 30
 """
 
 import dataclasses
@@ -242,7 +242,7 @@ def test_a_state_that_does_not_fit_the_run_is_named_on_resuming(tiny, reference,
         run.train(tiny.root, tmp_path, tiny_datasets.settings(*OVERRIDES), resume=True)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_runs_killed_at_random_moments_resume_to_the_same_bits(tiny, reference, tmp_path, pytestconfig):
     draw = random.Random(11)
     options = [text for override in (*tiny_datasets.SETTINGS, *OVERRIDES) for text in ("--set", override)]

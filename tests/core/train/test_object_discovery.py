@@ -38,7 +38,7 @@ def overlap(found, truth, a, b):
     return inside / sum(((f == a) | (t == b)).sum() for f, t in zip(found, truth, strict=True))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_moving_objects_are_found_and_separated(unmasked, tiny):
     config = tiny_datasets.settings("discovery.iterations=1000", "densify.stop=0.6")
     events = []
@@ -167,7 +167,7 @@ def test_a_field_is_clustered_only_without_other_groups(unmasked, tiny):
         assert not training_needs.sorting(data, tiny_datasets.settings(field, off))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_parts_of_a_field_are_the_objects(unmasked, tiny, tmp_path):
     config = tiny_datasets.settings(
         "train.representation='field'", "field.size='small'", "train.iterations=1000", "densify.stop=0.6"
