@@ -115,7 +115,7 @@ def test_an_object_that_was_missed_gets_its_pixels_back(scene_path, tiny, tmp_pa
     for view, true in zip(datasets.read(tiny.root, str(out)).train, data.train, strict=True):
         new, ids = datasets.load_mask(view), datasets.load_mask(true)
         if view.name == "train/r_008":
-            assert ((new == 1) & (ids == 1)).sum() > 0.7 * ((new == 1) | (ids == 1)).sum() > 0
+            assert ((new == 1) & (ids == 1)).sum() > 0.6 * ((new == 1) | (ids == 1)).sum() > 0
             assert (new[ids == 2] == 2).all()
         else:
             np.testing.assert_array_equal(new, ids)
