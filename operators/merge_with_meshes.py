@@ -4,7 +4,7 @@ import bpy
 from bpy.props import EnumProperty
 
 from ..r5dgs_addon import compat
-from ..r5dgs_addon.engine import engine, mesh_merge
+from ..r5dgs_addon.engine import engine, mesh_merge, mesh_shadows
 from ..r5dgs_addon.scene import polls
 
 ENGINES = (
@@ -25,6 +25,7 @@ class R5DGS_OT_merge_with_meshes(polls.NeedsScene, bpy.types.Operator):
     def execute(self, context):
         scene = context.scene
         if mesh_merge.of(scene) is not None:
+            mesh_shadows.remove(scene)
             mesh_merge.remove(scene)
         scene.render.engine = engine.ENGINE
         meshes = mesh_merge.add(scene, self.engine)

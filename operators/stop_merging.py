@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..r5dgs_addon.engine import mesh_merge
+from ..r5dgs_addon.engine import mesh_merge, mesh_shadows
 
 
 class R5DGS_OT_stop_merging(bpy.types.Operator):
@@ -20,6 +20,7 @@ class R5DGS_OT_stop_merging(bpy.types.Operator):
         return True
 
     def execute(self, context):
+        mesh_shadows.remove(context.scene)
         mesh_merge.remove(context.scene)
         return {"FINISHED"}
 

@@ -250,3 +250,18 @@ def alpha_over(tree: bpy.types.NodeTree, background, foreground) -> bpy.types.No
     tree.links.new(background, pictures[0])
     tree.links.new(foreground, pictures[1])
     return node.outputs[0]
+
+
+def multiply(tree: bpy.types.NodeTree, image, factor) -> bpy.types.NodeSocket:
+    """Add a node that multiplies the colours of an image and keeps its alpha; returns its output."""
+    if hasattr(bpy.types, "CompositorNodeMixRGB"):
+        node = tree.nodes.new("CompositorNodeMixRGB")
+    else:  # from 5.0 on
+        node = tree.nodes.new("ShaderNodeMix")
+        node.data_type = "RGBA"
+    node.blend_type = "MULTIPLY"
+    colors = [socket for socket in node.inputs if socket.type == "RGBA"]
+    next(socket for socket in node.inputs if socket.type == "VALUE" and socket.enabled).default_value = 1.0
+    tree.links.new(image, colors[0])
+    tree.links.new(factor, colors[1])
+    return next(socket for socket in node.outputs if socket.type == "RGBA")

@@ -54,6 +54,7 @@ ALLOWED = {
     "folder_lock": set(),
     "scene": {"motion"},
     "color": {"scene"},
+    "shapes": {"motion", "scene"},
     "data": {"motion", "scene", "color"},
     "raster": {"motion", "scene"},
     "search": {"scene"},
@@ -176,7 +177,18 @@ ADDON_ALLOWED = {
     "panels": {"ui", "scene", "color", "worker", "engine", "splats", "language", "motion", "clean_up"},
     "capture": {"ui", "export"},
 }
-LIGHT = GROUND | {"motion", "scene", "color", "formats", "playback", "editing", "search", "protocol", "user_settings"}
+LIGHT = GROUND | {
+    "motion",
+    "scene",
+    "color",
+    "formats",
+    "playback",
+    "editing",
+    "search",
+    "protocol",
+    "shapes",
+    "user_settings",
+}
 # The extension holds these rooms only: those of Blender itself, and those of the worker.
 PICTURE = LIGHT | {"data", "raster", "render", "language", "worker"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}

@@ -2,10 +2,11 @@
 
 F12 of the scene with the Gaussians renders both scenes, as its compositor uses both. The merged picture is
 
-    coverage * (front + visible * meshes) + (1 - coverage) * Gaussians
+    coverage * (shadows * front + visible * meshes) + (1 - coverage) * shadows * Gaussians
 
-with the anti-aliased coverage of the meshes, their straight colours, and the pass `render_passes.FRONT`: the Gaussians
-in front of the meshes, premultiplied, and the visible share of the meshes behind them.
+with the anti-aliased coverage of the meshes, their straight colours, the pass `render_passes.FRONT`: the Gaussians in
+front of the meshes, premultiplied, and the visible share of the meshes behind them; and the shadows of the meshes on
+the Gaussians, 1 without `mesh_shadows`.
 """
 
 import bpy
@@ -16,6 +17,10 @@ from . import render_passes, visible_meshes
 
 NAME = "R5DGS Merge"
 SAMPLES = 128  # of Cycles, in a new scene
+_INPUTS = (  # of the node group
+    *(("Gaussians", "Color"), ("Front", "Color"), ("Shadows", "Color")),
+    *(("Meshes", "Color"), ("Coverage", "Float")),
+)
 _SHARED = (
     *("resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y", "use_border"),
     *("border_min_x", "border_max_x", "border_min_y", "border_max_y", "use_crop_to_border", "fps", "fps_base"),
@@ -59,7 +64,9 @@ def remove(scene: bpy.types.Scene) -> None:
     for group in [one for one in bpy.data.node_groups if one.name.startswith(NAME) and not one.users]:
         bpy.data.node_groups.remove(group)
     if meshes is not None:
+        own = [one for one in meshes.collection.children if one.name.startswith(NAME)]
         compat.remove_scene(meshes)
+        bpy.data.batch_remove(own)
 
 
 def share_settings(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
@@ -87,23 +94,28 @@ def notes(scene: bpy.types.Scene) -> list[str]:
 
 
 def _share_objects(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
-    """Link the collections and objects of a scene to another, and exclude the same collections and R5DGS scenes."""
+    """Link the collections and objects of a scene to another, and exclude the same collections and R5DGS scenes.
+
+    Objects of the top level go to a new collection, because only collections can be hidden from cameras in a layer.
+    """
     for child in scene.collection.children:
         meshes.collection.children.link(child)
+    top = bpy.data.collections.new(f"{NAME} Objects")
     for obj in scene.collection.objects:
-        meshes.collection.objects.link(obj)
+        top.objects.link(obj)
+    meshes.collection.children.link(top)
     meshes.view_layers[0].update()  # Blender 5.2 creates the layer collections of linked collections here
-    _share_visibility(scene.view_layers[0].layer_collection, meshes.view_layers[0].layer_collection)
+    share_visibility(scene.view_layers[0].layer_collection, meshes.view_layers[0].layer_collection)
 
 
-def _share_visibility(source: bpy.types.LayerCollection, target: bpy.types.LayerCollection) -> None:
-    """Exclude loaded R5DGS scenes, and copy the visibility of all other collections."""
-    for given, layer in zip(source.children, target.children, strict=True):
+def share_visibility(source: bpy.types.LayerCollection, target: bpy.types.LayerCollection) -> None:
+    """Exclude loaded R5DGS scenes, and copy the visibility of all other collections of ``source``."""
+    for given, layer in zip(source.children, target.children, strict=False):  # only the target has its own objects
         if given.exclude or layer.collection.r5dgs.is_scene:
             layer.exclude = True
         else:
             layer.holdout, layer.indirect_only = given.holdout, given.indirect_only
-            _share_visibility(given, layer)
+            share_visibility(given, layer)
 
 
 def _add_nodes(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> None:
@@ -146,19 +158,21 @@ def _merge_group() -> bpy.types.NodeTree:
     as its alpha.
     """
     group = bpy.data.node_groups.new(NAME, "CompositorNodeTree")
-    for name, kind in (("Gaussians", "Color"), ("Front", "Color"), ("Meshes", "Color"), ("Coverage", "Float")):
+    for name, kind in _INPUTS:
         group.interface.new_socket(name, in_out="INPUT", socket_type=f"NodeSocket{kind}")
+    group.interface.items_tree["Shadows"].default_value = (1.0, 1.0, 1.0, 1.0)
     group.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
     given, result = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
     images = given.outputs
+    gaussians, front = (compat.multiply(group, images[name], images["Shadows"]) for name in ("Gaussians", "Front"))
     visible = group.nodes.new("CompositorNodeSeparateColor")
     group.links.new(images["Front"], visible.inputs[0])
-    covered = compat.set_alpha(group, "APPLY", images["Front"], images["Coverage"])
+    covered = compat.set_alpha(group, "APPLY", front, images["Coverage"])
     added = compat.set_alpha(group, "REPLACE_ALPHA", covered, None)
     behind = compat.set_alpha(group, "APPLY", images["Meshes"], visible.outputs["Alpha"])
     both = compat.alpha_over(group, behind, added)
     foreground = compat.set_alpha(group, "REPLACE_ALPHA", both, images["Coverage"])
-    group.links.new(compat.alpha_over(group, images["Gaussians"], foreground), result.inputs[0])
+    group.links.new(compat.alpha_over(group, gaussians, foreground), result.inputs[0])
     for place, node in enumerate(group.nodes):
         node.location = (180 * place - 700, 0)
     given.location, result.location = (-1000, 0), (180 * len(group.nodes) - 700, 0)

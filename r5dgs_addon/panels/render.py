@@ -90,6 +90,7 @@ class R5DGS_PT_merge(_OfEngine, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("r5dgs.merge_with_meshes", text="Merge Again", icon="FILE_REFRESH").engine = meshes.render.engine
         row.operator("r5dgs.stop_merging", icon="X")
+        layout.operator("r5dgs.add_shadows", icon="SHADING_RENDERED")
 
 
 class R5DGS_PT_passes(_OfEngine, bpy.types.Panel):

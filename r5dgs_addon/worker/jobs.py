@@ -37,7 +37,7 @@ class Job:
         self.dropped = False  # True if the job was dropped before it started
         self._step = "waiting for the worker"
         self._started = time.monotonic()
-        self._answer: Answer | None = None
+        self._answers: list[Answer] = []  # of the steps that have ended
         self._error: BaseException | None = None
         self._begun = self._ended = False
         self._ending = threading.Event()
@@ -78,14 +78,17 @@ class Job:
 
     def answer(self) -> Answer:
         """Wait for the result and arrays of the last step. Re-raises its error; BackendError if the job was dropped."""
+        return self.answers()[-1]
+
+    def answers(self) -> list[Answer]:
+        """Wait for the results and arrays of all steps. Raises as `answer` does."""
         self.join()
         preferences.keep_found()
         if self.dropped:
             raise errors.BackendError("worker: the job was dropped before it started")
         if self._error is not None:
             raise self._error
-        assert self._answer is not None
-        return self._answer
+        return self._answers
 
     def _end(self) -> None:
         """Stop the worker until the job has ended. The job may just be starting one, or searching for its Python."""
@@ -112,7 +115,7 @@ class Job:
                 running = _running(self.python)
                 running.greet(choice.timeout_s)
                 for self._step, command, arguments in steps:
-                    self._answer = running.request(command, choice.timeout_s, **arguments)
+                    self._answers.append(running.request(command, choice.timeout_s, **arguments))
             except BaseException as error:  # re-raised by `answer`
                 self._error = error
             finally:  # set before the lock is released, because the thread itself may take a moment longer

@@ -110,7 +110,7 @@ def test_a_fast_body_is_not_lost_as_times_enter(tmp_path, monkeypatch):
         true = np.stack([fast.turn(BRICK, t) for t in made.times])
         frame = rotations.multiply(rotations.conjugate(quats(made, BRICK)[made.first_time]), true[made.first_time])
         errors[wanted] = off(made, BRICK, rotations.multiply(true, rotations.conjugate(frame))).max()
-    assert errors["true"] < 0.5 * errors["false"]
+    assert errors["true"] < 0.7 * errors["false"]
 
 
 def test_poses_are_repaired_only_if_asked_for(tiny):
