@@ -392,23 +392,26 @@ def combine_by_depth(first: bpy.types.Scene, second: bpy.types.Scene) -> None:
 
 
 def selecting(path: Path, folder: Path):
-    """A drag with the tool *Brush Gaussians* selects Gaussians in one undo step."""
+    """Drags with the tools *Brush Gaussians* and *Lasso Gaussians* select Gaussians in one undo step each."""
     points, region = w.service("clean_up.selected_points"), w.region_of(w.area_of("VIEW_3D"))
+    path = [(x * region.width, y * region.height) for x, y in ((0.3, 0.7), (0.6, 0.2), (0.7, 0.6))]
     with w.inside():
         bpy.ops.view3d.view_all()
-        bpy.ops.ed.undo_push(message="View")
-        bpy.ops.wm.tool_set_by_id(name="r5dgs.brush_tool")
-    yield 1.0
-    yield from w.drag(region, (0.3 * region.width, 0.7 * region.height), (0.6 * region.width, 0.2 * region.height))
-    count = points.count(loaded()[0])
-    assert count > 0, "the brush selected nothing"
-    yield from w.press("ctrl+z")
-    assert points.count(loaded()[0]) == 0, "Ctrl+Z left a selection"
-    yield from w.press("ctrl+shift+z")
-    assert points.count(loaded()[0]) == count, "Ctrl+Shift+Z did not bring the selection back"
-    with w.inside():
-        bpy.ops.wm.tool_set_by_id(name="builtin.select_box")
-        bpy.ops.r5dgs.select_gaussians(action="NONE")
+    for tool in ("brush", "lasso"):
+        with w.inside():
+            bpy.ops.ed.undo_push(message="View")
+            bpy.ops.wm.tool_set_by_id(name=f"r5dgs.{tool}_tool")
+        yield 1.0
+        yield from w.drag(region, *path)
+        count = points.count(loaded()[0])
+        assert count > 0, f"the {tool} selected nothing"
+        yield from w.press("ctrl+z")
+        assert points.count(loaded()[0]) == 0, f"{tool}: Ctrl+Z left a selection"
+        yield from w.press("ctrl+shift+z")
+        assert points.count(loaded()[0]) == count, f"{tool}: Ctrl+Shift+Z did not bring the selection back"
+        with w.inside():
+            bpy.ops.wm.tool_set_by_id(name="builtin.select_box")
+            bpy.ops.r5dgs.select_gaussians(action="NONE")
 
 
 CHECKS = (

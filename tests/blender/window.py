@@ -93,12 +93,13 @@ def click() -> Iterator[float]:
     yield KEY_S
 
 
-def drag(region: bpy.types.Region, start: tuple[float, float], end: tuple[float, float]) -> Iterator[float]:
-    """Drag with the left button between two pixels of a region."""
-    yield from hover(region, *start)
+def drag(region: bpy.types.Region, *path: tuple[float, float]) -> Iterator[float]:
+    """Drag with the left button along pixels of a region."""
+    yield from hover(region, *path[0])
     _xdotool("mousedown", 1)
     yield KEY_S
-    yield from hover(region, *end)
+    for corner in path[1:]:
+        yield from hover(region, *corner)
     _xdotool("mouseup", 1)
     yield KEY_S
 
