@@ -163,6 +163,7 @@ WITHOUT_A_SCENE = {
     "Select the objects to change": ("replace_motion",),
     "Nothing is isolated": ("unisolate",),
     "Live preview needs a window": ("live_preview",),
+    "Merge with meshes by Cycles first": ("add_shadows",),
     "Nothing is merged with this scene": ("stop_merging",),
     "Use this in a 3D view": ("brush_gaussians", "lasso_gaussians"),
 }  # fmt: skip
