@@ -26,29 +26,40 @@ class R5DGS_PT_prompt(sidebar.WithScene, bpy.types.Panel):
 
     bl_idname = "R5DGS_PT_prompt"
     bl_label = "Select by Prompt"
+
+    def draw(self, context):
+        layout, session = self.layout, context.window_manager.r5dgs_words
+        row = layout.row(align=True)
+        row.prop(session, "prompt", text="", icon="VIEWZOOM", placeholder="Words, such as red mug")
+        row.menu("R5DGS_MT_prompts", text="", icon="TIME")
+        row = layout.row(align=True)
+        for mode, text in (("SET", "Select"), ("ADD", "Add"), ("SUBTRACT", "Subtract")):
+            action = row.operator("r5dgs.select_by_prompt", text=text)
+            action.mode = mode
+            action.text = session.prompt
+        if session.asked:
+            _draw_answers(layout.box().column(align=True), session, _current_names(session))
+
+
+class R5DGS_PT_prompt_options(sidebar.WithScene, bpy.types.Panel):
+    """Threshold and scenes of the search, and isolation of its matches."""
+
+    bl_idname = "R5DGS_PT_prompt_options"
+    bl_parent_id = "R5DGS_PT_prompt"
+    bl_label = "Search Options"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context):
         layout = self.layout
         session, settings = context.window_manager.r5dgs_words, context.scene.r5dgs_words
         row = layout.row(align=True)
-        row.prop(session, "prompt", text="", icon="VIEWZOOM", placeholder="Words, such as red mug")
-        row.menu("R5DGS_MT_prompts", text="", icon="TIME")
-        row = layout.row(align=True)
         row.prop(settings, "threshold", slider=True)
         if len(selection.scenes(context)) > 1:
             row.prop(settings, "all_scenes", toggle=True)
         row = layout.row(align=True)
-        for mode, text in (("SET", "Select"), ("ADD", "Add"), ("SUBTRACT", "Subtract")):
-            action = row.operator("r5dgs.select_by_prompt", text=text)
-            action.mode = mode
-            action.text = session.prompt
-        row = layout.row(align=True)
         row.operator("r5dgs.isolate", text="Isolate Matches", icon="HIDE_ON").text = session.prompt
         if isolation.is_isolated(context.scene):
             row.operator("r5dgs.unisolate", icon="HIDE_OFF")
-        if session.asked:
-            _draw_answers(layout.box().column(align=True), session, _current_names(session))
 
 
 def _draw_answers(box, session, names):
@@ -85,4 +96,4 @@ def _current_names(session) -> dict[tuple[str, int], str]:
     }
 
 
-CLASSES = (R5DGS_MT_prompts, R5DGS_PT_prompt)
+CLASSES = (R5DGS_MT_prompts, R5DGS_PT_prompt, R5DGS_PT_prompt_options)

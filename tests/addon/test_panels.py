@@ -183,4 +183,4 @@ def test_panels_are_in_the_order_of_tasks_and_only_the_first_ones_are_open(exten
     ]
     closed = {one for one in sidebar if "DEFAULT_CLOSED" in getattr(one, "bl_options", ())}
     assert {one for one in sidebar if hasattr(one, "bl_parent_id")} <= closed
-    assert [one.bl_label for one in sidebar if one not in closed] == ["Scene", "Objects", "Motion"]
+    assert [one.bl_label for one in sidebar if one not in closed] == ["Scene", "Objects", "Select by Prompt"]
