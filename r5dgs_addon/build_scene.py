@@ -169,23 +169,32 @@ def _check_size(scene: Scene, path: Path) -> None:
 def _objects(
     collection: bpy.types.Collection, root: bpy.types.Object, scene: Scene, sh_degree: int
 ) -> dict[tuple[int, int], bpy.types.Object]:
-    """Create the collections of the objects with their anchors and point clouds. Returns the anchors."""
+    """Create the collections of the objects with their anchors and point clouds. Returns the anchors.
+
+    The collection of an object holds its largest point cloud with its anchor. Point clouds that another motion moves,
+    and shadows with their anchors, go into a collection inside it.
+    """
     parts, extent = ranges(scene), scene.extent
     largest: dict[int, Range] = {}
     for part in parts:
         largest[part.object_id] = max(largest.get(part.object_id, part), part, key=lambda own: own.count)
     material = point_clouds.material(object_names.fit(f"R5DGS {scene.name}"))
-    children = {}
-    for object_id in sorted({part.object_id for part in parts}):
-        children[object_id] = bpy.data.collections.new(object_names.fit(object_name(scene, object_id)))
-        collection.children.link(children[object_id])
+    children: dict[tuple[int, bool], bpy.types.Collection] = {}
+    for part in sorted(parts, key=lambda own: (own.object_id, own != largest[own.object_id])):
+        key, name = (part.object_id, part == largest[part.object_id]), object_name(scene, part.object_id)
+        if key not in children:
+            above = collection if key[1] else children[part.object_id, True]
+            children[key] = bpy.data.collections.new(object_names.fit(name if key[1] else name + object_names.FRINGE))
+            above.children.link(children[key])
     anchors = {}
     for part in homes(scene, parts):
-        anchors[_anchor_key(part)] = _anchor(children[part.object_id], root, scene, part, largest, extent)
+        home = children[part.object_id, part == largest[part.object_id]]
+        anchors[_anchor_key(part)] = _anchor(home, root, scene, part, largest, extent)
     for part, data in zip(parts, compat.new_point_clouds([part.count for part in parts]), strict=True):
         point_clouds.fill(data, scene, slice(part.start, part.start + part.count), extent, sh_degree)
         data.materials.append(material)
-        _cloud(children[part.object_id], anchors[_anchor_key(part)], scene, part, largest, data)
+        home = children[part.object_id, part == largest[part.object_id]]
+        _cloud(home, anchors[_anchor_key(part)], scene, part, largest, data)
     return anchors
 
 

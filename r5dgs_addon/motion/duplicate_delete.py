@@ -134,7 +134,8 @@ def delete(context: bpy.types.Context, anchors: list[bpy.types.Object], shadows:
         curve_place.check_local(anchor)
     names = [anchor.name for anchor in everyone]
     removed = [obj for anchor in everyone for obj in (anchor, *clouds_of(anchor))]
-    collections = {home for obj in removed for home in obj.users_collection}
+    collections = list(dict.fromkeys(home for obj in removed for home in obj.users_collection))
+    collections.sort(key=lambda home: len(home.children_recursive))  # a collection is emptied after those inside it
     for anchor in everyone:
         confidence_tubes.hide(anchor)
         for child in anchor.children:

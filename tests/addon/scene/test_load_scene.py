@@ -101,6 +101,10 @@ def test_the_collection_tree_is_the_table(blender, scene_path):
         cloud = next(obj for obj in inside if obj.name == item.name)
         assert cloud.type == "POINTCLOUD" and cloud.parent in inside
         assert cloud.parent.type == "EMPTY" and cloud.parent.parent == collection.r5dgs.root
+        assert len(inside) == 2
+    (fringe,) = collection.children["background"].children
+    assert fringe.name == "background fringe"
+    assert {obj.name for obj in fringe.objects} == {"mug shadow anchor", "mug shadow"}
     assert sum(len(obj.data.points) for obj in motions.clouds(collection)) == len(scene.gaussians.means)
     assert [entry.name for entry in collection.r5dgs.table] == [item.name for item in scene.objects]
 

@@ -106,6 +106,11 @@ def test_a_name_that_is_taken_gets_a_number_and_none_is_refused(blender, loaded,
     assert table.names(loaded)[MUG] == "ü" * 31
 
 
+def test_the_collection_of_other_clouds_is_renamed_with_the_object(blender, loaded, table):
+    table.rename(loaded, 0, "room")
+    assert [child.name for child in loaded.children["room"].children] == ["room fringe"]
+
+
 def test_a_name_inside_another_name_is_not_renamed(blender, loaded, table):
     table.rename(loaded, APPLE, "mug tall")
     table.rename(loaded, MUG, "cup")
