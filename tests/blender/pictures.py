@@ -1,14 +1,16 @@
 """Take the pictures of docs/user/blender.md in a real Blender with a window.
 
-    xvfb-run -a -s "-screen 0 1600x1400x24 +extension GLX" blender --factory-startup --window-geometry 0 0 1600 1400 \\
+    xvfb-run -a -s "-screen 0 1280x900x24 +extension GLX" blender --factory-startup --window-geometry 0 0 1280 900 \\
         --python tests/blender/pictures.py -- demo.r5dgs FOLDER [PICTURE ...]
 
 Needs ImageMagick's ``import`` (Blender's own screenshots are black under software rendering) and a worker's Python
 (`R5DGS_PYTHON`). Each picture is a function that sets up the window; the screenshot follows after Blender has drawn. A
-function may be a generator of seconds to wait between its steps.
+function may be a generator of seconds to wait between its steps. Take the picture `physics` in a run of its own, in
+which the panel *Motion* is open, and in a window of 1280 x 1250 pixels.
 """
 
 import argparse
+import importlib
 import importlib.util
 import inspect
 import shutil
@@ -19,22 +21,22 @@ import traceback
 from pathlib import Path
 
 import bpy
-from mathutils import Vector
+import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-CROPS = {"nothing": "225x330+830+66"}  # of 1280 pixels of width, if only one panel is shown
+CROPS = {"nothing": "256x172+773+540"}  # of 1280 x 900 pixels: the panel Select by Prompt
 SETTLE_S = 2.5  # until the window has been redrawn
 SIDEBAR = "R5DGS"
 
 
-def register_extension() -> None:
-    """Register the extension of this repository if none is enabled."""
-    if hasattr(bpy.types, "R5DGS_PT_scene"):
-        return
+def register_extension(open_motion: bool) -> None:
+    """Register the extension of this repository, with the panel *Motion* open if requested."""
     spec = importlib.util.spec_from_file_location("r5dgs", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)])
     module = importlib.util.module_from_spec(spec)
     sys.modules["r5dgs"] = module
     spec.loader.exec_module(module)
+    if open_motion:  # scripts cannot open panels
+        importlib.import_module("r5dgs.r5dgs_addon.panels.motion").R5DGS_PT_motion.bl_options = set()
     module.register()
 
 
@@ -86,21 +88,6 @@ def load(path: Path, window: Window) -> None:
     space.shading.type = "MATERIAL"
 
 
-def bounds() -> tuple[Vector, Vector]:
-    """Box about the named objects, Blender's world."""
-    import numpy as np
-
-    points = []
-    for obj in collection().all_objects:
-        if obj.r5dgs.role == "CLOUD" and obj.r5dgs.object_id > 0:
-            places = np.empty(3 * len(obj.data.points), np.float32)
-            obj.data.attributes["position"].data.foreach_get("vector", places)
-            matrix = np.array(obj.matrix_world)
-            points.append(places.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3])
-    low, high = np.quantile(np.concatenate(points), [0.02, 0.98], axis=0)
-    return Vector(low), Vector(high)
-
-
 def loaded(window: Window):
     """The sidebar with a loaded scene, at an extrapolated frame."""
     window.scrub(0.9)
@@ -113,9 +100,9 @@ def prompt(window: Window):
 
 
 def nothing(window: Window):
-    """A prompt without matches, and its suggestions."""
+    """A prompt without matches."""
     with window.inside():
-        bpy.ops.r5dgs.select_by_prompt(text="glowb")
+        bpy.ops.r5dgs.select_by_prompt(text="elephant")
 
 
 def physics(window: Window):
@@ -169,19 +156,27 @@ def preview(window: Window):
 
 
 def merge(window: Window):
-    """A mesh by Cycles among the Gaussians, by Merge with Meshes."""
+    """A mesh by Cycles among the Gaussians of the demo, by Merge with Meshes and Add Shadows, in the demo's light."""
     gaussians = bpy.context.scene
-    low, high = bounds()
-    middle, size = (low + high) / 2, (high - low).length
-    bpy.ops.mesh.primitive_monkey_add(size=0.12 * size, location=middle + Vector((-0.03, -0.08, 0.02)) * size)
+    bpy.ops.mesh.primitive_monkey_add(size=0.66, location=(0.35, -0.35, 0.33), rotation=(-0.25, 0.0, 0.5))
+    bpy.ops.object.shade_smooth()
+    material = bpy.data.materials.new("Orange")
+    material.use_nodes = True
+    material.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = (0.8, 0.35, 0.1, 1)
+    bpy.context.object.data.materials.append(material)
     light = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
-    light.data.energy, light.rotation_euler = 4.0, (0.6, 0.3, 0.0)
+    light.data.energy, light.rotation_euler = 2.1, np.radians((32.0, -18.0, 20.0))
     gaussians.collection.objects.link(light)
+    gaussians.world = bpy.data.worlds.new("Sky")
+    gaussians.world.use_nodes = True
+    sky = gaussians.world.node_tree.nodes["Background"]
+    sky.inputs["Color"].default_value, sky.inputs["Strength"].default_value = (0.74, 0.85, 1.0, 1.0), 0.62
     gaussians.view_settings.view_transform = "Standard"
     gaussians.render.resolution_percentage = 400
     bpy.ops.r5dgs.merge_with_meshes()
     gaussians.r5dgs_render.meshes.cycles.samples = 32
     gaussians.r5dgs_render.meshes.cycles.use_denoising = False
+    bpy.ops.r5dgs.add_shadows()
     bpy.ops.render.render()
     window.window.workspace = bpy.data.workspaces["Compositing"]
     yield 1.0
@@ -232,7 +227,7 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     options.folder.mkdir(parents=True, exist_ok=True)
     bpy.context.preferences.view.show_splash = False
-    register_extension()
+    register_extension(options.pictures == ["physics"])
     chosen = [shot for shot in SHOTS if not options.pictures or shot.__name__ in options.pictures]
     copy = Path(tempfile.mkdtemp(prefix="r5dgs-pictures-")) / options.scene.name
     shutil.copy(options.scene, copy)
