@@ -30,7 +30,7 @@ def check(folder: Path) -> list[Finding]:
         with collect(), coded("R04"):
             content = strict_json.read(evaluation, errors.CheckpointError)
             if not isinstance(content, dict) or not isinstance(content.get("splits"), dict):
-                raise errors.CheckpointError(f"{evaluation}: expected an object with 'splits', found another")
+                raise errors.CheckpointError(f"{evaluation}: expected an object with an object 'splits'")
     for path in sorted(folder.glob("*.r5dgs")):
         collect.findings += scene.check(path)
     if run is not None:

@@ -43,7 +43,7 @@ def edit(
     pieces = [piece for piece in pieces if piece.count > 0]
     for piece in pieces:
         if not 0 <= piece.start <= piece.start + piece.count <= len(scene.gaussians.means):
-            raise ValueError(f"{piece.name}: its rows leave the scene's {len(scene.gaussians.means)} Gaussians")
+            raise ValueError(f"{piece.name}: its rows exceed the scene's {len(scene.gaussians.means)} Gaussians")
     clusters = edited_motion.move(scene, piece_clusters.clusters(scene, pieces, notes), times, notes)
     kept, arrays, untouched = edited_gaussians.gather(scene, clusters)
     objects = _objects(scene, table, arrays["object_ids"])

@@ -277,6 +277,7 @@ def _to_splats(table: np.ndarray, place: str, guard: findings.Guard) -> Splats:
 def _whole(values: np.ndarray, place: str) -> np.ndarray:
     """Convert ids to int32, with a range check."""
     least, most = np.iinfo(np.int32).min, np.iinfo(np.int32).max
-    if values.size and not (values.min() >= least and values.max() <= most):
-        raise errors.SceneFileError(f"{place}: expected whole numbers from {least} to {most}, found others")
+    bad = ~((values >= least) & (values <= most))
+    if bad.any():
+        raise errors.SceneFileError(f"{place}: expected whole numbers from {least} to {most}, found {values[bad][0]:g}")
     return values.astype(np.int32)

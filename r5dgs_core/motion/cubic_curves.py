@@ -13,7 +13,7 @@ import numpy as np
 
 from . import rotations
 
-_ROUNDING = 1e-9  # maximum relative change of a curve by a dropped key
+_ROUNDING = 1e-9  # a key is dropped if this changes the curve by at most this much, relative to its values
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Curves:
     Attributes:
         location: Displacements of the pivot. [K, 3]
         rotation: Unit wxyz with continuous signs. [K', 4]
-        followed: False if the motion is too fast for keys, so that the curve is exact only at the keys.
+        followed: False if keys cannot follow the motion within the tolerance; the curve is then exact only at the keys.
     """
 
     location: Keys

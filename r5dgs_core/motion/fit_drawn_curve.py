@@ -1,8 +1,9 @@
 """Fit a motion model to a curve that the user drew after t_max.
 
-`model_selection` identifies a motion law behind noisy observations. This module takes the poses as exact: it returns
-the simplest kind within a tolerance, else the kind with the smallest error. Notation: tau = t - t_max > 0; radius
-weights rotations against displacements.
+`model_selection` identifies a motion law behind noisy observations. This module takes the poses as exact: it tries
+kinds from simple to complex and stops at the first within the tolerance; otherwise it returns the best one. A more
+complex kind replaces a simpler one only if it reduces the error by more than a tenth. Notation: tau = t - t_max > 0;
+radius weights rotations against displacements.
 """
 
 from __future__ import annotations
@@ -50,7 +51,10 @@ def fit(
 def pose_errors(
     quats_a: np.ndarray, moves_a: np.ndarray, quats_b: np.ndarray, moves_b: np.ndarray, radius: float
 ) -> np.ndarray:
-    """Upper bound of the distance between two poses of a point within ``radius`` of the pivot. [S, 4], [S, 3] -> [S]"""
+    """Upper bound of the distance between the positions that two poses give a point within ``radius`` of the pivot.
+
+    [S, 4], [S, 3] -> [S]
+    """
     turn = rotations.angle_between(quats_a, quats_b)
     return np.linalg.norm(moves_a - moves_b, axis=-1) + 2 * radius * np.sin(0.5 * turn)
 

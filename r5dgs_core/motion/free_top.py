@@ -2,10 +2,10 @@
 
 Notation: J inertia in the world at tau = 0, up to a factor; I1, I2, I3 its principal moments; A the rotation from the
 principal axes to the world; w_k spins about the principal axes; L = |J w| and 2E = w J w, both conserved. The axes are
-ordered so that the spin circles the third. With u = p tau + u_0, Euler's equations give w_1 = w_1m cn u, w_2 = w_2m sn
-u, w_3 = w_3m dn u, Jacobi's elliptic functions of parameter m. About the fixed vector J w, a body axis k precesses at
-the rate L (2E - I_k w_k^2) / (L^2 - I_k^2 w_k^2), whose integral is a mean rate plus a Fourier series. The solution is
-in closed form, so any time costs the same.
+ordered so that the angular velocity circles the third one. With u = p tau + u_0, Euler's equations give w_1 =
+w_1m cn u, w_2 = w_2m sn u, w_3 = w_3m dn u, Jacobi's elliptic functions of parameter m. About the fixed vector J w, a
+body axis k precesses at the rate L (2E - I_k w_k^2) / (L^2 - I_k^2 w_k^2), whose integral is a mean rate plus a Fourier
+series. The solution is in closed form, so any time costs the same.
 """
 
 from __future__ import annotations

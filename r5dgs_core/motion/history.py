@@ -9,7 +9,7 @@ import numpy as np
 
 EVENTS = ("start", "stop", "impact", "change")
 MOST_KNOTS = 16
-_RATES = {"velocity": True, "acceleration": True, "angular_velocity": False}  # name: it scales with the scene
+_RATES = {"velocity": True, "acceleration": True, "angular_velocity": False}  # True for rates that scale with the scene
 _DONE = {"start": "set off", "stop": "stopped", "impact": "hit", "change": "changed"}
 
 
@@ -65,7 +65,7 @@ class Band:
         half_width: Half width of the position of a point of the body, world units. [H]
         half_angle: Half width of the rotation, rad. [H]
         level: Probability that the truth lies inside.
-        predictable_until: Scene time after which the motion is not predictable; None if it is up to the last knot.
+        predictable_until: Scene time after which the motion is not predictable; None if it is up to the last one.
     """
 
     times: tuple[float, ...]
@@ -98,7 +98,7 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class History:
-    """Evidence of the observed poses on a motion, besides its model.
+    """Events, segments, confidence band and pose errors of a motion, from its observed poses.
 
     Attributes:
         events: Changes of the motion, in order.

@@ -21,12 +21,12 @@ FEWEST_INTERVALS = 64  # first grid between two kinks
 MOST_INTERVALS = 1 << 15
 FEWEST_KINKS = 16  # lowest limit of the number of kinks
 _BESIDE = 1e-7  # distance from a kink at which its slopes are sampled, as a fraction of the time between two kinks
-_REST = 1e-3  # largest change of a curve that rests, as a fraction of the tolerance
+_REST = 1e-3  # largest change of a curve that counts as constant, as a fraction of the tolerance
 _FINER = 4  # checking grid points per candidate key time
 _PER_FRAME = 4  # candidate key times
 _STEPS_PER_SAMPLE, _STEPS_PER_INTERVAL = 4, 16  # integration steps
-_ENOUGH_STEPS = 1 << 16  # upper bound of integration steps for few samples
-_ONE_BY_ONE = 256  # keys found sequentially; the rest is split into stripes searched in parallel
+_ENOUGH_STEPS = 1 << 16  # cap on the minimum number of integration steps
+_ONE_BY_ONE = 256  # keys found one by one; the rest is split into stripes that are searched together
 _PER_STRIPE = 32  # keys per stripe; each stripe adds at most one
 
 Samples = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -77,8 +77,9 @@ def reduce(
         t1: Last time, > t0.
         tolerance: Maximum position error of any point, world units, > 0.
         radius: Largest distance of a point from the pivot, world units.
-        kinks: Increasing times at which slopes jump. Those inside (t0, t1) get a key with the slopes of both sides, but
-            not those within ``nearest`` of the previous one, and no more than one per `FEWEST_INTERVALS` of ``most``.
+        kinks: Increasing times at which slopes jump. Those inside (t0, t1) get a key with the slopes of both sides,
+            except those within ``nearest`` of the previous one or of an end, and those beyond the first
+            max(`FEWEST_KINKS`, ``most`` / `FEWEST_INTERVALS`).
         nearest: Minimum time between candidate keys, for editors that merge closer keys.
         frames: Frames of the editor. A curve that four keys per frame do not reproduce, or a rotation of more than
             `MAX_FRAME_TURN_RAD` per frame, gets one key per frame.

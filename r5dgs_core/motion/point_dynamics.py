@@ -18,7 +18,7 @@ from . import rotations, twist_propagation
 log = logging.getLogger(__name__)
 
 Array = rotations.Array
-MAX_TURN = 0.1  # rad per midpoint step; above, bodies grow visibly, by sqrt(1 + x^4 / 4) per step
+MAX_TURN = 0.1  # rad per midpoint step; if larger, x, bodies grow visibly, by the factor sqrt(1 + x^4 / 4) per step
 TRACE_STEP = 1 / 60  # TRACE's playback step, in units of time
 
 
@@ -44,8 +44,8 @@ def rk2(
     """Integrate points by the midpoint rule and rotations by exponentials of the midpoint spin: TRACE's integrator.
 
     Points and rotations are integrated separately, so a body is rigid only to second order in the step; `propagate`
-    keeps it exactly rigid. Supports numpy and torch. For numpy arrays it warns once about spins of more
-    than `MAX_TURN` per step, because bodies then grow visibly in playback.
+    keeps it exactly rigid. Supports numpy and torch. For numpy arrays it warns, once per step
+    length, about rotations of more than `MAX_TURN` per step, because bodies then grow visibly in playback.
 
     Args:
         points: Start positions. [..., 3]
@@ -97,8 +97,8 @@ def propagate(dynamics: np.ndarray, duration: float, tolerance: float) -> tuple[
 @functools.cache
 def _warn_of_coarse_steps(step: float) -> None:
     log.warning(
-        "TRACE's midpoint steps of %g are too long for a spin of more than %g rad a step: bodies grow; "
-        "remedy: another mode than rigid_paper, or shorter steps",
+        "TRACE's midpoint steps of %g turn points by more than %g rad each, so bodies grow visibly; "
+        "remedy: use a mode other than rigid_paper, or shorter steps",
         step,
         MAX_TURN,
     )

@@ -16,7 +16,7 @@ from . import rotations
 
 @dataclass(frozen=True)
 class Window:
-    """Times that a fit refers to.
+    """Time window of a fit, and the angular frequencies that its poses can resolve.
 
     Attributes:
         first: Time of the first pose.
@@ -30,7 +30,7 @@ class Window:
 
     @property
     def middle(self) -> float:
-        """Middle of the window: the reference time of rates, at which they are nearly uncorrelated with the others."""
+        """Middle of the window, the reference time of rates: there they hardly correlate with the other parameters."""
         return 0.5 * self.first
 
     @property
@@ -39,7 +39,7 @@ class Window:
         return self.low < self.high
 
     def frequency(self, pace: np.ndarray) -> np.ndarray:
-        """Frequency for an unbounded parameter, its logit."""
+        """Map an unbounded parameter to an angular frequency between `low` and `high` by the logistic function."""
         return self.low + (self.high - self.low) / (1 + np.exp(-np.clip(pace, -30, 30)))
 
     def pace(self, frequency: float) -> float:

@@ -54,7 +54,7 @@ def fit_rigid(
     """Fit a rotation and a translation robustly (Kabsch with Cauchy reweighting).
 
     If the points do not determine the rotation about an axis (a line, a single point, noise larger than the lever arm),
-    that part comes from ``hint``: the result is the fitting rotation nearest to it.
+    that part is taken from ``hint``: of all rotations that fit, the result is the one nearest to it.
 
     Args:
         source: Points before. [n, 3]

@@ -38,7 +38,7 @@ def with_center(model: MotionModel, point: np.ndarray, old: np.ndarray | None = 
     """
     now = center(model)
     if now is None:
-        raise ValueError(f"expected a motion that turns or swings about a point, got {model.kind!r} that has none")
+        raise ValueError(f"expected a motion with a centre, got one of kind {model.kind!r}")
     return KINDS[model.kind].with_center(model, np.asarray(point, np.float64), now if old is None else old)
 
 
@@ -56,7 +56,7 @@ def with_axis(model: MotionModel, direction: np.ndarray, through: np.ndarray | N
     old = axis(model)
     length = float(np.linalg.norm(direction))
     if old is None or not 0 < length < np.inf:
-        raise ValueError(f"expected a motion that turns and a direction, got {model.kind!r} and {direction}")
+        raise ValueError(f"expected a rotating motion and a direction, got one of kind {model.kind!r} and {direction}")
     turn = _between(old, np.asarray(direction, np.float64) / length)
     return KINDS[model.kind].with_axis(model, turn, through)
 

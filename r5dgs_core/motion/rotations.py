@@ -49,9 +49,12 @@ def _horner(coefficients: tuple[float, ...], x: Array) -> Array:
 
 
 def _split(angle2: Array) -> tuple[Any, Array, Array, Array]:
-    """Mask of small angles; squared angle if small, else 0; squared angle if large, else 1; square root of the latter.
+    """Safe arguments of a series for small angles and of the closed form for others.
 
-    `where` also differentiates the branch that it discards, so both branches get a safe argument first.
+    `where` also differentiates the branch that it discards, so each branch needs a safe argument.
+
+    Returns:
+        Mask of small angles; squared angles, 0 if not small; squared angles, 1 if small; square roots of the latter.
     """
     xp = array_namespace(angle2)
     small = angle2 < _SERIES_LIMIT

@@ -20,7 +20,7 @@ from . import quaternion_columns, rotations, se3
 log = logging.getLogger(__name__)
 
 MAX_STEPS = 512  # steps per frame of thousands of points, to bound the time
-WILD = 1e12  # difficulty above which no number of steps suffices
+WILD = 1e12  # difficulty above which results may be inaccurate or not finite
 CHUNK = 2048  # points per block, sized for the CPU cache
 _TINY = 1e-30
 

@@ -31,7 +31,7 @@ _MOST_SCALE = 36.0  # maximum factor on the covariance from the errors of earlie
 
 
 def slow(least: Noise, deviations: Noise) -> Noise:
-    """Drift of a track over its span, from the lower bound of its noise and the deviations that drift causes."""
+    """Drift of a track over its span, from the lower bound of its noise and standard deviations due to drift."""
     return Noise(
         max(_DRIFT * least.place, _LINE * deviations.place),
         max(_DRIFT * least.turn, _LINE * deviations.turn),
@@ -41,8 +41,10 @@ def slow(least: Noise, deviations: Noise) -> Noise:
 def of(selected: Selected, variance: float, drift: Noise) -> Widths:
     """Band of the chosen solution, up to one observed span past t_max.
 
-    ``drift`` is that of the track over its span. ``variance`` is the factor of the parameters' covariance, from
-    `evidence.variance`.
+    Args:
+        selected: Result of the selection.
+        variance: Factor of the parameters' covariance, from `evidence.variance`.
+        drift: Drift of the track over its span.
     """
     tau = np.linspace(0.0, 1.0, MOST_KNOTS)
     chosen, evidence, noise = selected.chosen, selected.evidence, selected.noise
@@ -114,7 +116,7 @@ def _variance(solution: Solution, variance: float, tau: np.ndarray) -> tuple[np.
 def _spread(
     chosen: Solution, all_solutions: Sequence[Solution], evidence: Evidence, tau: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean squared distance of the near candidates' positions and rotations from the chosen one's. [H]"""
+    """Mean squared distances of other candidates' positions and rotations from the chosen one's, by evidence. [H]"""
     scores = [evidence.score(s) for s in all_solutions]
     best = min(scores)
     weights = np.exp(-(np.array(scores) - best) / _SOFT)

@@ -52,7 +52,7 @@ class Candidate:
 
     @property
     def last_choice(self) -> int:
-        """Minimum number of first poses that determine all discrete choices."""
+        """Number of poses, from the first one, that suffice to determine all discrete choices."""
         return 0
 
     @property
@@ -116,7 +116,8 @@ class Candidate:
         return models.KINDS[self.kind].events(self.parts(theta), self.window)
 
 
-# Ordered by number of parameters; with equal numbers, motions without oscillation first, then in the order of `_NAMES`.
+# Ordered by number of parameters; with equal numbers, motions without oscillation first, then in the order of
+# `models.KINDS` and their `fits`.
 ALL = sorted(
     (Candidate(name, kind, fit) for kind in models.KINDS for name, fit in models.KINDS[kind].fits.items()),
     key=lambda candidate: (candidate.parameters, candidate.oscillates),

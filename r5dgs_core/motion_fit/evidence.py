@@ -21,7 +21,7 @@ STRONG = 10.0  # minimum difference of scores for a break
 NEAR = 6.0  # maximum difference of scores within which the simplest law is chosen
 _LEAST_LEVEL = 0.05
 _MOST_LAG = 0.8
-_RHOS = np.linspace(0.0, 0.9, 19)  # correlations of neighbouring poses that are weighed
+_RHOS = np.linspace(0.0, 0.9, 19)  # tried correlations of neighbouring poses
 
 
 @dataclass(frozen=True)
@@ -70,10 +70,10 @@ class Evidence:
 
 
 def variance(solution: Solution, track: PoseTrack, noise: Noise, evidence: Evidence) -> float:
-    """Factor of the parameters' covariance, at least that of the evidence, for noise of an unknown correlation.
+    """Factor of the parameters' covariance for noise of an unknown correlation, at least that of the evidence.
 
-    The mean of s2 (1 + rho) / (1 - rho) over the restricted likelihood of rho, the correlation of neighbouring poses.
-    Unlike that of `_inflation`, this rho is not reduced by the part of slow noise that the fit follows.
+    It is the mean of s2 (1 + rho) / (1 - rho), weighted by the restricted likelihood of rho, the correlation of
+    neighbouring poses. Unlike rho in `_inflation`, this one also includes slow noise that the fit follows.
 
     Args:
         solution: The chosen solution, fitted to the track.
@@ -106,7 +106,7 @@ def variance(solution: Solution, track: PoseTrack, noise: Noise, evidence: Evide
 
 
 def _inflation(parts: Sequence[Solution], count: int, parameters: int) -> float:
-    """a from the correlation between neighbouring residuals, weighted robustly; it corrects for the fit."""
+    """a from the robustly weighted correlation of neighbouring residuals, which the fit reduces; corrected for that."""
     energy = product = 0.0
     for solution in parts:
         values = np.sqrt(solution.robust)[:, None] * solution.residuals

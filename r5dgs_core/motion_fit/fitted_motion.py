@@ -48,7 +48,7 @@ def to_model(solution: Solution, variance: float, radius: float, span: float) ->
 
 
 def _varies(name: str, moved: dict[str, np.ndarray]) -> bool:
-    """True for rates of single kinds that are free."""
+    """True for a free rate that only some kinds have."""
     return name not in models.RATES and not name.startswith("offset_") and bool(np.ptp(moved[name], axis=0).any())
 
 
@@ -64,7 +64,7 @@ def _fields(law: Candidate, theta: np.ndarray, radius: float, span: float) -> di
 
 
 def events(solution: Solution, variance: float, t_max: float, span: float) -> tuple[Event, ...]:
-    """Events of a solution in the observed window, in order; of those within a gap between poses, the first."""
+    """Events of a solution in the observed window, in order; only the first of several between two poses."""
     gap = -solution.candidate.window.first / len(solution.weights)
     found: list[tuple[str, np.ndarray]] = []
     rows: list[int] = []

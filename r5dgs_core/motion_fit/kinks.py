@@ -65,7 +65,7 @@ BREAKS = {
 
 @dataclass(frozen=True)
 class Kink(Candidate):
-    """A break in one gap between two poses, or in one gap per start if the limits are arrays [B, 1, 1, 1].
+    """A break between two neighbouring poses, or one such break per start if the limits are arrays [B, 1, 1, 1].
 
     Attributes:
         low, high: Times of the poses before and after the gap.
@@ -93,7 +93,7 @@ class Kink(Candidate):
         return _BLOCKS[name] if name in _BLOCKS else super()._block(name)
 
     def time(self, parts: Parts) -> np.ndarray:
-        """Time of the break, squashed into its gap. [..., 1]"""
+        """Time of the break, mapped into its gap by the logistic function. [..., 1]"""
         return self.low + (self.high - self.low) / (1 + np.exp(-np.clip(parts["c"], -4, 4)))
 
     def poses(self, theta: np.ndarray, tau: np.ndarray) -> se3.Pose:

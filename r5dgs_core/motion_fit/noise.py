@@ -7,7 +7,7 @@ import numpy as np
 from ..motion.pose_track import PoseTrack
 from .candidates import Noise
 
-IMAGES = (0.001, 0.002)  # share of the diameter and rad; tracks from images drift by this much without scatter
+IMAGES = (0.001, 0.002)  # share of the diameter, and rad; smooth errors of tracks from images, which do not scatter
 FLOOR = 1e-7  # radii and radians; below this, noise is only rounding
 _MEDIAN = 1.538  # median length of three numbers with unit variance
 

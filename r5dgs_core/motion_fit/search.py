@@ -24,11 +24,11 @@ STEEP = 0.9  # cosine of the angle to the vertical below which a motion is verti
 _ROUNDS = 3  # rounds of noise estimation
 _MEDIAN_SQUARE = 0.455  # median square of a normal variable with unit variance
 _NOTHING_FITS = 9.0  # squared misfit of the best candidate above which the estimated noise is increased
-_TOO_LARGE = 0.4  # variance of the residuals below which the noise is estimated again
+_TOO_LARGE = 0.4  # variance of the residuals, in units of the noise, below which the noise is estimated again
 _EXACT = 1e-4  # gain of a step below which the selected candidate is final
 _CONTRADICTED = 3.0  # squared prediction error, relative to the best law's, above which a law is rejected
 _SMALL_JUMP = 0.15  # relative change of the rates below which a break needs stronger evidence
-_POOR = 3.0  # noise level, relative to that of neighbouring poses, above which a track may have several breaks
+_POOR = 3.0  # residuals' variance, relative to the noise, above which a track may have several breaks
 _HOPELESS_LOSS = 200.0  # excess of the loss of a candidate above which it is not refitted
 _HOPELESS = 30.0  # score excess of plain parts above which a track is not cut
 _CUTS = 4  # number of breaks at which such a track is cut on trial
@@ -81,7 +81,9 @@ def select(
     tried = [c for c in family if c.parameters <= most] or [min(family, key=lambda c: c.parameters)]
     found, broken = _try_all(tried, track, level, breaks)
     coarser = _misfit((*found, *broken))
-    if max(coarser) > _NOTHING_FITS:  # at the level of the noise, all losses are nearly equal
+    if (
+        max(coarser) > _NOTHING_FITS
+    ):  # if the noise is underestimated, the robust losses of all candidates are nearly equal
         level = level.scaled(*(math.sqrt(max(ratio, 1.0)) for ratio in coarser))
         found, broken = _try_all(tried, track, level, breaks)
     for _ in range(_ROUNDS):

@@ -98,7 +98,7 @@ def _apart(a: np.ndarray, a_cov: np.ndarray, b: np.ndarray, b_cov: np.ndarray) -
 
 
 def _largest_agreeing(found: dict[int, tuple[np.ndarray, np.ndarray]]) -> list[int]:
-    """Largest set of bodies that agree in pairs; among equally large sets, the tightest."""
+    """Large set of bodies that agree in pairs, grown greedily from each body; among equally large, the tightest."""
     best: tuple[int, float, list[int]] = (0, 0.0, [])
     for seed in found:
         distances = {i: _apart(*found[seed], *found[i]) for i in found if i != seed}

@@ -23,7 +23,7 @@ SIMILARITY_TOLERANCE = 1e-5
 
 @dataclass(frozen=True)
 class Bend:
-    """Deviation of Gaussians from the motion of their group.
+    """Deviation of Gaussians from the motion of their groups.
 
     Attributes:
         rows: Rows of the scene. [n]
@@ -101,7 +101,7 @@ def place(
         ValueError: The range exceeds the scene, or the matrix is singular or not finite.
     """
     if not 0 <= start <= start + count <= len(scene.gaussians.means):
-        raise ValueError(f"rows {start}:{start + count} leave the scene's {len(scene.gaussians.means)} Gaussians")
+        raise ValueError(f"rows {start}:{start + count} exceed the scene's {len(scene.gaussians.means)} Gaussians")
     rows, turn = slice(start, start + count), nearest_rotation(affine(matrix)[0])
     if world is not None:
         turn = nearest_rotation(affine(world)[0]).T @ turn
@@ -143,7 +143,7 @@ def _bent(scene: Scene, start: int, splats: Splats, bend: Bend) -> Splats:
 
 
 def _relight(scene: Scene, start: int, factor: np.ndarray | None, turn: np.ndarray, bend: Bend) -> None:
-    """Write the shading factors of deviating Gaussians that ``turn`` then rotates. factor [n, 1], turn [3, 3]"""
+    """Write the shading factors of deviating Gaussians, which ``turn`` then rotates. factor [n, 1], turn [3, 3]"""
     if factor is None or scene.shading is None:
         return
     light = np.asarray(scene.shading.light, np.float64)
@@ -181,7 +181,7 @@ def affine(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"expected a finite matrix [4, 4], got {matrix!r}")
     singular = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     if singular[-1] <= 1e-9 * max(singular[0], 1e-30):
-        raise ValueError("the matrix flattens space (scale 0)")
+        raise ValueError("the matrix is singular (scale 0)")
     return matrix[:3, :3], matrix[:3, 3]
 
 

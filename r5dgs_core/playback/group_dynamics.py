@@ -50,7 +50,7 @@ def models_of(scene: Scene, source: str = "fitted") -> tuple[MotionModel, ...]:
     Raises:
         ValueError: The source is unknown, or the scene has no dynamics.
 
-    Source: "representative" is the anchor of the R5DGS paper. Members fainter than `visibility.SEEN_OPACITY` are
+    Source: "representative" is the paper's anchor. Members fainter than `visibility.SEEN_OPACITY` are
         excluded; fits are weighted by opacity and robust (Cauchy).
     """
     if source not in SOURCES:
@@ -58,7 +58,7 @@ def models_of(scene: Scene, source: str = "fitted") -> tuple[MotionModel, ...]:
     if source == "fitted":
         return tuple(group.model for group in scene.groups)
     if scene.dynamics is None:
-        raise ValueError(f"source: the scene {scene.name!r} has no dynamics of its Gaussians, only 'fitted'")
+        raise ValueError(f"source: expected 'fitted', as the scene {scene.name!r} has no dynamics, got {source!r}")
     return tuple(_model_of(scene, group, source) for group in scene.groups)
 
 

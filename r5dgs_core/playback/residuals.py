@@ -109,7 +109,7 @@ class OwnMotion:
             scene.dynamics.rates[chosen], tolerance, radius=tolerance / ANGLE_TOLERANCE
         )
         moving = self._propagator.rows
-        # If only some rows move on their own, resting ones are listed too, so that their group does not move them.
+        # Among chosen rows, those at rest are listed too; otherwise their groups would move them.
         self._resting = np.zeros(0, np.int64) if rows is None else np.setdiff1d(np.arange(len(chosen)), moving)
         self.rows = chosen[np.concatenate([moving, self._resting])]
         self._means = np.ascontiguousarray(scene.gaussians.means[self.rows].T, np.float64)

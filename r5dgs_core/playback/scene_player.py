@@ -99,7 +99,9 @@ class Player:
         self.scene, self.mode = scene, mode
         self._base, self._variant = split(mode)
         if not available(scene, mode):
-            raise ValueError(f"mode: the scene {scene.name!r} has {', '.join(modes(scene))}, not {mode!r}")
+            raise ValueError(
+                f"mode: expected one of {', '.join(modes(scene))} for the scene {scene.name!r}, got {mode!r}"
+            )
         self._poser = posing.Poser(scene)
         source = self._variant if self._base in ("rigid", "hybrid") else "fitted"
         self._groups = group_dynamics.GroupMotion(scene, source)

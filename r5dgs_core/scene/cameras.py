@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-FARTHEST = 1e15  # maximum coordinate that is drawn; its square is within the range of float32
+FARTHEST = 1e15  # maximum coordinate; its square is within the range of float32
 MOST_PIXELS = 1 << 16  # maximum image side
 _MOST_FOCAL = 1e12  # pixels; the smallest focal length is its reciprocal
 _RIGID_TOLERANCE = 1e-3  # maximum entry of R R^T - 1

@@ -119,7 +119,8 @@ def _warn_of_lost_detail(scene: Scene, path: str | Path) -> None:
     size = float(np.exp(np.median(scene.gaussians.log_scales[some].astype(np.float64))))
     if step > 0.2 * size:
         _log.warning(
-            "%s: is so far from the origin that its Gaussians, of %.2g units, are positioned only to %.2g units. "
+            "%s: the scene is so far from the origin that its Gaussians, of %.2g units, are positioned only to "
+            "%.2g units. "
             "Bake its run again with this release for sharp images",
             path,
             size,

@@ -85,7 +85,7 @@ def basis(directions: Array, degree: int) -> Array:
 
 
 def change_of_basis(linear: np.ndarray, degree: int) -> np.ndarray:
-    """Matrix that transforms coefficients when the object with that colour is transformed by a linear map.
+    """Matrix that transforms coefficients along with an object under a linear map.
 
     The colour seen along d after the map is that seen along A^-1 d before it. The result is exact for rotations,
     mirrors and uniform scales, which do not mix the bands; for any other map it is a least-squares fit over all

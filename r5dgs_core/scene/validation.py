@@ -204,13 +204,15 @@ def _check_residuals(scene: Scene, place: str, guard: findings.Guard) -> None:
         return
     rows, count = scene.residuals.rows, len(scene.gaussians.means)
     with guard():
-        if len(rows) and (rows[0] < 0 or rows[-1] >= count or (rows[1:] <= rows[:-1]).any()):
-            _fail(place, "residual_rows", f"increasing rows below {count}", "others")
+        bad = np.flatnonzero((rows < 0) | (rows >= count) | (np.diff(rows, prepend=-1) <= 0))
+        if len(bad):
+            _fail(place, "residual_rows", f"increasing rows below {count}", f"{rows[bad[0]]} at position {bad[0]}")
     for name in ("offsets", "log_scales"):
         with guard():
-            if (getattr(scene.residuals, name)[:, -1] != 0).any():
+            last = getattr(scene.residuals, name)[:, -1]
+            if (last != 0).any():
                 wanted = "zero at t_max (residuals are relative to the bind state)"
-                _fail(place, f"residual_{name}", wanted, "something else")
+                _fail(place, f"residual_{name}", wanted, f"{last[last != 0][0]:g}")
 
 
 def _check_units(scene: Scene, place: str, guard: findings.Guard) -> None:
@@ -300,10 +302,10 @@ def _check_group(
             _fail(place, where, f"id {row}", group.id)
     with guard():
         if group.role not in ROLES:
-            _fail(place, where, f"a role out of {ROLES}", repr(group.role))
+            _fail(place, where, f"one of the roles {', '.join(ROLES)}", repr(group.role))
     with guard():
         if group.object_id not in object_ids:
-            _fail(place, where, "an object of the table", group.object_id)
+            _fail(place, where, "an object_id of the scene's objects", group.object_id)
     with guard():
         if not -1 <= group.anchor_index < len(scene.gaussians.means):
             _fail(place, where, f"an anchor_index below {len(scene.gaussians.means)}, or -1", group.anchor_index)
@@ -328,7 +330,7 @@ def _check_group(
         known = 0 <= group.follows < len(scene.groups)
         leader = scene.groups[group.follows].follows if known else findings.UNREAD
         if not known or (leader is not None and leader is not findings.UNREAD):
-            _fail(place, where, "to follow a group that follows none", group.follows)
+            _fail(place, where, "a leader that follows no group", group.follows)
     with guard():
         matrix = group.follow_matrix
         if matrix is None or matrix.shape != (3, 3) or not (np.abs(matrix) <= _LARGE).all():

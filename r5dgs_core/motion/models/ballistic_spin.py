@@ -32,7 +32,6 @@ class BallisticSpin(MotionKind):
         "ballistic + spin, free centre": ("v", "a", "w", "u"),
         "full, free centre": ("v", "a", "w", "eps", "u"),
     }
-    may_tumble = True
     drawn_fits = (_SPIN, (*_SPIN, "center_offset"))
 
     def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:

@@ -36,7 +36,7 @@ _AT_REST = [np.zeros(unit.size) for unit in FIELDS.values()]
 
 
 class Block(NamedTuple):
-    """Size of a block of free parameters, and the standard deviation of a weak prior about 0; infinite for none."""
+    """Size of a block of free parameters, and the standard deviation of its weak prior about 0 (infinite: no prior)."""
 
     size: int
     prior: float = np.inf
@@ -99,12 +99,11 @@ class MotionKind:
         word: Name in the output of ``r5dgs objects`` and ``r5dgs info``.
         fields: Fields of `MotionModel` that users edit.
         needs_inertia: True if `MotionModel.inertia` is needed.
-        center_on_axis: True if each point of the axis serves as the centre.
+        center_on_axis: True if any point of the axis may serve as the centre.
         fits: Name -> free blocks of the candidates with which `motion_fit` identifies this kind, beside the pose at
             t_max (r, e).
         blocks: Sizes and priors of blocks of `fits` that no other kind has; `BLOCKS` has the common ones.
         fits_by_default: False if a caller must choose these candidates by name.
-        may_tumble: True if a freely tumbling body may be fitted by this kind, so that the free top is tried.
         drawn_fits: Sets of free rates with which `fit_drawn_curve` tries this kind.
     """
 
@@ -117,7 +116,6 @@ class MotionKind:
     fits: Mapping[str, tuple[str, ...]] = {}
     blocks: Mapping[str, Block] = {}
     fits_by_default = True
-    may_tumble = False
     drawn_fits: tuple[tuple[str, ...], ...] = ()
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
@@ -240,7 +238,7 @@ def clocks(frequency: float | np.ndarray, span: np.ndarray, damping: float | np.
     Args:
         frequency: W >= 0, rad per unit of time. [..., 1]
         span: Times tau since t_max, of either sign. [..., 1]
-        damping: c >= 0, per unit of time; counts only if W > 0. [..., 1]
+        damping: c >= 0, per unit of time; ignored if W = 0. [..., 1]
 
     Returns:
         s1 and s2 of the module's notation; exactly tau and tau^2/2 for W = 0.
@@ -252,7 +250,7 @@ def clocks(frequency: float | np.ndarray, span: np.ndarray, damping: float | np.
     p, s, stiffness = _decaying(frequency, span, c)
     small = stiffness * span**2 < 1e-6
     safe = np.where(stiffness > 0, stiffness, 1.0)
-    # Each is k - k p + b s with the constants of the initial values.
+    # Each factor is k (1 - p) + b s, with k and b from its initial values.
     once = np.where(small, span - stiffness * span**3 / 6, (2 * c * (1 - p) + (safe - 2 * c**2) * s) / safe)
     twice = np.where(small, 0.5 * span**2 - c * span**3 / 3, (1 - p - c * s) / safe)
     return once, twice

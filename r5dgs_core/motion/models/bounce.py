@@ -1,4 +1,6 @@
-"""A body that flies, spins and bounces off a floor, each time with a share of its speed, until it rests there.
+"""A body that flies, spins and bounces off a floor, and keeps a fixed fraction of its vertical speed at each bounce.
+
+Once it no longer leaves the floor, it slides on and keeps spinning.
 
 Gravity a sets the upward direction n = -a / |a|. Between bounces the height over the floor is V y - |a| y^2 / 2, with
 y the time since the last bounce and V the speed after it. V falls by the factor rho (restitution) at each bounce.
@@ -18,6 +20,8 @@ from .base import Block, Curve, MotionKind, MotionModel, Rates
 _LEAST = 1e-300
 _NEAR = 9  # poses about a bounce that give its first guess
 _PLACES = (0.2, 0.5, 0.8)  # tried times of a bounce between two poses
+_RESTING = 1000.0  # flight number that stands for a body that stays on the floor
+_LOW = 1e-3  # a body stays on the floor once its speed falls to this share of that after bounce 0, times 1 - rho
 
 
 class Bounce(MotionKind):
@@ -81,7 +85,7 @@ class Bounce(MotionKind):
         return quats, parts["e"] + place(tau[:, None]) - place(np.zeros((1, 1)))
 
     def starts(self, blocks: Sequence[str], track: PoseTrack, window: Window) -> list[first_guesses.Guess]:
-        """Fit two parabolas of one acceleration that meet between two poses; the best two gaps with a bounce."""
+        """Fit two parabolas with a common acceleration that meet between two poses; guesses for at most two bounces."""
         count, tau = len(track), track.tau
         if count < 8:
             return []
@@ -122,7 +126,7 @@ class Bounce(MotionKind):
         return [("impact", parts["bounce"] + _start(np.array(float(k)), speed, gravity, rho)) for k in numbers]
 
     def kinks(self, model: MotionModel, end: float) -> np.ndarray:
-        """Impacts, and the time from which the body rests on the floor."""
+        """Impacts, and the time from which the body stays on the floor."""
         g, up = _gravity(model.acceleration)
         rho, down = model.restitution, -float((model.velocity + model.acceleration * model.bounce_time) @ up)
         if not (g > 0 and down >= 0):
@@ -141,10 +145,6 @@ class Bounce(MotionKind):
         return bool(model.angular_velocity.any())
 
 
-_RESTING = 1000.0  # number of bounces after which a body rests on the floor
-_LOW = 1e-3  # share of the speed after the first bounce, times 1 - rho, below which a body rests
-
-
 def _gravity(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Strength of an acceleration [..., 1] and the direction against it [..., 3]."""
     g = np.sqrt((a * a).sum(-1))[..., None]
@@ -156,23 +156,23 @@ def _restitution(parts: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _split(v: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Upward speed, at least a little, and the velocity along the floor. [..., 1], [..., 3]"""
+    """Upward speed, at least 1e-6, and the velocity along the floor. [..., 1], [..., 3]"""
     speed = (v * up).sum(-1)[..., None]
     return np.maximum(speed, 1e-6), v - speed * up
 
 
 def _start(number: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray) -> np.ndarray:
-    """Time of the bounce before a flight, since bounce 0: 2 V / g times 1 + rho + ... + rho^(number - 1)."""
+    """Start of a flight, as time since bounce 0: 2 V / g times 1 + rho + ... + rho^(number - 1)."""
     first = 2 * speed / g
     steady = np.abs(1 - rho) < 1e-9
     return first * np.where(steady, number, (1 - rho**number) / np.where(steady, 1.0, 1 - rho))
 
 
 def _flight(since: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number of the flight at a time since bounce 0, after which it flies up at ``speed``; `_RESTING` for rest.
+    """Flight at a time since bounce 0, from which the body rises at ``speed``.
 
     Returns:
-        The number, negative before bounce 0, and the time of the bounce before that flight since bounce 0.
+        Number of the flight, negative before bounce 0 and `_RESTING` if the body stays on the floor, and its start.
     """
     first = 2 * speed / g
     flights = since / np.maximum(first, _LEAST)
@@ -188,7 +188,7 @@ def _flight(since: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray
 
 
 def _heights(since: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Height over the floor and its rate at a time since bounce 0, after which the body flies up at ``speed``."""
+    """Height over the floor and its rate at a time since bounce 0, from which the body rises at ``speed``."""
     number, start = _flight(since, speed, g, rho)
     rising = speed * rho**number
     y = since - start

@@ -34,7 +34,7 @@ class Drag(MotionKind):
         return quats, rates.v * once + rates.a * twice, rates.w * decay, rates.v * decay + rates.a * once
 
     def rates(self, parts: Mapping[str, np.ndarray], window: Window) -> Rates:
-        """ "v", the excess of the velocity over "terminal", and the spin "w" are values at mid-window."""
+        """Rates at t_max; "v", the velocity minus "terminal", and the spin "w" are values at mid-window."""
         c = np.exp(np.clip(parts["log_c"], *LOGARITHMS))
         decay = np.exp(np.minimum(c * window.middle, _MOST_EXPONENT))
         terminal = parts.get("terminal", np.zeros(1))

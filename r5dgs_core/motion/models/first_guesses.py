@@ -16,7 +16,7 @@ _PACES = 25  # number of tried frequencies
 _PAIRED = 18  # the same for sums of two oscillations
 _DECAYS = (0.3, 1.0, 2.5, 4.0)  # tried decay rates, per span
 _STARTS = 2  # number of guesses that are refined
-_GAIN = 9.0  # variances; a frequency that differs from zero by three standard deviations
+_GAIN = 9.0  # minimum gain of an oscillation over the simpler fit, in variances (three standard deviations)
 _RIDGE = 1e-4  # on a centre of rotation, in radii
 
 
@@ -142,7 +142,7 @@ def _swinging(blocks: Sequence[str], track: PoseTrack, window: Window, sweep: _S
 def pairs(track: PoseTrack, window: Window, clocks: Clocks) -> list[Guess]:
     """Guesses of a sum of two oscillations of positions and rotations, most promising first.
 
-    Empty if the best pair of frequencies fits no better than one of them.
+    Empty if no pair of frequencies fits significantly better than the best single frequency.
     """
     if not window.may_swing or len(track) < 10:
         return []

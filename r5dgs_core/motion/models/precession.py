@@ -12,12 +12,8 @@ from ..pose_track import PoseTrack, Window
 from . import first_guesses
 from .base import Block, Curve, MotionKind, MotionModel, Rates
 
-_SHARES = (
-    0.0,
-    0.5,
-    -0.5,
-    1.0,
-)  # tried shares of the mean spin in the precession; the rate of the spin leaves them open
+# Tried precessions, as fractions of the mean spin, which does not determine them.
+_SHARES = (0.0, 0.5, -0.5, 1.0)
 
 
 class Precession(MotionKind):

@@ -64,7 +64,7 @@ def test_midpoint_steps_that_are_too_long_warn_once(caplog):
 
     with caplog.at_level(logging.WARNING):
         assert play(0.11) == 1
-        assert "rad a step" in caplog.text
+        assert "rad each" in caplog.text
         assert play(0.09) == 0
         assert play(5.0, duration=0.0) == 0
         assert play(5.0, kind=torch.tensor) == 0

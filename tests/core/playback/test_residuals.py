@@ -262,7 +262,7 @@ def test_scenes_without_canonical_centres_lack_the_literal_form():
 
 
 def test_a_mode_without_data_is_refused():
-    with pytest.raises(ValueError, match="has rigid, not 'standard'"):
+    with pytest.raises(ValueError, match="expected one of rigid for the scene .* got 'standard'"):
         scene_player.frame(make_scene(), 1.0, "standard")
 
 
