@@ -515,7 +515,7 @@ IMPORT_LIGHT_TIER = """
 sys.path.insert(0, root)
 import r5dgs_core.errors, r5dgs_core.strict_json, r5dgs_core.user_settings
 seen = []
-for name in ("motion", "scene", "color", "formats", "playback", "editing", "search", "protocol"):
+for name in ("motion", "scene", "color", "formats", "playback", "editing", "search", "shapes", "protocol"):
     package = importlib.import_module(f"r5dgs_core.{name}")
     for info in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         importlib.import_module(info.name)
