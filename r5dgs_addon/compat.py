@@ -68,6 +68,11 @@ def make_gaussian_splat(cloud: bpy.types.PointCloud) -> bool:
     return True
 
 
+def is_gaussian_splat(cloud: bpy.types.PointCloud) -> bool:
+    """Return True if Blender itself draws a point cloud as Gaussian splats."""
+    return getattr(cloud, "type", "") == "GAUSSIAN_SPLAT"
+
+
 def new_fcurves(obj: bpy.types.Object, name: str):
     """Assign a new, empty action to an object and return its F-curve collection.
 

@@ -168,7 +168,7 @@ ADDON_ALLOWED = {
     "color": {"compat", "ui", "scene"},
     "worker": {"ui", "process_group", "find_python", "preferences", "scene"},
     "engine": {"compat", "ui", "scene", "color", "worker"},
-    "splats": {"ui", "scene", "engine"},
+    "splats": {"compat", "ui", "scene", "engine"},
     "language": {"ui", "preferences", "scene", "worker", "engine"},
     "motion": {"compat", "ui", "scene", "engine"},
     "build_scene": {"compat", "scene", "motion"},

@@ -11,14 +11,17 @@ from . import loaded_scenes
 SAMPLE = 2000  # Gaussians that the best camera is chosen by
 NEAREST, FARTHEST = 1e-3, 100.0  # clip range as factors of the distance to the objects
 DEFAULT_CLIP = (0.01, 1000.0)  # Blender's own, which is only widened
+VIEW_SENSOR_MM = 72.0  # width that the focal length of a 3D view refers to, on the longer side of its region
+LENSES_MM = (1.0, 250.0)  # of 3D views
 
 
 def remember(collection: bpy.types.Collection, scene: Scene) -> None:
-    """Store the pose of the best captured camera and the distance to the objects; nothing if there are no cameras."""
+    """Store the view of the best captured camera and the distance to the objects; nothing if there are no cameras."""
     if scene.cameras:
         camera = scene.cameras[best(scene)]
-        pose = cameras.cam_world_to_opengl(camera.T_cam_world)
-        collection[loaded_scenes.VIEW] = [*pose.ravel().tolist(), distance(scene, camera)]
+        pose, k = cameras.cam_world_to_opengl(camera.T_cam_world), camera.intrinsics
+        size = camera.width / k[0, 0], camera.height / k[1, 1]
+        collection[loaded_scenes.VIEW] = [*pose.ravel().tolist(), distance(scene, camera), *map(float, size)]
 
 
 def best(scene: Scene) -> int:
@@ -43,13 +46,14 @@ def clip_range(distance: float) -> tuple[float, float]:
 def show(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
     """Look at a loaded scene in all 3D views of the windows that show the active Blender scene.
 
-    Views through a camera and locked ones keep their view. The clip range of a view is widened if needed.
+    Views through a camera and locked ones keep their view. The clip range of a view is widened if needed. The camera's
+    picture fits into the view.
 
     Returns:
         Number of views that changed.
     """
     found = np.array(collection.get(loaded_scenes.VIEW, ()), np.float64)
-    if found.shape != (17,) or not np.isfinite(found).all() or collection.r5dgs.root is None:
+    if found.shape not in ((17,), (19,)) or not np.isfinite(found).all() or collection.r5dgs.root is None:
         return 0
     root = np.array(collection.r5dgs.root.matrix_world, np.float64)
     pose, target = found[:16].reshape(4, 4), np.eye(4)[3]
@@ -62,15 +66,31 @@ def show(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
     changed = 0
     for window in context.window_manager.windows:
         areas = window.screen.areas if window.scene == context.scene else ()
-        for space in (area.spaces.active for area in areas if area.type == "VIEW_3D"):
+        for area in (area for area in areas if area.type == "VIEW_3D"):
+            space = area.spaces.active
             view = space.region_3d
             if view.view_perspective == "CAMERA" or view.lock_rotation or space.region_quadviews:
                 continue
             view.view_rotation, view.view_location, view.view_distance = rotation, target, length
             start, end = clip_range(length)
             space.clip_start, space.clip_end = min(space.clip_start, start), max(space.clip_end, end)
+            region = next(region for region in area.regions if region.type == "WINDOW")
+            space.lens = _lens(region, found[17:]) or space.lens
             changed += 1
     return changed
+
+
+def _lens(region: bpy.types.Region, size: np.ndarray) -> float | None:
+    """Focal length of a 3D view that shows a picture as large as possible, or None if it is not known.
+
+    Args:
+        region: Region of the view.
+        size: Width and height of the picture at distance 1, empty for scenes of older versions. [2] or [0]
+    """
+    shown = np.array([region.width, region.height], np.float64)
+    if not len(size) or shown.min() < 2 or size.min() <= 0:
+        return None
+    return float(np.clip(VIEW_SENSOR_MM * (shown / size).min() / shown.max(), *LENSES_MM))
 
 
 def _looking(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray | None:

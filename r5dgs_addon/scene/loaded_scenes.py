@@ -8,7 +8,8 @@ import numpy as np
 
 ORIGIN = "r5dgs_origin"  # custom property of the root, because Blender's built-in vectors are float32
 SKY = "r5dgs_sky"  # custom property of the collection: coefficients of the sky
-VIEW = "r5dgs_view"  # the same: pose of the best captured camera, OpenGL axes, and distance to the objects
+# The same: pose of the best captured camera (OpenGL axes), distance to the objects, size of the picture at distance 1.
+VIEW = "r5dgs_view"
 LIGHT = "r5dgs_light"  # the same: direction of the light that shading depends on
 
 

@@ -2,11 +2,13 @@
 
 Splats are drawn by the add-on. Points are fast for any number of Gaussians. Ellipsoids show size, orientation and
 opacity, but are slower. They are instances created by a modifier. Splats and ellipsoids have a modifier that passes the
-points on with radius 0, so that Blender does not draw them and the evaluated point cloud keeps them.
+points on with radius 0, so that Blender does not draw them and the evaluated point cloud keeps them. Point clouds that
+Blender itself draws as Gaussian splats are left to it.
 """
 
 import bpy
 
+from .. import compat
 from . import point_clouds
 
 SPLATS, POINTS, ELLIPSOIDS = "SPLATS", "POINTS", "ELLIPSOIDS"
@@ -31,11 +33,15 @@ def show(collection: bpy.types.Collection, display: str) -> None:
         display: Key of `ITEMS`.
     """
     clouds = [obj for obj in collection.all_objects if obj.r5dgs.role == "CLOUD" and obj.library is None]
-    for name, wanted, make in ((MODIFIER, ELLIPSOIDS, _ellipsoids), (SPLATS_MODIFIER, SPLATS, _hidden_points)):
-        present = [(cloud, cloud.modifiers.get(name)) for cloud in clouds]
+    drawn_here = [cloud for cloud in clouds if not compat.is_gaussian_splat(cloud.data)]
+    for name, wanted, make, users in (
+        (MODIFIER, ELLIPSOIDS, _ellipsoids, clouds),
+        (SPLATS_MODIFIER, SPLATS, _hidden_points, drawn_here),
+    ):
+        present = [(cloud, cloud.modifiers.get(name)) for cloud in users]
         used = {found.node_group for _, found in present if found is not None and found.node_group is not None}
         tree = None
-        if display == wanted:
+        if display == wanted and users:
             current = [found.node_group for cloud, found in present if found is not None and not hides_points(cloud)]
             tree = next(filter(None, current), None) or make()
             for cloud, found in present:

@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core.playback import affine_transform, posing
+from .. import compat
 from ..engine import visible_clouds
 from ..scene import evaluated_points, loaded_scenes, viewport_display
 from . import gaussian_table
@@ -106,6 +107,8 @@ def layer_key(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer) -> LayerK
 def shown(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None) -> VisibleSplats | None:
     """Return the visible splats of the loaded scenes with display *Splats*, or None if there are none.
 
+    Point clouds that Blender itself draws as Gaussian splats are left out.
+
     Args:
         depsgraph: Evaluated depsgraph.
         space: 3D view whose local view is respected.
@@ -115,6 +118,7 @@ def shown(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = 
     """
     scenes, clouds = visible_clouds.instances(depsgraph, space, edits=False)
     clouds = [one for one in clouds if one.seen and one.collection.r5dgs.display == viewport_display.SPLATS]
+    clouds = [one for one in clouds if not compat.is_gaussian_splat(one.object.data)]
     layer = _layers.setdefault(layer_key(depsgraph.scene, depsgraph.view_layer), _Layer())
     for one in clouds:
         if one.object.session_uid not in layer.clouds:

@@ -343,3 +343,53 @@ def test_loaded_scenes_survive_disabling_and_enabling_the_extension(blender, ext
         extension.register()
     assert {obj.name for obj in blender.data.objects} == before
     assert plays(blender, loaded(blender), scene_path)
+
+
+def radii(bpy, name="mug"):
+    """Radii with which a viewport shows the points of a cloud."""
+    cloud = bpy.data.objects[name].evaluated_get(bpy.context.evaluated_depsgraph_get())
+    return {point.radius for point in cloud.data.points}
+
+
+def test_points_are_visible_while_the_extension_is_disabled(blender, extension, scene_path):
+    motions.load(blender, scene_path)
+    assert radii(blender) == {0.0}
+    extension.unregister()
+    try:
+        assert min(radii(blender)) > 0
+    finally:
+        extension.register()
+    assert radii(blender) == {0.0}
+
+
+@pytest.mark.parametrize("copy", [False, True])
+def test_a_blend_opened_without_the_extension_shows_points(blender, extension, scene_path, tmp_path, copy):
+    motions.load(blender, scene_path)
+    blend = str(tmp_path / "shared.blend")
+    blender.ops.wm.save_as_mainfile(filepath=blend, copy=copy)
+    assert radii(blender) == {0.0}, "saving changed the open file"
+    extension.unregister()
+    try:
+        blender.ops.wm.open_mainfile(filepath=blend)
+        assert min(radii(blender)) > 0
+    finally:
+        extension.register()
+    blender.ops.wm.open_mainfile(filepath=blend)
+    assert radii(blender) == {0.0}
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_imported_scenes_hide_their_points_too(blender, library, link):
+    bring(blender, library, link=link)
+    blender.context.view_layer.update()
+    assert radii(blender) == {0.0}
+
+
+def test_a_cloud_without_its_scene_is_visible(blender, library):
+    with blender.data.libraries.load(str(library)) as (_, target):
+        target.objects = ["mug"]
+    blender.context.scene.collection.objects.link(target.objects[0])
+    root = target.objects[0].parent.parent
+    assert root.r5dgs.role == "ROOT"
+    blender.context.view_layer.update()
+    assert min(radii(blender)) > 0

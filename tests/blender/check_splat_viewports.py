@@ -38,6 +38,7 @@ def checks(path: str, folder: str = ""):
     """Run the checks. Yields the seconds to wait after each step."""
     global out
     out = Path(folder or tempfile.mkdtemp())
+    out.mkdir(parents=True, exist_ok=True)
     bpy.context.preferences.view.show_splash = False
     for obj in list(bpy.data.objects):
         bpy.data.objects.remove(obj)

@@ -56,6 +56,20 @@ def test_views_look_from_the_camera_that_sees_the_objects_best(blender, tmp_path
     np.testing.assert_allclose(again, seen_from, atol=1e-4)
 
 
+@pytest.mark.parametrize("size", [(100, 80), (80, 300)])
+def test_the_picture_of_the_camera_fits_into_the_view(blender, tmp_path, size):
+    scene = scenes.make_scene(n=200, objects=2)
+    camera = looking(np.array([4.0, -5.0, 2.0]), np.zeros(3), "c")
+    camera = dataclasses.replace(camera, width=size[0], height=size[1])
+    motions.load(blender, scene_file.write(dataclasses.replace(scene, cameras=(camera,)), tmp_path / "scene.r5dgs"))
+    (space,) = spaces(blender)
+    (area,) = (area for area in blender.context.window.screen.areas if area.type == "VIEW_3D")
+    region = next(one for one in area.regions if one.type == "WINDOW")
+    pixels = space.lens / 72 * max(region.width, region.height)  # focal length; see Blender's `CAMERA_PARAM_ZOOM_INIT`
+    shown = pixels * np.array(size) / 90 / (region.width, region.height)
+    assert shown.max() == pytest.approx(1, abs=1e-4) and region.width > 1
+
+
 def test_a_view_through_a_camera_and_the_users_choice_are_respected(blender, tmp_path):
     path = scene_file.write(scenes.make_scene(n=200), tmp_path / "scene.r5dgs")
     (space,) = spaces(blender)

@@ -6,7 +6,7 @@ import pytest
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
-from tests.support import scenes
+from tests.support import motions, scenes
 
 SIGMAS = 1.5
 
@@ -77,6 +77,15 @@ def test_splats_hide_their_points_in_viewports_only(blender, scene_path):
     shown = cloud.evaluated_get(blender.context.evaluated_depsgraph_get()).data
     assert len(shown.points) == len(cloud.data.points) and {point.radius for point in shown.points} == {0.0}
     assert min(point.radius for point in cloud.data.points) > 0 and not cloud.modifiers[0].show_render
+
+
+def test_what_blender_draws_as_splats_is_left_to_it(blender, scene_path, monkeypatch):
+    monkeypatch.setattr(motions.addon("compat"), "is_gaussian_splat", lambda cloud: cloud.name == "mug")
+    blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    clouds = {obj.name: obj for obj in blender.data.objects if obj.r5dgs.role == "CLOUD"}
+    assert not clouds["mug"].modifiers and clouds["red apple"].modifiers
+    monkeypatch.setattr(motions.addon("compat"), "is_gaussian_splat", lambda cloud: True)
+    assert motions.addon("splats.visible_splats").shown(blender.context.evaluated_depsgraph_get()) is None
 
 
 def test_one_undo_reverts_the_display_and_redo_restores_it(blender, scene_path):
