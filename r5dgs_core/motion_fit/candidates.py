@@ -90,7 +90,10 @@ class Candidate:
 
     def pack(self, guess: Mapping[str, np.ndarray]) -> np.ndarray:
         """Parameters from values of the blocks. [P]"""
-        return np.concatenate([guess[name] for name in ("r", "e", *self.blocks)])
+        names = ("r", "e", *self.blocks)
+        if missing := [name for name in names if name not in guess]:
+            raise ValueError(f"candidate {self.name!r}: starts() gives no value for the block {missing[0]!r}")
+        return np.concatenate([guess[name] for name in names])
 
     def rates(self, theta: np.ndarray) -> Rates:
         """Rates at t_max. [..., P] -> [..., 3], [..., 1]"""

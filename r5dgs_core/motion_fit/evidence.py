@@ -99,8 +99,12 @@ def variance(solution: Solution, track: PoseTrack, noise: Noise, evidence: Evide
         pull = np.einsum("psc,sc->p", columns, white)
         loss = max(float((white**2).sum() - pull @ np.linalg.pinv(normal, hermitian=True) @ pull), _LEAST_LEVEL**2)
         logs = 12 * np.log(rest).sum() + np.linalg.slogdet(normal)[1] + free * math.log(loss)
+        if not math.isfinite(logs):  # only a weak prior determines a direction, and exact poses hide it in rounding
+            continue
         likelihoods.append(-0.5 * float(logs))
         variances.append(loss / free * (1 + rho) / (1 - rho))
+    if not likelihoods:
+        return evidence.variance
     shares = np.exp(np.array(likelihoods) - max(likelihoods))
     return max(evidence.variance, float(shares @ np.array(variances) / shares.sum()))
 

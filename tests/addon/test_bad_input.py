@@ -182,7 +182,8 @@ def test_actions_without_a_scene_raise(blender, asked, name):
 
 def test_every_action_needs_a_scene_or_is_known_to_need_none(blender):
     needing = {name for names in WITHOUT_A_SCENE.values() for name in names}
-    assert needing | NEEDING_NONE == {name for name in dir(blender.ops.r5dgs) if not name.startswith("_")}
+    actions = {name for name in dir(blender.ops.r5dgs) if not name.startswith("_")}
+    assert needing | NEEDING_NONE == actions, "WITHOUT_A_SCENE and NEEDING_NONE above must list all operators"
 
 
 def test_loading_without_a_path_raises(blender):

@@ -122,4 +122,5 @@ def test_undo_and_redo_restore_everything(blender, loaded, mug, name):
 def test_undo_of_every_operator_is_tested(extension):
     operators = importlib.import_module("r5dgs.operators")
     found = {cls.bl_idname.partition(".")[2]: cls for module in operators.modules() for cls in module.CLASSES}
-    assert {name for name, cls in found.items() if "UNDO" in getattr(cls, "bl_options", ())} == set(OPERATORS)
+    with_undo = {name for name, cls in found.items() if "UNDO" in getattr(cls, "bl_options", ())}
+    assert with_undo == set(OPERATORS), "OPERATORS above must list exactly the operators with UNDO"

@@ -20,7 +20,10 @@ def add(folder: Path) -> Path:
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("__init__.py", "blender_manifest.toml"):
         shutil.copy(ROOT / name, folder / name)
-    kind, rate = pages.blocks(pages.EXTENDING, "Motion model")
+    shown = pages.blocks(pages.EXTENDING, "Motion model")
+    if len(shown) != 2:
+        raise ValueError(f"{pages.EXTENDING}, Motion model: expected 2 blocks of Python, found {len(shown)}")
+    kind, rate = shown
     models = folder / "r5dgs_core/motion/models"
     (models / f"{NAME}.py").write_text(kind)
     _insert(models / "__init__.py", r"MENU_NUMBERS = \{\n(?:    .*\n)*", f'    "{NAME}": {NUMBER},\n')

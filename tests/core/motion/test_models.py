@@ -455,6 +455,16 @@ def test_the_pages_describe_each_kind(kind):
     pages = Path(__file__).parents[3] / "docs"
     assert f"| `{kind}` |" in (pages / "reference/conventions.md").read_text()
     assert f"*{models.KINDS[kind].label}*" in (pages / "user/motion.md").read_text()
+    assert f"`{models.KINDS[kind].word}`" in (pages / "user/objects.md").read_text()
+
+
+def test_the_row_motions_lists_the_kinds_and_rates_that_need_the_feature():
+    page = (Path(__file__).parents[3] / "docs/reference/scene_format.md").read_text()
+    (row,) = (line for line in page.splitlines() if line.startswith("| `motions` |"))
+    basic = {"static", "translation", "ballistic_spin", "constant_twist", "world_twist", "free_top"}
+    rates = {*models.FIELDS} - {*models.RATES, "frequency"}
+    names = {*models.KINDS} - basic | {name for name in rates if not name.startswith("second_")}
+    assert {name for name in names if f"`{name}`" not in row} == set()
 
 
 @pytest.mark.parametrize("data", [{"kind": "teleport"}, {"kind": "static", "jump": [1, 0, 0]}])

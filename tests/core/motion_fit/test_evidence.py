@@ -1,4 +1,5 @@
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -52,3 +53,20 @@ def test_two_poses_have_the_variance_of_the_evidence():
     solution = candidates.solve(candidates.BY_NAME["translation + spin"], track, noise)
     least = evidence.Evidence(2, 1.0, 1.0)
     assert evidence.variance(solution, track, noise, least) == 1.0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 1.0])
+def test_exact_poses_that_leave_a_direction_undetermined_give_a_finite_variance(share):
+    times = np.linspace(0, 1, 15)
+    spin = models.MotionModel("ballistic_spin", angular_velocity=[1, 1, 0])
+    quats, d, _, _ = problems.observe(spin, times, np.random.default_rng(0))
+    track, noise = PoseTrack(times - 1, quats, d, np.ones(15)), candidates.Noise(1e-9, 1e-9)
+    law = dataclasses.replace(candidates.BY_NAME["precession"], window=track.window)
+    w = spin.angular_velocity
+    # Only the sum of p and s affects a spin about a fixed axis.
+    start = law.pack({"r": 0 * w, "e": 0 * w, "p": share * w, "s": (1 - share) * w, "u": 0 * w})
+    solution = candidates.solve(law, track, noise, [start])
+    least = evidence.Evidence.of([solution])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isfinite(evidence.variance(solution, track, noise, least))

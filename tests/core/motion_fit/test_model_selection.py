@@ -1,7 +1,10 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
 from r5dgs_core.motion import models, rotations
+from r5dgs_core.motion.pose_track import PoseTrack
 from r5dgs_core.motion_fit import candidates, evidence, kinks, model_selection
 from tests.support import problems
 from tests.support.problems import MOTIONS, RADIUS, SIZE, T_MAX
@@ -12,6 +15,7 @@ TIMES = np.linspace(0, T_MAX, 15)
 UNEVEN = np.sort(np.r_[0.0, T_MAX, np.random.default_rng(9).uniform(0, T_MAX, 13)])
 UP = np.array([0.0, 0.0, 1.0])
 HORIZON = np.array([0.25, 1.25])  # t = 1 and t = 2
+FITTED = [name for name, (model, _) in MOTIONS.items() if models.KINDS[model.kind].fits_by_default]
 
 
 def fitted(name, rng, sigma_t=0.0, sigma_r=0.0, times=TIMES, **options):
@@ -21,7 +25,7 @@ def fitted(name, rng, sigma_t=0.0, sigma_r=0.0, times=TIMES, **options):
     return fit, problems.error_percent(fit.model, truth, HORIZON, last_quat, last)
 
 
-@pytest.mark.default_cases(
+TYPICAL = (
     "static",
     "ballistic, spinning",
     "hinge, accelerating",
@@ -34,12 +38,34 @@ def fitted(name, rng, sigma_t=0.0, sigma_r=0.0, times=TIMES, **options):
     "precession",
     "two oscillations",
 )
+FIRST_OF_KIND = {model.kind: name for name, (model, _) in reversed(MOTIONS.items())}
+OF_OTHER_KINDS = [name for kind, name in FIRST_OF_KIND.items() if kind not in {MOTIONS[n][0].kind for n in TYPICAL}]
+
+
+@pytest.mark.default_cases(*TYPICAL, *OF_OTHER_KINDS)
 @pytest.mark.parametrize("name", MOTIONS)
 def test_each_motion_is_recovered_without_noise(name):
-    fit, error = fitted(name, np.random.default_rng(0), 1e-7 * SIZE, 1e-7)
-    assert fit.chosen in MOTIONS[name][1]
+    _, names = MOTIONS[name]
+    family = None if name in FITTED else [*(law.name for law in candidates.FAMILY), *names]
+    fit, error = fitted(name, np.random.default_rng(0), 1e-7 * SIZE, 1e-7, candidates=family)
+    assert fit.chosen in names
     assert error.max() < 0.1
     assert not fit.rested
+
+
+@pytest.mark.parametrize("name", candidates.BY_NAME)
+@pytest.mark.parametrize("motion", ["pendulum", "two oscillations"])
+def test_the_first_guesses_of_each_candidate_have_values_of_all_its_blocks(name, motion):
+    quats, d, _, _ = problems.observe(MOTIONS[motion][0], TIMES, np.random.default_rng(6))
+    track = PoseTrack(TIMES - T_MAX, quats, d, np.ones(len(TIMES)))
+    law = dataclasses.replace(candidates.BY_NAME[name], window=track.window)
+    for theta in law.starts(track):
+        assert theta.shape == (law.parameters,)
+
+
+def test_a_block_without_a_first_guess_is_named():
+    with pytest.raises(ValueError, match="candidate 'spin': .*no value for the block 'w'"):
+        candidates.BY_NAME["spin"].pack({"r": np.zeros(3), "e": np.zeros(3)})
 
 
 @pytest.mark.default_cases("hinge")
@@ -54,7 +80,7 @@ def test_uneven_times_and_gaps_are_supported(name):
 def test_the_right_family_is_chosen_in_noise_and_beats_the_largest():
     rng = np.random.default_rng(2)
     right, ours, full = 0, [], []
-    chosen = list(MOTIONS.values())[::3]
+    chosen = [MOTIONS[name] for name in FITTED[::3]]
     for truth, names in chosen:
         quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
         fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
@@ -399,7 +425,7 @@ def test_unusable_tracks_are_refused(change, message):
 
 
 NOISE = 0.005 * SIZE, np.radians(1) / 3**0.5
-STUDIED = [name for name in MOTIONS if name not in ("pendulum", "spring", "screw")]
+STUDIED = [name for name in FITTED if name not in ("pendulum", "spring", "screw")]
 
 
 @pytest.mark.nightly
