@@ -207,7 +207,7 @@ class MotionKind:
         return np.ones(len(tau), np.int64)
 
     def moves(self, model: MotionModel) -> bool:
-        """True if the curve is not the identity at all times."""
+        """True if a vector rate that counts is not zero: a basic one or one of `fields`, except `center_offset`."""
         names = ({*RATES, *self.fields} & set(VECTORS)) - {"center_offset"}
         return any(getattr(model, name).any() for name in names)
 

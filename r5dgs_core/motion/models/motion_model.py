@@ -181,7 +181,7 @@ class MotionModel:
 
     @property
     def is_static(self) -> bool:
-        """True if `evaluate` returns the identity at every time."""
+        """True if there is no offset and the kind does not move (`MotionKind.moves`): all poses are the identity."""
         offset = self.offset_rotvec.any() or self.offset_displacement.any()
         return not (offset or KINDS[self.kind].moves(self))
 
