@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -88,10 +88,18 @@ class Widths:
         )
 
 
+def trusted(band: Band, radius: float) -> Band:
+    """Return a band with the time at which its half width becomes too large for a body of the given radius."""
+    widths = np.array(band.half_width) / radius
+    wide = np.flatnonzero(widths > WIDE)
+    until = _crossing(np.array(band.times), widths, int(wide[0])) if len(wide) else None
+    return replace(band, predictable_until=until)
+
+
 def _crossing(tau: np.ndarray, values: np.ndarray, row: int) -> float:
     """Time at which linear interpolation reaches `WIDE`, in the interval before a row."""
     if row == 0:
-        return 0.0
+        return float(tau[0])
     share = (WIDE - values[row - 1]) / (values[row] - values[row - 1])
     return float(tau[row - 1] + share * (tau[row] - tau[row - 1]))
 

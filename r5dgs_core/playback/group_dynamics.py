@@ -21,6 +21,8 @@ from ..motion import (
     se3,
     twist_propagation,
 )
+from ..motion import joint as joints
+from ..motion.joint import Joint
 from ..motion.models import STATIC, MotionModel
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
@@ -74,6 +76,11 @@ class GroupMotion:
         self._times, self._t_max = scene.tracks.times, scene.t_max
         self._scene, self._source = scene, source
         self._quats, self._displacements = knots(scene)
+        self._parts = parts_of(scene)
+        if self._parts:
+            self._displacements = self._displacements.copy()
+        for part, _ in self._parts:
+            self._quats[part.id], self._displacements[part.id] = local_knots(scene, part)
         self._slopes = (
             cubic_curves.slopes(self._times, self._quats),
             cubic_curves.slopes(self._times, self._displacements),
@@ -91,9 +98,8 @@ class GroupMotion:
 
     @functools.cached_property
     def _future(self) -> models.MotionStack:
-        return models.MotionStack(
-            [STATIC if g.follows is not None else m for g, m in zip(self._scene.groups, self.models, strict=True)]
-        )
+        own = [STATIC if g.follows is not None else m for g, m in zip(self._scene.groups, self.models, strict=True)]
+        return models.MotionStack(own)
 
     def poses(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Pose of every group relative to the bind state, as from `scene_player.group_poses`."""
@@ -102,6 +108,10 @@ class GroupMotion:
         if t < self._t_max:
             return self._observed(t)
         quats, displacements = self._future.poses(t - self._t_max)
+        if self._source == "fitted":
+            for part, joint in self._parts:
+                quats[part.id], displacements[part.id] = joint.poses(t - self._t_max)
+            self._carry(quats, displacements)
         for g, leader, matrix in self._followers:
             displacements[g] = matrix @ displacements[leader]
         return quats, displacements.clip(-FARTHEST, FARTHEST)
@@ -109,7 +119,9 @@ class GroupMotion:
     def _observed(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         times = self._times
         if t <= times[0]:
-            return rotations.normalize(self._quats[:, 0]), self._displacements[:, 0].copy()
+            quats, displacements = rotations.normalize(self._quats[:, 0]), self._displacements[:, 0].copy()
+            self._carry(quats, displacements)
+            return quats, displacements
         k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
         h = times[k + 1] - times[k]
         u = (t - times[k]) / h
@@ -117,7 +129,46 @@ class GroupMotion:
             cubic_curves.hermite(values[:, k], values[:, k + 1], slopes[:, k], slopes[:, k + 1], h, u)
             for values, slopes in zip((self._quats, self._displacements), self._slopes, strict=True)
         )
-        return rotations.normalize(q), d
+        q = rotations.normalize(q)
+        self._carry(q, d)
+        return q, d
+
+    def _carry(self, quats: np.ndarray, displacements: np.ndarray) -> None:
+        """Replace the motion of parts relative to their parents by that in the world, in place. [G, 4], [G, 3]"""
+        for part, joint in self._parts:
+            assert part.parent is not None
+            parent = quats[part.parent], displacements[part.parent]
+            own = quats[part.id], displacements[part.id]
+            pivot = self._scene.groups[part.parent].pivot
+            quats[part.id], displacements[part.id] = joints.composed(parent, pivot, own, joint.point, part.pivot)
+
+
+def parts_of(scene: Scene) -> list[tuple[MotionGroup, Joint]]:
+    """Return the groups with a parent, and their joints; parents come before their children."""
+    found, known = [], {g.id for g in scene.groups if g.joint is None}
+    waiting = [g for g in scene.groups if g.joint is not None]
+    while waiting:
+        ready = [g for g in waiting if g.parent in known]
+        if not ready:
+            raise ValueError("groups: the parents form a circle")
+        found += [(g, g.joint) for g in ready if g.joint is not None]
+        known |= {g.id for g in ready}
+        waiting = [g for g in waiting if g.id not in known]
+    return found
+
+
+def local_knots(scene: Scene, group: MotionGroup) -> se3.Pose:
+    """Poses of a group as `knots`; those of a part relative to its parent, about the joint's point. [S, 4], [S, 3]"""
+
+    def world(row: int) -> se3.Pose:
+        quats, displacements = knots(scene, slice(row, row + 1))
+        return quats[0], displacements[0]
+
+    if group.parent is None or group.joint is None:
+        return world(group.id)
+    above = scene.groups[group.parent]
+    quats, moves = joints.relative(world(above.id), above.pivot, world(group.id), group.pivot, group.joint.point)
+    return rotations.make_continuous(quats[::-1])[::-1], moves
 
 
 def knots(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@
     "features": [{"name": "origin", "required": true, "since": "0.2.0"}]
 
 A reader rejects a file with a required feature that it does not support, and skips an optional one. Names reserved for
-later releases: parts, hulls, trajectory, quantised.
+later releases: hulls, trajectory, quantised.
 """
 
 from __future__ import annotations
@@ -41,14 +41,16 @@ class Feature:
 ORIGIN = Feature("origin", required=True, since="0.2.0")
 MOTIONS = Feature("motions", required=True, since="0.2.0")
 EVENTS = Feature("events", required=False, since="0.2.0")
-_KNOWN_NAMES = {ORIGIN.name, MOTIONS.name, EVENTS.name}
+PARTS = Feature("parts", required=False, since="0.2.0")
+_KNOWN_NAMES = {ORIGIN.name, MOTIONS.name, EVENTS.name, PARTS.name}
 
 
 def _used(scene: Scene) -> list[Feature]:
     """Features that a scene needs."""
     found = [ORIGIN] if scene.origin.any() else []
     found += [MOTIONS] if any(not group.model.is_basic for group in scene.groups) else []
-    return found + ([EVENTS] if any(group.history.events for group in scene.groups) else [])
+    found += [EVENTS] if any(group.history.events for group in scene.groups) else []
+    return found + ([PARTS] if any(group.joint is not None for group in scene.groups) else [])
 
 
 def version(scene: Scene) -> int:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..motion import history
+from ..motion.joint import Joint
 from ..motion.models import MotionModel
 from .cameras import Camera
 from .lookup_table import Table
@@ -92,6 +93,8 @@ class MotionGroup:
         seen: First and last time at which masks localised the object; before them, the track is extrapolated or holds
             its first pose. None if never observed.
         history: Events in the observed time, and the confidence band of the motion past t_max.
+        parent: Group of another part of the same object that carries this one past t_max and in Blender, or None.
+        joint: Joint with the parent; None without a parent.
     """
 
     id: int
@@ -106,6 +109,8 @@ class MotionGroup:
     rigid_max: float = 0.0
     seen: tuple[float, float] | None = None
     history: history.History = history.NONE
+    parent: int | None = None
+    joint: Joint | None = None
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from .. import __version__, errors, findings, strict_json
+from ..motion.joint import Joint
 from ..motion.models import MotionModel
-from . import history_json
+from . import history_json, joint_json
 from .cameras import Camera
 from .json_row import Row
 from .lookup_table import POOLINGS, EmbeddingSource, EncoderCard, Table
@@ -125,6 +126,14 @@ def _read_group(row: Row) -> MotionGroup:
         rigid_max=row.get("rigid_max", float),
         seen=None if row.lacks("seen") else row.floats("seen", 2),
         history=findings.attempt(row.guard, lambda: history_json.read(row)),
+        parent=row.optional("parent", int),
+        joint=findings.attempt(row.guard, lambda: _read_joint(row)),
+    )
+
+
+def _read_joint(row: Row) -> Joint | None:
+    return (
+        None if row.lacks("joint") else joint_json.read(Row(row.get("joint", dict), f"{row.place}: joint", row.guard))
     )
 
 
@@ -185,6 +194,7 @@ def _group_tree(group: MotionGroup) -> dict[str, Any]:
         "rigid_max": float(group.rigid_max),
         "seen": None if group.seen is None else [float(t) for t in group.seen],
         **history_json.tree(group.history),
+        **({} if group.joint is None else {"parent": group.parent, "joint": joint_json.tree(group.joint)}),
     }
 
 

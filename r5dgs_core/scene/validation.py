@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import errors, findings
 from ..motion import models
-from . import array_shapes, cameras
+from . import array_shapes, cameras, part_checks
 from .lookup_table import Table
 from .row_runs import runs
 from .scene import DTYPES, EMBEDDINGS, GROUPS, ROLES, MotionGroup, Scene
@@ -103,6 +103,7 @@ def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> 
     for row, group in enumerate(_listed(scene.groups)):
         if group is not findings.UNREAD:
             _check_group(scene, place, row, group, object_ids, guard)
+    part_checks.check(scene, place, guard)
     for camera in _listed(scene.cameras):
         with guard():
             try:
@@ -315,7 +316,9 @@ def _check_group(
     with guard():
         if not (0 <= group.rigid_rms <= farthest and 0 <= group.rigid_max <= farthest):
             _fail(place, where, f"rigid residuals from 0 to {farthest:g}", (group.rigid_rms, group.rigid_max))
-    _check_model(group, f"{place}: {where}: model", guard)
+    _check_model(group.model, f"{place}: {where}: model", guard)
+    if group.joint is not None and group.joint is not findings.UNREAD:
+        _check_model(group.joint.model, f"{place}: {where}: joint: model", guard)
     with guard():
         if group.seen is not None and not group.seen[0] <= group.seen[1]:
             _fail(place, where, "'seen' as first and last time, in order", group.seen)
@@ -337,13 +340,13 @@ def _check_group(
             _fail(place, where, f"a follow_matrix (3, 3) of numbers up to {_LARGE:g}", matrix)
 
 
-def _check_model(group: MotionGroup, place: str, guard: findings.Guard) -> None:
+def _check_model(model: models.MotionModel, place: str, guard: findings.Guard) -> None:
     """Raise `SceneFileError` naming a rate that playback cannot use."""
     for name, limit in _MODEL_LIMITS.items():
         with guard():
-            value = np.max(np.abs(getattr(group.model, name)))
+            value = np.max(np.abs(getattr(model, name)))
             if not value <= limit:
                 _fail(place, name, f"numbers up to {limit:g}", f"{value:g}")
     with guard():
-        if group.model.radius < _LEAST_LENGTH or group.model.fade_time < _LEAST_STEP:
+        if model.radius < _LEAST_LENGTH or model.fade_time < _LEAST_STEP:
             _fail(place, "radius and fade_time", f"{_LEAST_LENGTH:g} and {_LEAST_STEP:g} or more", "less")
