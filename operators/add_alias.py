@@ -25,7 +25,7 @@ class R5DGS_OT_add_alias(polls.OfObject, bpy.types.Operator):
         found = self.found(context)
         entry = None if found is None else object_names.entry_of(*found)
         if entry is None or not loaded_scenes.is_own(found[0]):
-            self.report({"WARNING"}, "Select an object of a scene that was loaded into this file first")
+            self.report({"WARNING"}, "First select an object of a scene that was loaded into this file")
             return {"CANCELLED"}
         word = self.word.strip()
         if not word:

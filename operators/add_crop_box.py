@@ -7,7 +7,7 @@ from ..r5dgs_addon.scene import loaded_scenes, polls
 
 
 class R5DGS_OT_add_crop_box(polls.NeedsScene, bpy.types.Operator):
-    """Add a box around the objects. Move, turn and scale it, then select the Gaussians outside"""
+    """Add a box around the objects. Move, rotate and scale it, then select the Gaussians outside it"""
 
     bl_idname = "r5dgs.add_crop_box"
     bl_label = "Add Crop Box"

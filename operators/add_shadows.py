@@ -8,7 +8,7 @@ from ..r5dgs_addon.worker import worker_operator
 
 
 class R5DGS_OT_add_shadows(worker_operator.Waiting, bpy.types.Operator):
-    """Let meshes and Gaussians cast shadows on each other, by proxies of the Gaussians in the scene of the meshes"""
+    """Let meshes and Gaussians cast shadows on each other; adds proxies of the Gaussians to the scene of the meshes"""
 
     bl_idname = "r5dgs.add_shadows"
     bl_label = "Add Shadows"

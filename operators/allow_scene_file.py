@@ -1,4 +1,4 @@
-"""Allow operator: trust the scene file that a .blend names outside its folder."""
+"""Allow operator: trust the scene file of a .blend, which is outside the folder of the .blend."""
 
 import bpy
 from bpy.props import BoolProperty

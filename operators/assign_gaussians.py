@@ -9,7 +9,7 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_assign_gaussians(polls.OfObject, selected_points.NeedsSelected, bpy.types.Operator):
-    """Assign the selected Gaussians to the active object, with which they move from now on"""
+    """Assign the selected Gaussians to the active object; they then move with it"""
 
     bl_idname = "r5dgs.assign_gaussians"
     bl_label = "Assign to Object"

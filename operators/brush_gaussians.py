@@ -7,7 +7,7 @@ from ..r5dgs_addon.clean_up import stroke_operator
 
 
 class R5DGS_OT_brush_gaussians(stroke_operator.StrokeOperator, bpy.types.Operator):
-    """Select the Gaussians that a brush passes while the left mouse button is pressed"""
+    """Select the Gaussians under a brush while the left mouse button is pressed"""
 
     bl_idname = "r5dgs.brush_gaussians"
     bl_label = "Brush Gaussians"

@@ -62,7 +62,9 @@ class R5DGS_OT_capture_dataset(stepwise_operator.Running, bpy.types.Operator):
         min=0,
     )
     observed: StringProperty(
-        name="Observed", description="Names of observed cameras (patterns) or their collection; empty for all"
+        name="Observed",
+        description="Names of observed cameras (patterns) or their collection; empty for all cameras that are not "
+        "novel, or for none if Rig is Arc, Ring or Hemisphere",
     )
     novel: StringProperty(
         name="Novel", description="Names of novel cameras (patterns) or their collection", default="*novel*"
@@ -72,7 +74,7 @@ class R5DGS_OT_capture_dataset(stepwise_operator.Running, bpy.types.Operator):
         items=_items(
             cameras.RIGS,
             (
-                "An arc around the scene camera if the scene has fewer than three cameras",
+                "An arc around the scene camera if fewer than three cameras are observed",
                 "Only the scene's cameras",
                 "Cameras on an arc",
                 "Cameras on a ring",

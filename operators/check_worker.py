@@ -58,7 +58,7 @@ class R5DGS_OT_check_worker(worker_operator.Waiting, bpy.types.Operator):
         found, _ = answer
         versions = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
         seconds = time.monotonic() - self._began
-        compiled = f", rasterizer compiled in {seconds:.0f} s, once" if found["compiled"] else ""
+        compiled = f", rasterizer compiled in {seconds:.0f} s (first use only)" if found["compiled"] else ""
         width, height = found["size"]
         return (
             f"Worker ready: {self._job.python} ({versions}), {found['device']}{compiled}; "

@@ -9,7 +9,7 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_delete_gaussians(selected_points.NeedsSelected, bpy.types.Operator):
-    """Delete the selected Gaussians; an exported scene does not hold them"""
+    """Delete the selected Gaussians; exported scenes omit them"""
 
     bl_idname = "r5dgs.delete_gaussians"
     bl_label = "Delete Gaussians"

@@ -43,7 +43,8 @@ class R5DGS_OT_exact_mode(polls.NeedsScene, bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         self.report(
-            {"INFO"}, f"{plural.of(count, 'Gaussian', 'bend')}; Lock Interface is on, so that renders stay in step"
+            {"INFO"},
+            f"{plural.of(count, 'Gaussian', 'bend')}; Lock Interface is on, so that renders show the right frame",
         )
         return {"FINISHED"}
 

@@ -1,4 +1,4 @@
-"""Export Object Masks operator: object of each pixel as PNG masks and index EXR."""
+"""Export Object Masks operator: the object that each pixel shows, as PNG masks and index EXR."""
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
@@ -9,7 +9,7 @@ from ..r5dgs_addon.ui import stepwise_operator
 
 
 class R5DGS_OT_export_masks(stepwise_operator.Running, polls.NeedsCamera, bpy.types.Operator):
-    """Render the object of each pixel of the active camera in the worker and save it to files"""
+    """Save the object that each pixel of the active camera shows to image files, rendered by the worker"""
 
     bl_idname = "r5dgs.export_masks"
     bl_label = "Export Object Masks"

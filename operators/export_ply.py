@@ -12,7 +12,7 @@ FORMAT = registry.get("ply")
 
 
 class R5DGS_OT_export_ply(stepwise_operator.Running, bpy.types.Operator):
-    """Export Gaussians with all edits at their current place as PLY files for other splat tools"""
+    """Export Gaussians with all edits and at their current positions as PLY files for other splat tools"""
 
     bl_idname = "r5dgs.export_ply"
     bl_label = "Export Gaussians"

@@ -9,7 +9,7 @@ from ..r5dgs_addon.ui import plural
 
 
 class R5DGS_OT_isolate(polls.Selects, bpy.types.Operator):
-    """Hide the other objects of all loaded scenes in viewports and renders"""
+    """Hide all objects of loaded scenes in viewports and renders, except the selected or named ones"""
 
     bl_idname = "r5dgs.isolate"
     bl_label = "Isolate"
@@ -20,7 +20,10 @@ class R5DGS_OT_isolate(polls.Selects, bpy.types.Operator):
     )
     scene: StringProperty(name="Scene", description="Collection of the object's scene", options={"SKIP_SAVE"})
     object_id: IntProperty(
-        name="Object Id", description="Object to show instead", default=object_names.NOBODY, options={"SKIP_SAVE"}
+        name="Object Id",
+        description="Object to show; replaces prompt and selection",
+        default=object_names.NOBODY,
+        options={"SKIP_SAVE"},
     )
 
     def execute(self, context):
@@ -47,7 +50,7 @@ class R5DGS_OT_isolate(polls.Selects, bpy.types.Operator):
             return {"CANCELLED"}
         hidden = isolation.isolate(context, wanted)
         shown = ", ".join(known[collection][0][object_id] for collection, object_id in wanted)
-        self.report({"INFO"}, f"{shown}: {plural.of(hidden, 'other')} hidden; Un-Isolate shows all again")
+        self.report({"INFO"}, f"{shown}: {plural.of(hidden, 'other')} hidden; Un-Isolate restores their visibility")
         return {"FINISHED"}
 
 

@@ -54,7 +54,8 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
     frame_zero: FloatProperty(name="Frame of Time 0", description="Frame of scene time 0", default=1.0)
     t_end: FloatProperty(
         name="Extrapolate Until",
-        description="Scene time up to which motion is extrapolated; 0 for a third of the observed span, at least 1",
+        description="Scene time up to which motion is extrapolated; 0 for a third of the observed span after t_max, "
+        "but at least scene time 1",
         default=0.0,
         min=0.0,
     )
@@ -91,7 +92,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
     )
     bend: BoolProperty(
         name="Play Bending",
-        description="Play the motion of single Gaussians of objects that bend; Lock Interface is switched on for them",
+        description="Play the bending of objects from the motion of their single Gaussians; switches on Lock Interface",
         default=True,
     )
 
@@ -149,7 +150,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         if too_fast:
             self.report({"WARNING"}, too_fast)
         if scene.residuals is not None and not self.bend:
-            count = plural.of(len(scene.residuals.rows), "Gaussian", "deform")
+            count = plural.of(len(scene.residuals.rows), "Gaussian", "bend")
             self.report({"WARNING"}, f"{count} in the observed time; shown rigid, unless Exact Mode is on")
         return {"FINISHED"}
 

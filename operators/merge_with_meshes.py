@@ -14,7 +14,7 @@ ENGINES = (
 
 
 class R5DGS_OT_merge_with_meshes(polls.NeedsScene, bpy.types.Operator):
-    """Render the meshes of this scene among the Gaussians: makes a scene for them and compositor nodes"""
+    """Render the meshes of this scene together with the Gaussians; makes a scene for them and compositor nodes"""
 
     bl_idname = "r5dgs.merge_with_meshes"
     bl_label = "Merge with Meshes"
@@ -29,7 +29,9 @@ class R5DGS_OT_merge_with_meshes(polls.NeedsScene, bpy.types.Operator):
             mesh_merge.remove(scene)
         scene.render.engine = engine.ENGINE
         meshes = mesh_merge.add(scene, self.engine)
-        self.report({"INFO"}, f"F12 merges Gaussians with the meshes of '{meshes.name}'; its settings are there")
+        self.report(
+            {"INFO"}, f"F12 adds the meshes of the scene '{meshes.name}', which has the meshes' render settings"
+        )
         return {"FINISHED"}
 
 

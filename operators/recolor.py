@@ -11,7 +11,10 @@ def tint(operator: bpy.types.Operator, context: bpy.types.Context, factors) -> s
     wanted = [cloud for item in selection.selected(context) for cloud in object_names.clouds(*item)]
     linked = object_tint.recolor(wanted, factors)
     if linked:
-        operator.report({"WARNING"}, f"Linked from another file, make a library override first: {', '.join(linked)}")
+        operator.report(
+            {"WARNING"},
+            f"Linked from another file; first make a library override of: {', '.join(linked)}",
+        )
     return {"CANCELLED"} if len(linked) == len(wanted) else {"FINISHED"}
 
 

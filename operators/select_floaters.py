@@ -10,7 +10,7 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_select_floaters(polls.NeedsScene, bpy.types.Operator):
-    """Select the Gaussians that meet one of the criteria above"""
+    """Select the Gaussians that meet at least one of the criteria above"""
 
     bl_idname = "r5dgs.select_floaters"
     bl_label = "Select Floaters"

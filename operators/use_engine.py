@@ -22,7 +22,10 @@ class R5DGS_OT_use_engine(bpy.types.Operator):
         objections = display_to_linear.objections(scene)
         view = scene.view_settings.view_transform
         if objections:
-            self.report({"WARNING"}, f"Engine R5DGS; colors are not as trained with {', '.join(objections)}; {REMEDY}")
+            self.report(
+                {"WARNING"},
+                f"Engine R5DGS; colors differ from the trained ones because of: {', '.join(objections)}; {REMEDY}",
+            )
         elif loss is None:
             self.report({"INFO"}, "Engine R5DGS")
         elif loss.psnr < inverse_loss.ENOUGH_DB:

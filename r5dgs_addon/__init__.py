@@ -1,4 +1,4 @@
-"""Services of the add-on: objects, keyframes, properties, preferences, panels and the worker client."""
+"""Services of the extension: objects, keyframes, properties, preferences, panels and the worker client."""
 
 from . import panels, preferences
 from .clean_up import criteria, overlay

@@ -86,7 +86,7 @@ def ranges(scene: Scene) -> list[Range]:
 
 
 def homes(scene: Scene, parts: list[Range]) -> list[Range]:
-    """Return the ranges whose object collections hold the anchors.
+    """Return one range per anchor, whose object collection holds the anchor.
 
     Each motion group has one anchor; the pinned group 0 has one per object. The anchor of a body goes to the group's
     own object if that object has Gaussians in the group, otherwise to the object with the most Gaussians in it.

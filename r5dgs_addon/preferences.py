@@ -1,4 +1,4 @@
-"""Preferences of the add-on: worker Python, timeout, text encoder and trusted folders.
+"""Preferences of the extension: worker Python, timeout, text encoder and trusted folders.
 
 Preferences are read and written only in Blender's main thread. Other threads use a `Choice` created there. The search
 for a Python does not touch Blender's data, so it can run in any thread.
@@ -60,7 +60,7 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
     )
     text_encoder: StringProperty(
         name="Text Encoder",
-        description="Folder of the text encoder used for the scenes' lookup tables, for words they do not store; "
+        description="Folder of the encoder that made the scenes' lookup tables, for words that the tables do not hold; "
         "'text' for the installed package",
         subtype="DIR_PATH",
     )
@@ -96,7 +96,7 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
 
 
 def get() -> "R5DGS_AP_preferences | None":
-    """Return the preferences, or None if the add-on is registered without being enabled as an extension."""
+    """Return the preferences, or None if the code is registered without being enabled as an extension."""
     addon = bpy.context.preferences.addons.get(base_package)
     return addon.preferences if addon else None
 

@@ -30,10 +30,11 @@ class CaptureSettings:
         val_between: True to render novel views half-way between observed times, too.
         test_every: Stride of the times after t_max that are rendered.
         test_views: Number of observed views in test, in addition to all novel ones.
-        observed: Names of the observed cameras: patterns such as "cam*, left", or a collection; "" for all.
-        novel: The same for the novel cameras.
-        rig: Generated cameras: "NONE", "ARC", "RING", "HEMISPHERE", or "AUTO", which adds an arc around the scene
-            camera if the scene has fewer than three observed cameras.
+        observed: Names of the observed cameras: patterns such as "cam*, left", or a collection; "" for all that are not
+            novel, or for none if ``rig`` is "ARC", "RING" or "HEMISPHERE".
+        novel: Names of the novel cameras, likewise; "" for none.
+        rig: Generated cameras: "NONE", "ARC", "RING", "HEMISPHERE", or "AUTO", which is an arc around the scene
+            camera if fewer than three cameras are observed; it replaces them if ``observed`` is "".
         rig_observed: Number of generated observed cameras.
         rig_novel: Number of generated novel cameras.
         rig_target: Point, or name of the object, that the rig looks at; "" for the centre of the objects.

@@ -61,7 +61,7 @@ class R5DGS_PG_clean_up(bpy.types.PropertyGroup):
     by_opacity: _switch("Faint", "Select Gaussians with a low opacity")
     opacity: FloatProperty(
         name="Opacity Below",
-        description="Opacity of a Gaussian below which it is selected, from 0 to 1",
+        description="Gaussians with a lower opacity are selected (0 to 1)",
         default=0.02,
         min=0.0,
         max=1.0,
@@ -70,19 +70,21 @@ class R5DGS_PG_clean_up(bpy.types.PropertyGroup):
         update=_follow,
     )
     by_size: _switch("Large", "Select Gaussians that are large for their object")
-    size: _share("Size Above", 100.0, "Largest standard deviation above which a Gaussian is selected")
+    size: _share("Size Above", 100.0, "A Gaussian is selected if its largest standard deviation exceeds this")
     by_isolation: _switch("Isolated", "Select Gaussians with few neighbors of the same object")
-    isolation: _share("Within Distance", 10.0, "Size of the neighborhood")
+    isolation: _share(
+        "Within Distance", 10.0, "Size of grid cells; the neighbors of a Gaussian are in its cell and the 26 around it"
+    )
     neighbors: IntProperty(
         name="Neighbors Below",
-        description="Number of neighbors below which a Gaussian is selected",
+        description="Gaussians with fewer neighbors are selected",
         default=3,
         min=1,
         soft_max=50,
         update=_follow,
     )
     by_distance: _switch("Distant", "Select Gaussians far from the center of their object")
-    distance: _share("Distance Above", 300.0, "Distance above which a Gaussian is selected")
+    distance: _share("Distance Above", 300.0, "Gaussians at a larger distance are selected")
     by_box: _switch("Crop Box", "Select Gaussians on one side of the crop box", False)
     box: PointerProperty(
         name="Box",

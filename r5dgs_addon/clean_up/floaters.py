@@ -33,7 +33,7 @@ def is_isolated(means: np.ndarray, share: float, fewest: int) -> np.ndarray:
     Args:
         means: Centres of one object. [n, 3]
         share: Size of the cells of a grid, as a share of the object's radius.
-        fewest: Smallest number of other Gaussians, in a Gaussian's cell and the 26 around it, that is not isolated.
+        fewest: A Gaussian is isolated if its cell and the 26 around it hold fewer other Gaussians than this.
 
     Returns:
         The mask. [n]

@@ -60,9 +60,9 @@ def _take(
     members: list[bpy.types.Object],
     use: Callable[[bpy.types.Object, np.ndarray], object] = lambda cloud, chosen: None,
 ) -> int:
-    """Remove the selected points of clouds after their use. Returns their number.
+    """Call ``use`` for each cloud, then remove the selected points. Returns their number.
 
-    Clouds that keep no points are removed. Copies of an object go on sharing their points.
+    Clouds that keep no points are removed. Copies of an object still share their points.
     """
     kept: dict[bpy.types.PointCloud, bpy.types.PointCloud | None] = {}
     total = 0
@@ -82,7 +82,7 @@ def _take(
 
 
 def _part(cloud: bpy.types.Object, home: bpy.types.Object, chosen: np.ndarray, name: str) -> bpy.types.Object:
-    """Make a cloud of some points of another, for the object of ``home`` and moving with its anchor. [n]"""
+    """Copy the points in a mask [n] to a new cloud, which belongs to the object of ``home`` and its anchor."""
     part = cloud.copy()
     part.name, part.data = name, _unselected(point_subset.of(cloud.data, chosen))
     part.data.name = part.name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-FRONT = 0.5  # a Gaussian is in front if at least this share of its light passes those before it
+FRONT = 0.5  # a Gaussian is in front if the Gaussians before it let at least this share of its light through
 _FINEST = 4.0  # smallest cell in which Gaussians hide each other, in pixels
 
 

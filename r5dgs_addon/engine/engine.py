@@ -87,8 +87,8 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         if objections:
             self.report(
                 {"WARNING"},
-                f"R5DGS: colors are not as trained with {', '.join(objections)}; press 'Show Colors as "
-                "Trained' in the render properties",
+                f"R5DGS: colors differ from the trained ones because of: {', '.join(objections)}; press 'Show Colors "
+                "as Trained' in the render properties",
             )
         transparent = scene.render.film_transparent
         passes = render_passes.of_layer(layer, mesh_merge.of(scene) is not None)
@@ -119,7 +119,13 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
     def _seen(
         self, depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object | None, point: np.ndarray | None = None
     ) -> render_request.VisibleParts:
-        """Return the visible parts, seen by a stereo camera or else by the scene's, and by a point of its lens."""
+        """Return the visible parts as a camera sees them.
+
+        Args:
+            depsgraph: Evaluated depsgraph.
+            camera: Camera of a stereo view, or None for the scene's.
+            point: Point of the lens that the rays pass, or None for the pinhole camera.
+        """
 
         def view(points):
             found = view_cameras.of_camera(depsgraph, points, eye=stereo.eye(self, camera))

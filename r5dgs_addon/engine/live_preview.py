@@ -29,7 +29,7 @@ def running() -> bool:
 
 
 def message() -> str:
-    """Error message if windows is no image, or ""."""
+    """Error of the last preview image, or ""."""
     return _message
 
 

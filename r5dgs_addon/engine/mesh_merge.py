@@ -4,9 +4,11 @@ F12 of the scene with the Gaussians renders both scenes, as its compositor uses 
 
     coverage * (shadows * front + visible * meshes) + (1 - coverage) * shadows * Gaussians
 
-with the anti-aliased coverage of the meshes, their straight colours, the pass `render_passes.FRONT`: the Gaussians in
-front of the meshes, premultiplied, and the visible share of the meshes behind them; and the shadows of the meshes on
-the Gaussians, 1 without `mesh_shadows`.
+    coverage  anti-aliased coverage of the meshes
+    meshes    their straight colours
+    front     Gaussians in front of the meshes, premultiplied (pass `render_passes.FRONT`)
+    visible   share of the meshes that these Gaussians let through (the same pass)
+    shadows   shadows of the meshes on the Gaussians; 1 without `mesh_shadows`
 """
 
 import bpy

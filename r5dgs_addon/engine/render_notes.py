@@ -20,7 +20,10 @@ def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> 
     others = [obj.original for obj in depsgraph.objects if obj.type in solid] if depsgraph is not None else []
     held = sorted({obj.name for obj in others if visible_clouds.is_held_out(obj, None, depsgraph)})
     if held:
-        notes.append(f"{', '.join(held)}: hold-outs other than clouds do not cut Gaussians; merge them by depth")
+        notes.append(
+            f"{', '.join(held)}: only hold-out point clouds cut Gaussians; to let these objects hide Gaussians, use "
+            "Merge with Meshes"
+        )
     notes += mesh_merge.notes(scene)
     return notes + [note for one in loaded_scenes.shown(scene) for note in evaluated_points.notes(one)]
 

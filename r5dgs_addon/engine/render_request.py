@@ -127,7 +127,7 @@ def scene_path(collection: bpy.types.Collection) -> Path:
     if found.asked is not None:
         raise errors.SceneFileError(
             f"{found.asked}: not read, because it is outside the folder of the .blend that uses it; "
-            "press Allow in the panel Scene of the R5DGS tab, or add its folder to 'Trusted Folders' in the add-on's "
+            "press Allow in the panel Scene of the R5DGS tab, or add its folder to 'Trusted Folders' in the "
             f"preferences or to the environment variable {trust.ENVIRONMENT}"
         )
     raise errors.SceneFileError(

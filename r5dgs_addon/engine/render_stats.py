@@ -43,7 +43,9 @@ def errors() -> list[str]:
     figures = bpy.context.window_manager.r5dgs_figures
     lines = [figures.error] if figures.error else []
     if figures.unbent:
-        lines.append(f"{plural.of(figures.unbent, 'Gaussian', 'bend')} while observed, shown unbent; see Exact Mode")
+        lines.append(
+            f"{plural.of(figures.unbent, 'Gaussian', 'bend')} in the observed time but are shown rigid; see Exact Mode"
+        )
     return lines
 
 

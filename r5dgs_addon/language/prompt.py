@@ -20,8 +20,9 @@ from . import phrase_embeddings
 
 HISTORY = 12  # maximum number of stored prompts
 ASKING = "Running the text encoder for "  # prefix of the note shown while the encoder runs
-STRANGER = (
-    "{}: its table was made by the encoder {!r}, not by {!r} of the preferences; make the table again with that one"
+OTHER_ENCODER = (
+    "{0}: its table was made by the encoder {1!r}, but the preferences name {2!r}; choose {1!r} there, or make the "
+    "table again with {2!r}"
 )
 _embeddings: file_cache.Remembered[stored_embeddings.StoredEmbeddings | None] = file_cache.Remembered(
     scene_file.read_embeddings
@@ -99,7 +100,7 @@ def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> 
             missing += phrase_embeddings.missing(unknown)
             lost += [] if phrase_embeddings.has_encoder() else unknown
             other = phrase_embeddings.other_encoder(unknown, card)
-            notes += [STRANGER.format(collection.name, card.name, other)] if other else []
+            notes += [OTHER_ENCODER.format(collection.name, card.name, other)] if other else []
             embed = functools.partial(phrase_embeddings.of, card=card)
         left.append(object_search.unanswered(labels, text, threshold, embeddings, embed))
         kept.append(object_search.not_excluded(labels, text, threshold, embeddings, embed))
@@ -133,7 +134,8 @@ def _instances(found: set[bpy.types.Collection]) -> list[str]:
         one: empties for one, empties in loaded_scenes.shown(bpy.context.scene).items() if one in found and empties
     }
     return [
-        f"{one.name} is an instance: Select takes {' and '.join(empty.name for empty in empties)} as a whole"
+        f"{one.name} is instanced by {' and '.join(empty.name for empty in empties)}; its objects cannot be selected "
+        "one by one"
         for one, empties in instanced.items()
     ]
 

@@ -50,7 +50,7 @@ def find(anchor: bpy.types.Object) -> Place:
     if animation is None:
         return Place(None, None)
     if animation.use_tweak_mode:
-        raise errors.ConfigError(f"{name}: an NLA strip of it is being edited; leave tweak mode (Tab) first")
+        raise errors.ConfigError(f"{name}: one of its NLA strips is being edited; leave tweak mode (Tab) first")
     if animation.action is not None:
         found = Place(animation.action, compat.slot_of(animation))
     else:

@@ -1,8 +1,9 @@
 """Timeline markers of observed events, such as "ball: impact".
 
-A Blender scene registers the markers with the loaded scene and the motion group that they belong to. So they follow
-renamed objects and go with the loaded scene, while markers of users stay. A marker that a user renames or moves is the
-user's from then on. Blender 5.0 removed custom properties of markers, so the register is a property of the scene.
+A register in the Blender scene records the loaded scene and the motion group of each marker. Markers are therefore
+renamed with their objects and removed with their loaded scene, while markers of users stay. A marker that a user
+renames or moves counts as the user's. The register is a property of the scene because Blender 5.0 removed custom
+properties of markers.
 """
 
 import json

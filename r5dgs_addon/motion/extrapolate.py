@@ -121,7 +121,8 @@ def times_of(anchor: bpy.types.Object, t_end: float | None = None) -> timeline.T
     collection = scene_of(anchor)
     if collection is None or not physics.has_motion(anchor):
         raise errors.ConfigError(
-            f"{anchor.name}: expected the anchor of a loaded scene, found none of a motion; load the scene again"
+            f"{anchor.name}: expected an anchor of a loaded scene with a stored motion, found none; load the scene "
+            "again"
         )
     times = timeline.of_collection(collection)
     return times if t_end is None else replace(times, t_end=max(t_end, times.t_max))
@@ -130,9 +131,9 @@ def times_of(anchor: bpy.types.Object, t_end: float | None = None) -> timeline.T
 def _sampler(
     anchor: bpy.types.Object, location: np.ndarray, quat: np.ndarray, times: timeline.Times, most: int
 ) -> tuple[reduction.Sampler, models.MotionModel]:
-    """Sampler of the poses past t_max, continuing the pose at t_max, and its model.
+    """Return a sampler of the poses past t_max, which starts from the pose at t_max, and its model.
 
-    Quaternions keep the norm of that pose, as keys may have any.
+    The sampled quaternions have the norm of that pose, because keys need not be unit quaternions.
 
     Raises:
         ConfigError: The motion is invalid, or would take minutes to integrate.

@@ -89,7 +89,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     )
     too_fast: BoolProperty(
         name="Too Fast for Keys",
-        description="The motion rotates or swings too fast for keys, which are exact only at frames",
+        description="The motion rotates or swings so fast that keys are exact only at frames",
         options={"HIDDEN"},
     )
     at_once: BoolProperty(name="Write at Once", description="Re-extrapolate whenever a value changes", options=set())

@@ -83,7 +83,9 @@ def _digest(anchor: bpy.types.Object) -> str:
     others = {name: value for name, value in stored(state).items() if name not in models.RATES and np.any(value)}
     frequency = others.pop("frequency", 0.0)
     more = [{name: np.asarray(value).tolist() for name, value in others.items()}] if others else []
-    text = json.dumps([state.taken, state.kind, *fields, frequency, leader, *more])  # as in older files without others
+    text = json.dumps(
+        [state.taken, state.kind, *fields, frequency, leader, *more]
+    )  # without `more`, the text of older versions
     return hashlib.sha1(text.encode(), usedforsecurity=False).hexdigest()
 
 
@@ -122,12 +124,12 @@ def show(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
 
 
 def take(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -> None:
-    """Copy the motion of an anchor that follows no leader to another anchor. Its own learned motion stays stored.
+    """Copy the motion of an anchor without a leader to another anchor, which keeps its learned motion stored.
 
     Args:
         source: Anchor with the motion.
         target: Anchor that receives it.
-        turn: Rotation of the target relative to the source in its own frame, unit wxyz. [4]
+        turn: Rotation of the target relative to the source, in the frame of the source, unit wxyz. [4]
     """
     giver, taker = source.r5dgs_motion, target.r5dgs_motion
     base = basis(giver)

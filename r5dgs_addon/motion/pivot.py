@@ -113,7 +113,7 @@ def _offset(anchor: bpy.types.Object) -> np.ndarray | None:
     if model is None or found is None or not KINDS[model.kind].center_on_axis:
         return found
     along = rotation_centers.axis(model)
-    assert along is not None  # a model with a center that is no spring turns
+    assert along is not None  # the kinds with `center_on_axis` have an axis if they have a centre
     chosen = np.array(anchor.r5dgs_motion.stored_pivot, np.float64)
     on_axis = found + along * (along @ chosen)
     return on_axis if np.linalg.norm(on_axis - chosen) <= _ON_AXIS * np.linalg.norm(chosen) else found

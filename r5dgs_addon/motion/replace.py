@@ -42,7 +42,7 @@ class Replacement:
         times: Times of the target.
         location: Location of the target without curves. [3]
         quat: Rotation of the target without curves, unit wxyz. [4]
-        turn: Rotation of the target relative to the source in its own frame, unit wxyz. [4]
+        turn: Rotation of the target relative to the source, in the frame of the source, unit wxyz. [4]
         curves: Curves by data path and component.
     """
 

@@ -11,7 +11,9 @@ from ..scene import timeline
 from . import curve_place, extrapolate, fcurves, keyframes, physics
 
 _FRAMES = reduction.FrameTimes(0.0, 1.0)  # the curves' times are frames
-_LIKE = 0.01  # tolerance of slopes that do not form a kink: fraction of the allowed error over the shorter segment
+# Slopes before and after a key form no kink if they differ by less than this share of the allowed error, divided by the
+# duration of the shorter segment.
+_SLOPE_TOLERANCE = 0.01
 
 
 def simplify(anchors: list[bpy.types.Object], share: float) -> tuple[int, int]:
@@ -109,7 +111,7 @@ def _kinks(part: np.ndarray, allowed: float, path: str, reach: float) -> list[fl
     spans = np.minimum(part[:-1, 3, 0] - part[:-1, 0, 0], part[1:, 3, 0] - part[1:, 0, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         bend = np.abs(arrive[:, 1] / arrive[:, 0] - leave[:, 1] / leave[:, 0]) * spans * scale
-    return part[1:, 0, 0][~(bend <= _LIKE * allowed)].tolist()
+    return part[1:, 0, 0][~(bend <= _SLOPE_TOLERANCE * allowed)].tolist()
 
 
 def _sampler(

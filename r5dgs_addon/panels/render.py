@@ -86,7 +86,8 @@ class R5DGS_PT_merge(_OfEngine, bpy.types.Panel):
         if meshes is None:
             layout.operator("r5dgs.merge_with_meshes", icon="NODE_COMPOSITING")
             return
-        status_bar.wrapped(layout, context, f"Merged with '{meshes.name}'; its settings are in that scene", "CHECKMARK")
+        text = f"Merged with the scene '{meshes.name}', which has the meshes' render settings"
+        status_bar.wrapped(layout, context, text, "CHECKMARK")
         row = layout.row(align=True)
         row.operator("r5dgs.merge_with_meshes", text="Merge Again", icon="FILE_REFRESH").engine = meshes.render.engine
         row.operator("r5dgs.stop_merging", icon="X")

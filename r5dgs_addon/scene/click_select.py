@@ -1,6 +1,6 @@
 """Selection of anchors by clicking Gaussians in a 3D view. The Outliner still selects point clouds.
 
-Blender notifies the add-on when the active object changes. If the last operator was a click in a 3D view and the new
+Blender notifies the extension when the active object changes. If the last operator was a click in a 3D view and the new
 active object is a point cloud, its anchor is selected instead.
 """
 

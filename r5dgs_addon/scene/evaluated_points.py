@@ -118,7 +118,7 @@ def _compare(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, edited: bool
     cloud, problems = evaluated(obj, depsgraph), []
     hidden = cloud == obj.data
     if hidden and edited:
-        problems.append("its modifiers are ignored under ellipsoids of an earlier version; choose the display again")
+        problems.append("ellipsoids of an earlier version hide its modifiers from R5DGS; choose the display again")
     stored = point_clouds.fingerprints(obj.data)
     bound = point_clouds.attribute(cloud, point_clouds.BIND + "position", "FLOAT_VECTOR") is not None
     bent = bound and edited and not hidden

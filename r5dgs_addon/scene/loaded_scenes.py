@@ -8,9 +8,10 @@ import numpy as np
 
 ORIGIN = "r5dgs_origin"  # custom property of the root, because Blender's built-in vectors are float32
 SKY = "r5dgs_sky"  # custom property of the collection: coefficients of the sky
-# The same: pose of the best captured camera (OpenGL axes), distance to the objects, size of the picture at distance 1.
+# Custom property of the collection: pose of the best captured camera (OpenGL axes), distance to the objects, size of
+# the picture at distance 1.
 VIEW = "r5dgs_view"
-LIGHT = "r5dgs_light"  # the same: direction of the light that shading depends on
+LIGHT = "r5dgs_light"  # custom property of the collection: direction of the light that shading depends on
 
 
 def scene_collections() -> list[bpy.types.Collection]:

@@ -1,8 +1,8 @@
 """Object table of a loaded scene: names of the objects and the data-blocks that belong to them.
 
-Renaming an object in the Outliner renames it in the table. Loading marks the collection, anchor and point cloud of each
-object with the assigned name. If no data-block of one kind still has that name, the new name counts. No handler is
-needed, because `names` is evaluated whenever names are shown, searched or exported.
+Renaming an object in the Outliner renames it in the table. Loading stores the assigned name on the collection, anchor
+and point cloud of each object. If a user renamed all data-blocks of one of these types, their new name is the object's.
+No handler is needed, because `names` is evaluated whenever names are shown, searched or exported.
 """
 
 import re

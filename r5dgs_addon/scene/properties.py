@@ -95,7 +95,8 @@ class R5DGS_PG_scene(bpy.types.PropertyGroup):
     scene_name: StringProperty(name="Name", description="Name of the scene in its file")
     filepath: StringProperty(
         name="Scene File",
-        description="The .r5dgs file that the preview reads; relative to the .blend file if possible",
+        description="The .r5dgs file that previews, renders, exports, searches and Exact Mode read; relative to the "
+        ".blend file if possible",
         subtype="FILE_PATH",
         options={"ANIMATABLE"} | compat.PATH_OPTIONS,
         update=trust.choose,

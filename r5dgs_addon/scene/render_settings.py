@@ -16,8 +16,8 @@ class R5DGS_PG_render(bpy.types.PropertyGroup):
 
     sky: BoolProperty(
         name="Sky",
-        description="Render the captured scene's sky as background; if off, black, or nothing if the film "
-        "is transparent",
+        description="Render the captured scene's sky as background; if off, the background is black, or "
+        "transparent if Film Transparent is on",
         default=True,
     )
     as_trained: BoolProperty(

@@ -54,7 +54,7 @@ def of_collection(collection: bpy.types.Collection) -> Times:
 
 
 def default_end(scene: Scene) -> float:
-    """Default end of extrapolation: a third of the observed span after t_max, and at least 1."""
+    """Default end of extrapolation: a third of the observed span after t_max, but at least scene time 1."""
     start = float(scene.tracks.times[0])
     return max(scene.t_max + (scene.t_max - start) / 3, 1.0)
 

@@ -110,7 +110,7 @@ def choose(state: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
         allow(places(state.id_data)[0])
 
 
-_following: list[bool] = []  # not empty while the add-on itself writes paths
+_following: list[bool] = []  # not empty while the extension itself writes paths
 
 
 @contextlib.contextmanager

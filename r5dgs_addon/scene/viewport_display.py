@@ -1,6 +1,6 @@
 """Display of Gaussians in viewports: splats, points, or one ellipsoid each by geometry nodes.
 
-Splats are drawn by the add-on. Points are fast for any number of Gaussians. Ellipsoids show size, orientation and
+Splats are drawn by the extension. Points are fast for any number of Gaussians. Ellipsoids show size, orientation and
 opacity, but are slower. They are instances created by a modifier. Splats and ellipsoids have a modifier that passes the
 points on with radius 0, so that Blender does not draw them and the evaluated point cloud keeps them. Point clouds that
 Blender itself draws as Gaussian splats are left to it.
@@ -14,7 +14,7 @@ from . import point_clouds
 SPLATS, POINTS, ELLIPSOIDS = "SPLATS", "POINTS", "ELLIPSOIDS"
 ITEMS = (  # the numbers are stored in .blend files
     (SPLATS, "Splats", "The trained picture", 2),
-    (POINTS, "Points", "A sphere for each Gaussian, of at most a hundredth of the scene's size; fast", 0),
+    (POINTS, "Points", "A sphere for each Gaussian, with a radius of at most 1.2 % of the scene's extent; fast", 0),
     (ELLIPSOIDS, "Ellipsoids", "Each Gaussian with its size, orientation and opacity; slow above 100,000", 1),
 )
 MODIFIER = "R5DGS Ellipsoids"

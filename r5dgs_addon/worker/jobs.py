@@ -1,4 +1,4 @@
-"""Job queue of the worker: a Python with numba, started on first use and kept until the add-on is unregistered.
+"""Job queue of the worker: a Python with numba, started on first use and kept until the extension is unregistered.
 
 There is one worker, and it runs one job at a time: a job holds the worker for all its steps, so that no other job
 replaces its scene between loading and rendering. `run` blocks until the response arrives. `submit` returns a job for a

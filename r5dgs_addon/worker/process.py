@@ -38,7 +38,7 @@ ENVIRONMENT = preferences.ENVIRONMENT
 STDERR_LINES = 12
 COMPILE_PATIENCE = 10  # timeouts to wait while kernels are compiled, which takes minutes on a busy machine
 LAST_WORDS_S = 0.5  # time to read the rest of the pipes after a worker's death
-REMEDY = f"set 'Worker Python' in the add-on's preferences, or {ENVIRONMENT}, to a Python with numba"
+REMEDY = f"set 'Worker Python' in the extension's preferences, or {ENVIRONMENT}, to a Python with numba"
 COMPILING = "preparing the rasterizer (first use, 10 to 30 s)"
 
 log = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ class Worker:
         if find_python.is_own(python) and (kernels := preferences.choice().kernels):
             environment.setdefault("NUMBA_CACHE_DIR", kernels)
         known = environment.get("PYTHONPATH", "")
-        # The add-on's own copy of the core comes first, so that both sides have the same version.
+        # The extension's own copy of the core comes first, so that both sides have the same version.
         environment["PYTHONPATH"] = str(ROOT) + (os.pathsep + known if known else "")
         environment["PYTHONUNBUFFERED"] = "1"
         try:
@@ -107,7 +107,7 @@ class Worker:
             if self.hello.get("missing"):
                 raise errors.BackendError(
                     f"worker: {self.python} lacks {', '.join(self.hello['missing'])}; install the core there "
-                    "('pip install r5dgs') or choose another 'Worker Python' in the add-on's preferences"
+                    "('pip install r5dgs') or choose another 'Worker Python' in the extension's preferences"
                 )
         except BaseException:
             self.close()
@@ -161,7 +161,7 @@ class Worker:
                 self.close()
                 raise errors.BackendError(
                     f"worker: no answer to '{command}' within {timeout_s:g} s, so it was stopped; try again, or raise "
-                    "'Timeout' in the add-on's preferences"
+                    "'Timeout' in the extension's preferences"
                 ) from None
             if answer is None:
                 raise self._death()

@@ -177,7 +177,7 @@ def test_a_prompt_finds_an_instanced_scene_and_selects_what_instances_it(blender
     session = blender.context.window_manager.r5dgs_words
     assert [match.name for match in session.matches] == ["mug"]
     assert [note.name for note in session.notes] == [
-        f"{collection.name} is an instance: Select takes {empty.name} as a whole"
+        f"{collection.name} is instanced by {empty.name}; its objects cannot be selected one by one"
     ]
     assert blender.ops.r5dgs.select_object(object_id=1, mode="SUBTRACT") == {"FINISHED"} and not empty.select_get()
     assert "synthetic: 3 objects, 300 Gaussians" in draw_panels(blender)

@@ -87,7 +87,7 @@ def test_texts_fit_a_sidebar_of_normal_width(blender, sidebar, scene_path, monke
     said = sidebar()
     words = " ".join(said)
     assert words.count("change the attribute") == 5 and "False Color" in words
-    assert "1920 x 1080" in words and "shown unbent" in words and "lives in the forest" in words
+    assert "1920 x 1080" in words and "are shown rigid" in words and "lives in the forest" in words
     assert [text for text in said if len(text) > 40] == []
 
 

@@ -125,4 +125,4 @@ def test_holdout_meshes_are_named(blender, loaded, passes, capfd):
     blender.ops.mesh.primitive_cube_add()
     blender.context.object.is_holdout = True
     passes()
-    assert "hold-outs other than clouds do not cut Gaussians" in capfd.readouterr().out
+    assert "only hold-out point clouds cut Gaussians" in capfd.readouterr().out

@@ -79,7 +79,7 @@ def test_without_an_encoder_other_words_find_nothing(loaded, monkeypatch):
 def test_another_encoder_is_named_with_the_remedy(loaded, folders, monkeypatch):
     monkeypatch.setenv("R5DGS_TEXT_ENCODER", str(folders[1]))
     assert ask(loaded, "zorb") == {"CANCELLED"}
-    assert "made by the encoder 'own', not by 'other' of the preferences" in notes(loaded)[0]
+    assert "made by the encoder 'own', but the preferences name 'other'" in notes(loaded)[0]
 
 
 def test_a_damaged_encoder_is_reported_and_names_are_still_searched(loaded, tmp_path, monkeypatch):

@@ -55,9 +55,9 @@ def test_loading_warns_of_deformation_that_it_does_not_play(blender, tmp_path, c
     for name, wanted in (("rigid", scene), ("bending", bending)):
         path = scene_file.write(wanted, tmp_path / f"{name}.r5dgs")
         motions.load(blender, path)
-        assert "deform" not in capfd.readouterr().out
+        assert "Gaussians bend" not in capfd.readouterr().out
         motions.load(blender, path, bend=False)
-        warned = f"{len(bending.residuals.rows)} Gaussians deform" in capfd.readouterr().out
+        warned = f"{len(bending.residuals.rows)} Gaussians bend" in capfd.readouterr().out
         assert warned == (name == "bending")
 
 

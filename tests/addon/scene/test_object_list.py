@@ -164,7 +164,7 @@ def test_resetting_a_linked_tint_is_refused_with_a_report(blender, loaded, tmp_p
     blender.context.scene.collection.children.link(target.collections[0])
     blender.ops.r5dgs.select_by_prompt(text="mug")
     assert blender.ops.r5dgs.reset_color() == {"CANCELLED"}
-    assert "Linked from another file, make a library override first: mug" in capfd.readouterr().out
+    assert "first make a library override of: mug" in capfd.readouterr().out
 
 
 def test_the_list_filters_by_the_names_that_it_shows(blender, loaded):
