@@ -103,7 +103,7 @@ def make(plan: BenchmarkRequest) -> list[Case]:
             raise ConfigError(f"{name}: expected at least one of {', '.join(known)}")
         for item in given:
             if item not in known:
-                raise ConfigError(f"{name} {item}: expected some of {', '.join(known)}")
+                raise ConfigError(f"{name} {item}: expected one or more of {', '.join(known)}")
     if plan.out.exists() and not plan.out.is_dir():
         raise ConfigError(f"--out {plan.out}: is a file; name a folder")
     roots: dict[str, Path] = {}

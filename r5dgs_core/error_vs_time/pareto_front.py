@@ -1,4 +1,4 @@
-"""The Pareto front of error against time, without differences below the noise.
+"""The Pareto front of error against time; differences within the noise do not count.
 
 A line is a row of the report in each run of a scene, by the number of the run. Lines are compared run by run, so that
 effects common to the lines of a run, such as an easy seed, do not count as noise.

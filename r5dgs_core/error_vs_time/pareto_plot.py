@@ -23,8 +23,8 @@ _SHOWN = {
     "raster": ("difference", "difference to the finest picture, 8-bit levels (rms)", 1.0),
     "training": ("psnr@val", "error of pixels of held-out views, 8-bit levels (rms)", 1.0),
 }
-_FLOOR = {"dynamics": 1e-13, "poses": 1e-4, "family": 1e-4, "images": 1e-3, "raster": 1e-4, "training": 1e-3}
 # Smaller errors are drawn at the floor.
+_FLOOR = {"dynamics": 1e-13, "poses": 1e-4, "family": 1e-4, "images": 1e-3, "raster": 1e-4, "training": 1e-3}
 # Colors distinguishable with any color vision (Okabe and Ito 2008).
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F7F7F", "#000000")
 _FRONT = "#B00020"
@@ -72,7 +72,8 @@ def png(report: dict[str, Any], name: str) -> bytes:
     figure.suptitle(
         f"{name}: error against run time. {scene['gaussians']} Gaussians, {scene['groups']} motion "
         f"groups, {report['machine']['raster_threads']} threads{runs}.\n"
-        "Down and left is better; red: the Pareto front, where no better method is as fast, beyond the noise."
+        "Lower and further left is better; red: the Pareto front, where no method that is better beyond the noise is "
+        "as fast."
     )
     if not panels:
         figure.text(0.5, 0.5, "nothing could be timed", ha="center")

@@ -68,7 +68,10 @@ def measure(
 def _of_modes(
     scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], later: np.ndarray, rounds: int, clock: str
 ) -> tuple[list[Row], list[str]]:
-    """Measure each playback mode except hybrid, whose bodies equal rigid's. Separate Gaussians are fitted rigidly."""
+    """Measure each playback mode except "hybrid", whose bodies move as in "rigid".
+
+    Where Gaussians move one by one, the pose of a body is the rigid fit to its Gaussians.
+    """
     times = bodies[0].times[later]
     last = float(times[-1])
     players = {

@@ -66,7 +66,7 @@ class RunMeasurement:
 
     Attributes:
         place: Path of the run or scene file.
-        identity: Data and configuration without the seed; runs with equal ones are combined.
+        identity: Data and configuration without seed and threads; runs with equal ones are combined.
         facts: In JSON types ``scene gaussians groups t_max image_size horizon``. ``horizon`` is the time past t_max at
             which integration errors are measured.
         absent: Missing measurements with the reason.
@@ -113,7 +113,7 @@ def measure(
     busy = _busy(rows)
     if busy > timing.BUSY and options.clock == "wall":
         absent.append(
-            f"wall times of an idle machine: these are {busy:.1f} times the processor times (median); "
+            f"wall times without other load: the measured ones are {busy:.1f} times the processor times (median); "
             "measure again without other load, or with --clock cpu"
         )
     views = () if dataset is None else dataset.views(options.splits[0]) or dataset.train

@@ -1,4 +1,4 @@
-"""Groups of runs that differ in their seed only, and their names."""
+"""Groups of runs that differ only in seed or number of threads, and the names of these groups."""
 
 from __future__ import annotations
 

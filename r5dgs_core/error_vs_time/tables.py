@@ -134,9 +134,9 @@ def _sheet(task: str, rows: Sequence[Row], suffix: str) -> Sheet:
         if some[0].note:
             first = some[0]
             notes[f"{first.method}{', ' + first.setting if first.method == 'playback' else ''}: {first.note}"] = None
-    caption = f"{FRONT} on the Pareto front: no better method is as fast, beyond the noise; less is better"
+    caption = f"{FRONT} on the Pareto front: no method that is better beyond the noise is as fast; lower is better"
     better = [_head(kind) for kind in kinds if report_rows.KINDS[kind.partition("@")[0]].more_is_better]
-    caption += f", but more of {', '.join(better)}" if better else ""
+    caption += f", except for {', '.join(better)}" if better else ""
     caption += "; medians over objects, worst in brackets" if task in _MEASURED else ""
     caption += "; medians over runs, range in square brackets" if any(row.runs > 1 for row in rows) else ""
     if notes:

@@ -48,7 +48,9 @@ def psnr(image: np.ndarray, truth: np.ndarray, where: np.ndarray | None = None) 
 
 
 def psnr_pooled(errors: Sequence[float]) -> float:
-    """Return the PSNR of the mean squared error over all images, which is at most their mean PSNR; NaN without images.
+    """Return the PSNR of the mean of the images' squared errors, dB; NaN without images.
+
+    It is at most the mean of their PSNRs.
 
     Source: FreeGave's ``MAEPSNR``, -10 log10(mean(10^(-PSNR / 10))).
     """

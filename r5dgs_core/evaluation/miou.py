@@ -1,6 +1,6 @@
 """Mean intersection over union (mIoU) of a split's id maps with its true masks.
 
-Pixels of all images are pooled: an object is weighted by its pixels within its own IoU, and counts once in the mean.
+Pixels of all images are pooled before the IoU of each object is computed; the mean weights all objects equally.
 The background is measured separately, and pixels with an unknown mask value are ignored.
 """
 

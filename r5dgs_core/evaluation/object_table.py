@@ -139,9 +139,10 @@ def confidences(scene: Scene) -> dict[int, float]:
 
 
 def strays(scene: Scene) -> dict[int, int]:
-    """Return the number of members of each object that move with another object's group, or rest although theirs moves.
+    """Return the number of stray members of each object.
 
-    A shadow is background that follows its caster, and counts as resting.
+    A stray moves with the group of another object, or rests although its object has a group of its own. A shadow is
+    background that follows its caster, and counts as resting.
     """
     bodies = {group.id: group.object_id for group in scene.groups if group.role == "body"}
     owner = np.array([bodies.get(group.id, 0) for group in scene.groups])[scene.gaussians.motion_ids]
@@ -185,10 +186,10 @@ def to_json(scene: Scene, rows: Sequence[ObjectRow], views: int) -> dict[str, An
 
 
 def _recorded(scene: Scene, key: str) -> dict[str, Any] | None:
-    """Return counts that training stored in the scene: ``regrouping`` of motion labels or ``label_hygiene`` of object
-    labels.
+    """Return counts that training stored in the scene, or None if the step did not run.
 
-    Returns None if that step did not run.
+    Args:
+        key: ``regrouping`` for motion labels, or ``label_hygiene`` for object labels.
     """
     found = scene.provenance.get(key)
     return dict(found) if isinstance(found, dict) else None
@@ -210,12 +211,12 @@ def _caption(scene: Scene, rows: Sequence[ObjectRow], views: int) -> str:
     found = _recorded(scene, "regrouping")
     if found is not None:
         moved = sum(int(found.get(key, 0)) for key in ("to_bodies", "to_shadows", "to_rest"))
-        parts.append(f"hygiene: {moved} of {found.get('moving', 0)} moving Gaussians changed their group")
+        parts.append(f"regrouping: {moved} of {found.get('moving', 0)} moving Gaussians changed their group")
     cleaned = _recorded(scene, "label_hygiene")
     if cleaned is not None:
         rules = {rule: int(cleaned.get(rule, 0)) for rule in ("neighbours", "motion", "outliers")}
         by = ", ".join(f"{rule} {count}" for rule, count in rules.items())
-        parts.append(f"hygiene: {sum(rules.values())} of {cleaned.get('gaussians', 0)} labels changed ({by})")
+        parts.append(f"label cleanup: {sum(rules.values())} of {cleaned.get('gaussians', 0)} labels changed ({by})")
     return "; ".join(parts)
 
 

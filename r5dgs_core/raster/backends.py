@@ -77,7 +77,8 @@ def _fastest(like: Array) -> Backend:
                 _warn_once(f"rasterizer: using the slower '{name}', as '{other}' is not available: {why}")
             return backend
         missing.append((name, reason))
-    raise errors.BackendError(f"rasterizer: no backend for {like.dtype} on {device_of(like)}: {missing}")
+    reasons = "; ".join(f"'{name}': {why}" for name, why in missing) or "none of them supports it"
+    raise errors.BackendError(f"rasterizer: no backend for {like.dtype} on {device_of(like)}: {reasons}")
 
 
 @functools.cache

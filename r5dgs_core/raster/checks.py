@@ -30,7 +30,7 @@ def check_splats(means, quats, scales, opacities, channels, camera, background, 
             raise ValueError(f"{name}: expected shape {wanted}, got {tuple(values.shape)}")
         if values.dtype != means.dtype or device_of(values) != device_of(means):
             raise ValueError(
-                f"{name}: expected {means.dtype} on {device_of(means)}, as the means are, got {values.dtype} on "
+                f"{name}: expected {means.dtype} on {device_of(means)}, like the means, got {values.dtype} on "
                 f"{device_of(values)}; remedy: convert it, or the means"
             )
     cameras.check(camera)
@@ -148,7 +148,7 @@ def _check_labels(labels: Any, means: Array) -> None:
 def _check_device(name: str, values: Array, means: Array) -> None:
     if device_of(values) != device_of(means):
         expected, found = device_of(means), device_of(values)
-        raise ValueError(f"{name}: expected a tensor on {expected}, as the means are, got one on {found}")
+        raise ValueError(f"{name}: expected a tensor on {expected}, like the means, got one on {found}")
 
 
 def _check_values(name: str, values: Array, low: float, high: float, remedy: str) -> None:

@@ -96,7 +96,7 @@ def obstacle(device: torch.device, dtype: torch.dtype) -> str | None:
 
 @functools.cache
 def find_kernels() -> Kernels | str:
-    """Load the kernels of gsplat; return the reason and the remedy on failure. Cached, as a build can fail slowly."""
+    """Return the kernels of gsplat, or why they cannot be loaded. Cached, as a failing build takes long."""
     log.info("rasterizer 'cuda': loading gsplat; the first time on a machine it compiles for minutes")
     version = "(unknown version)"
     try:
@@ -169,8 +169,8 @@ def check_settings(settings: RasterSettings, kernels: Kernels, opacities: torch.
 
 def _cannot_meet(name: str, wanted: float, there: float, kernels: Kernels) -> str:
     return (
-        f"rasterizer 'cuda': {name}: expected {there:g}, which is compiled into gsplat {kernels.version}, got "
-        f"{wanted:g}; remedy: leave it at that, or use backend='cpu' or 'reference'"
+        f"rasterizer 'cuda': {name}: expected {there:g}, the value compiled into gsplat {kernels.version}, got "
+        f"{wanted:g}; remedy: use that value, or use backend='cpu' or 'reference'"
     )
 
 

@@ -43,8 +43,8 @@ def project(
         settings: Near plane and frustum clamp.
 
     Returns:
-        Centres in px [N, 2], axes in px, one per column [N, 2, 3], depths [N]. Rows in front of the near plane are
-        finite but meaningless.
+        Centres in px [N, 2], axes in px, one per column [N, 2, 3], depths [N]. Rows of Gaussians nearer
+        than the near plane are finite but meaningless.
 
     Source: Zwicker et al. 2001, Eq. 31, with the Jacobian at a slope clamped to the frustum as in 3DGS.
     """
@@ -109,7 +109,7 @@ def visible_rows(
     camera: Camera,
     settings: RasterSettings,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Find the Gaussians that can touch the image: behind the near plane, with an alpha_min ellipse that reaches it.
+    """Find the Gaussians beyond the near plane whose ellipse of opacity ``alpha_min`` overlaps the image.
 
     Args:
         means2d: Centres, px. [N, 2]

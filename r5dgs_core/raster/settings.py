@@ -22,8 +22,8 @@ class RasterSettings:
             projection is linearised: 0.3 means 1.3 times the field of view.
         alpha_min: Contributions below this are dropped.
         alpha_max: Cap on contributions; the gradient of capped contributions is zero.
-        transmittance_min: A pixel is finished before the contribution that would bring its transmittance down to this,
-            e.g. two layers at the default cap; see `finished_at`. At least 1e-30, as pixels are float32.
+        transmittance_min: A pixel is finished before the contribution that would reduce its transmittance to this, with
+            the defaults the second one at ``alpha_max``; see `finished_at`. At least 1e-30, as pixels are float32.
         id_alpha_min: Pixels with less alpha than this get id -1. In [0, 1].
     """
 

@@ -1,8 +1,8 @@
 """Image of the Gaussians in front of meshes, that is, between the camera and the nearest surface of each pixel.
 
-A Gaussian contributes the share of its density along the ray of the pixel that lies before the surface, so it fades
-out across a surface that cuts it. The image is composited over the render of the meshes, whose coverage anti-aliases
-the edges.
+A Gaussian is weighted by the share of its density along the pixel's ray that lies in front of the surface, so a
+Gaussian that a surface cuts fades out across it. The image is composited over the render of the meshes, whose
+coverage anti-aliases the edges.
 """
 
 from __future__ import annotations

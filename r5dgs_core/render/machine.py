@@ -1,4 +1,4 @@
-"""Package versions and machine description, which timings and the last bits of results depend on."""
+"""Package versions and machine, on which timings and the last bits of results depend."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def rows_of(posed: PosedScene, rows: np.ndarray) -> PosedScene:
 
 
 def with_moved(posed: PosedScene, other: PosedScene, moved: np.ndarray) -> PosedScene:
-    """Return posed Gaussians with the positions, rotations and shading factors of others in some rows. [N] bool"""
+    """Replace positions, rotations and shading factors of the rows in ``moved`` by those of ``other``. [N] bool"""
 
     def mixed(here: np.ndarray, there: np.ndarray) -> np.ndarray:
         return np.where(moved.reshape(-1, *[1] * (here.ndim - 1)), there, here)
@@ -301,7 +301,7 @@ def affine(matrix: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rows(given: JoinedScenes, index: int, instance: Instance) -> tuple[int, int]:
-    """First gathered row of an instance, and the one past its last."""
+    """Return the first row of an instance in the joined scenes, and the row past its last."""
     if not 0 <= instance.scene < len(given.starts) - 1:
         raise ValueError(f"instance {index}: expected a scene below {len(given.starts) - 1}, got {instance.scene}")
     first, end = given.starts[instance.scene : instance.scene + 2]
@@ -312,7 +312,7 @@ def _rows(given: JoinedScenes, index: int, instance: Instance) -> tuple[int, int
 
 
 def _tint(instance: Instance, index: int) -> np.ndarray:
-    """Colour factors of an instance, checked. [3]"""
+    """Return the checked colour factors of an instance. [3]"""
     if instance.tint is None:
         return np.ones(3)
     tint = np.asarray(instance.tint, np.float64)

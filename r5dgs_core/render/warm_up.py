@@ -31,7 +31,7 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
     """
     start = time.perf_counter()
     stages: list[tuple[str, Callable[[], object]]] = [
-        *(("splats", _splats), ("splats before others", _static_layer)),
+        *(("splats", _splats), ("static layer", _static_layer)),
         *(("colors", _colors), ("sky", _sky), ("meshes", _meshes)),
     ]
     if gradients:

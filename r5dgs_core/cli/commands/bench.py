@@ -84,7 +84,7 @@ def run_bench(
     ):
         for name in given:
             if name not in known:
-                raise errors.UsageError(f"{option} {name}: expected some of {', '.join(known)}")
+                raise errors.UsageError(f"{option} {name}: expected one or more of {', '.join(known)}")
     config.load(plan["config_path"], plan["overrides"], plan["preset"])
     for scene in scenes:
         inputs.check_dataset(scene)

@@ -177,8 +177,9 @@ def _check_unknown(unknown: int | None, folder: Path) -> None:
 
     if unknown is not None and unknown != mask_notes.read(folder).unknown:
         raise errors.ConfigError(
-            f"--unknown {unknown}: nothing would be written here, so training would not know this value. Remedy: "
-            f"write to another folder with --out, or record it in {folder / mask_notes.FILE}: "
+            f"--unknown {unknown}: the masks are already in {folder} and are not written again, so training would not "
+            "learn of this value. Remedy: write to another folder with --out, or record it in "
+            f"{folder / mask_notes.FILE}: "
             f'{{"format_version": 1, "unknown": {unknown}}}'
         )
 
@@ -207,7 +208,7 @@ def _check(given: Options) -> None:
             misplaced["--unknown"] = given.unknown
     for option, value in misplaced.items():
         if value is not None:
-            raise errors.UsageError(f"{option}: is not for --backend {given.backend}")
+            raise errors.UsageError(f"{option}: does not apply to --backend {given.backend}")
     for option, value in tuned.items():
         if option in ("--key-frames", "--points"):
             if not 1 <= value <= 1024:

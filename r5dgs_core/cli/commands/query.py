@@ -158,7 +158,7 @@ def _explain_nothing(scene: Scene, text: str, unknown: Sequence[str]) -> str:
     phrases = " and ".join(repr(phrase) for phrase in unknown)
     if scene.lookup is None:
         return f"{reason}\nonly names are searched without a lookup table; make one: r5dgs lookup SCENE --encoder DIR"
-    return f"{reason}\n{phrases} is not among the stored words; give the table's encoder for others: --encoder DIR"
+    return f"{reason}\nnot among the stored words: {phrases}; give the table's encoder for other words: --encoder DIR"
 
 
 def _user_encoder(card: EncoderCard) -> Any:

@@ -48,9 +48,9 @@ def run(args: argparse.Namespace) -> ExitStatus | None:
     """Run the command."""
     measured = (args.paths or None, args.out, args.tasks, args.splits, args.repeats)
     if args.stability and any(given is not None for given in measured):
-        raise errors.UsageError("report --stability: needs no scene; takes --json FILE alone")
+        raise errors.UsageError("report --stability: takes no scene and no other output than --json FILE")
     if args.json is not None and not args.stability:
-        raise errors.UsageError("report --json: is for --stability; a report's JSON goes to --out DIR/report.json")
+        raise errors.UsageError("report --json: applies to --stability only; --out DIR writes DIR/report.json")
     shared = {"threads": args.threads, "progress_kind": args.progress}
     if args.stability:
         return None if run_stability(args.json, **shared) else ExitStatus.NEGATIVE

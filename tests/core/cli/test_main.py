@@ -389,9 +389,9 @@ def test_the_help_of_train_names_every_preset(capsys):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (["--stability", "--out", "x"], "report --stability: needs no scene"),
-        (["scene.r5dgs", "--stability"], "report --stability: needs no scene"),
-        (["scene.r5dgs", "--out", "x", "--json", "x.json"], "report --json: is for --stability"),
+        (["--stability", "--out", "x"], "report --stability: takes no scene"),
+        (["scene.r5dgs", "--stability"], "report --stability: takes no scene"),
+        (["scene.r5dgs", "--out", "x", "--json", "x.json"], "report --json: applies to --stability only"),
         (["scene.r5dgs"], "report: expected RUN|SCENE and --out DIR"),
     ],
 )

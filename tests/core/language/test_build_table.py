@@ -319,7 +319,7 @@ def test_the_commands_find_by_meaning_without_an_encoder(file, capsys):
     assert main.main(["query", str(file), "elephant"]) == 1
     assert "nothing matches 'elephant'; the scene has: lemon, apple, donut, hammer" in capsys.readouterr().out
     assert main.main(["query", str(file), "glorp"]) == 1
-    assert "'glorp' is not among the stored words; give the table's encoder" in capsys.readouterr().out
+    assert "not among the stored words: 'glorp'; give the table's encoder" in capsys.readouterr().out
     assert main.main(["query", str(file), "donut and a lemon"]) == 0
     assert "name 'donut'" in capsys.readouterr().out
     assert main.main(["name", str(file), "donut", "donut [/left]"]) == main.main(["query", str(file), "donut"]) == 0

@@ -197,9 +197,9 @@ def test_masks_of_another_shape_are_named_before_anything_is_written(copied, tmp
     [
         ({"backend": "deva"}, "--backend deva: expected one of precomputed, blender, sam2"),
         ({"backend": "sam2"}, "--backend sam2: name the folder of the model with --model"),
-        ({"model": "m"}, "--model: is not for --backend precomputed"),
-        ({"points": 8}, "--points: is not for --backend precomputed"),
-        ({"backend": "sam2", "model": "m", "unknown": 255}, "--unknown: is not for --backend sam2"),
+        ({"model": "m"}, "--model: does not apply to --backend precomputed"),
+        ({"points": 8}, "--points: does not apply to --backend precomputed"),
+        ({"backend": "sam2", "model": "m", "unknown": 255}, "--unknown: does not apply to --backend sam2"),
         ({"backend": "sam2", "model": "m", "points": 0}, "--points 0: expected a number from 1 to 1024"),
         ({"backend": "sam2", "model": "m", "score": 2.0}, "--score 2.0: expected a share from 0 to 1"),
         ({"unknown": 254}, "--unknown 254: expected 255 or 65535"),
@@ -236,7 +236,7 @@ def test_old_masks_are_removed_if_the_backend_does_not_make_them(copied, tmp_pat
 def test_255_is_not_called_unknown_where_nothing_is_written(copied):
     """Training would still read it as an object."""
     with pytest.raises(
-        errors.ConfigError, match=r"--unknown 255: nothing would be written.*--out, or record it in .*masks"
+        errors.ConfigError, match=r"--unknown 255: the masks are already in.*--out, or record it in .*masks"
     ):
         cli_masks.run_masks(copied, unknown=255)
     (copied / "object_mask" / "masks.json").write_text('{"format_version": 1, "unknown": 255}')

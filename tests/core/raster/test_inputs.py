@@ -49,7 +49,7 @@ def test_a_background_of_another_float_dtype_is_converted_and_gets_its_gradient(
     ([0.0, 0.0, 0.0], TypeError, "expected a tensor, got list"),
     (np.zeros(3), TypeError, "expected a tensor, got ndarray"),
     (torch.full((3,), 255, dtype=torch.uint8), ValueError, "expected floating-point values, got torch.uint8; rem"),
-    (torch.zeros(3, device="meta"), ValueError, "expected a tensor on cpu, as the means are, got one on meta"),
+    (torch.zeros(3, device="meta"), ValueError, "expected a tensor on cpu, like the means, got one on meta"),
     (torch.zeros(4), ValueError, r"expected shape \(3,\) or \(40, 48, 3\), got \(4,\)"),
     (torch.zeros(48, 40, 3), ValueError, r"expected shape \(3,\) or \(40, 48, 3\), got \(48, 40, 3\)"),
 ])  # fmt: skip
@@ -221,7 +221,7 @@ def test_integer_and_mixed_dtypes_raise_different_errors():
     with pytest.raises(ValueError, match=r"means: expected floating-point values.*means\.float\(\)"):
         rasterize_splats(*whole, camera())
     mixed = [splats(3, 3)[0], *(t.float() for t in splats(3, 3)[1:])]
-    with pytest.raises(ValueError, match=r"quats: expected torch.float64 on cpu, as the means are.*remedy"):
+    with pytest.raises(ValueError, match=r"quats: expected torch.float64 on cpu, like the means.*remedy"):
         rasterize_splats(*mixed, camera())
 
 
