@@ -30,7 +30,7 @@ import torch
 from torch.nn.functional import interpolate
 
 from r5dgs_core.raster import compilation, rasterize
-from r5dgs_core.scene import sh_color
+from r5dgs_core.scene import spherical_harmonics
 from r5dgs_core.scene.cameras import Camera
 
 from .. import timing
@@ -220,7 +220,7 @@ def _harmonics(colors: torch.Tensor) -> torch.Tensor:
     sh = torch.randn((len(colors), 16, 3), generator=generator)
     for degree, spread in enumerate(tabletop.SH_SPREAD):
         sh[:, degree**2 : (degree + 1) ** 2] *= spread
-    sh[:, 0] = sh_color.rgb_to_dc(colors)
+    sh[:, 0] = spherical_harmonics.rgb_to_dc(colors)
     return sh
 
 

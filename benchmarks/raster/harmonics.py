@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from r5dgs_core.raster import compilation, shade
-from r5dgs_core.scene import cameras, sh_color
+from r5dgs_core.scene import cameras, spherical_harmonics
 from r5dgs_core.scene.cameras import Camera
 
 from ..timing import Contender, take_turns
@@ -49,7 +49,7 @@ def sky(size: int, degree: int, fused: bool) -> dict[str, Callable]:
     sh = np.random.default_rng(degree).normal(size=((degree + 1) ** 2, 3))
     if fused:
         return {"sky": lambda: shade.sky(sh, camera)}
-    return {"sky": lambda: np.clip(sh_color.to_rgb(sh, cameras.pixel_rays(camera)), 0, 1).astype(np.float32)}
+    return {"sky": lambda: np.clip(spherical_harmonics.to_rgb(sh, cameras.pixel_rays(camera)), 0, 1).astype(np.float32)}
 
 
 def main(arguments: list[str] | None = None) -> None:

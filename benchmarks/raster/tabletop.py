@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from r5dgs_core.motion import models, rotations
-from r5dgs_core.scene import sh_color
+from r5dgs_core.scene import spherical_harmonics
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.scene.scene import Gaussians, MotionGroup, Scene, SceneObject, Tracks
 
@@ -45,7 +45,7 @@ def build(count: int, camera: Camera) -> Scene:
     sh = np.concatenate(
         [SH_SPREAD[degree] * random.normal(size=(count, 2 * degree + 1, 3)) for degree in range(4)], axis=1
     )
-    sh[:, 0] = sh_color.rgb_to_dc(np.clip(colors + 0.05 * random.normal(size=(count, 3)), 0, 1))
+    sh[:, 0] = spherical_harmonics.rgb_to_dc(np.clip(colors + 0.05 * random.normal(size=(count, 3)), 0, 1))
     widths = sizes[:, None] * np.exp(0.3 * random.normal(size=(count, 3)))
     widths[:, 2] *= 0.1  # along the normal
     starts = np.cumsum([0, *counts[:-1]])

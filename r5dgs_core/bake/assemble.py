@@ -9,7 +9,7 @@ import numpy as np
 
 from ..data.dataset import Dataset
 from ..motion import rotations
-from ..scene import sh_color
+from ..scene import spherical_harmonics
 from ..scene.scene import NEAR_PLANE, Gaussians, Scene, SceneObject, Shading, Tracks
 from . import bind_state, needs
 from .draft import Cloud, Context, Draft, Need, ObservedScene
@@ -71,7 +71,7 @@ def _background(coefficients: np.ndarray, wanted: str) -> np.ndarray:
     """
     if wanted != "auto":
         return coefficients if wanted == "on" else coefficients[:1]
-    degree = sh_color.degree_of(len(coefficients))
+    degree = spherical_harmonics.degree_of(len(coefficients))
     while degree > 0 and np.abs(coefficients[degree**2 :]).max() < needs.SKY_BAND:
         degree -= 1
         coefficients = coefficients[: (degree + 1) ** 2]

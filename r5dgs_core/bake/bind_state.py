@@ -13,8 +13,7 @@ import numpy as np
 
 from ..motion import rotations
 from ..motion.models import MotionModel
-from ..playback import visibility
-from ..scene import sh_color
+from ..scene import spherical_harmonics, visibility
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
 from ..train import observed_motion
@@ -41,7 +40,7 @@ def bind(observed: ObservedScene, context: Context) -> BoundScene:
         q, d = group.quats[-1], path[-1]
         means[members] = center + rotations.rotate(q, means[members] - center) + d
         quats[members] = rotations.multiply(q, quats[members])
-        turned = sh_color.rotate(sh[members], q)
+        turned = spherical_harmonics.turned(sh[members], q)
         sh[members], shading[members], rest[members] = shading_vectors.rebind(
             turned, shading[members], rest[members], q, observed.light
         )
@@ -98,7 +97,7 @@ def _move(
     if not np.any(q[1:] != 0):
         return
     arrays["quats"][rows] = rotations.normalize(rotations.multiply(q, arrays["quats"][rows].astype(np.float64)))
-    sh = sh_color.rotate(arrays["sh"][rows].astype(np.float64), q)
+    sh = spherical_harmonics.turned(arrays["sh"][rows].astype(np.float64), q)
     if scene.shading is not None:
         vectors, rest = (arrays[name][rows].astype(np.float64) for name in ("shading", "shading_rest"))
         sh, arrays["shading"][rows], arrays["shading_rest"][rows] = shading_vectors.rebind(

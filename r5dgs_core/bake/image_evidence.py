@@ -248,7 +248,5 @@ def _clusters(views: Sequence[datasets.View]) -> np.ndarray:
 
 def _between(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
     """Interpolate (or extrapolate) between poses; ``share`` is 0 at ``before`` and 1 at ``after``. [G, S, 7]"""
-    turn = rotations.multiply(after[..., :4], rotations.conjugate(before[..., :4]))
-    turn = rotations.rotvecs_to_quats(share * rotations.quats_to_rotvecs(turn))
-    quats = rotations.normalize(rotations.multiply(turn, before[..., :4]))
+    quats = rotations.interpolate(before[..., :4], after[..., :4], share)
     return np.concatenate([quats, before[..., 4:] + share * (after[..., 4:] - before[..., 4:])], axis=-1)

@@ -29,7 +29,7 @@ from ..motion import free_top, rotations
 from ..motion.history import PoseErrors
 from ..motion_fit import model_selection, shared_gravity
 from ..motion_fit import noise as noises
-from ..playback import visibility
+from ..scene import visibility
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
 from . import bind_state, falling_bodies, image_evidence, needs, pose_errors, track_checks

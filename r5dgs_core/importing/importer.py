@@ -15,7 +15,7 @@ from ..data import dataset as datasets
 from ..data import origin as origins
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
-from ..scene import cameras, sh_color, validation
+from ..scene import cameras, spherical_harmonics, validation
 from ..scene.scene import Scene
 from . import assembly, cameras_json, deformable, freegave, gaussian_splatting, run_folder, trace, weights
 from .foreign_run import ForeignRun
@@ -101,7 +101,7 @@ def import_run(folder: Path, options: Options = Options(), progress: assembly.Pr
         frames_per_unit=datasets.FRAMES_PER_UNIT if dataset is None else dataset.frames_per_unit,
         world_convention=_world(run, foreign, dataset, options),
         cameras=cameras_json.read(run.folder / "cameras.json") if dataset is None else dataset.cameras,
-        background_sh=sh_color.rgb_to_dc(np.full((1, 3), float(white))).astype(np.float32),
+        background_sh=spherical_harmonics.rgb_to_dc(np.full((1, 3), float(white))).astype(np.float32),
         provenance={
             "imported": {
                 "layout": run_folder.TITLES[foreign.kind],

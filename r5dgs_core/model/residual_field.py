@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ..motion import rotations
-from ..playback.visibility import SEEN_OPACITY
+from ..scene.visibility import SEEN_OPACITY
 
 
 @dataclass(frozen=True)

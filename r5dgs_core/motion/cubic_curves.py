@@ -63,11 +63,25 @@ def evaluate(keys: Keys, times: np.ndarray, *, unit: bool = False) -> np.ndarray
     if len(keys.times) == 1:
         values = np.broadcast_to(keys.values[0], (*times.shape, keys.values.shape[1])).copy()
     else:
-        k = np.clip(np.searchsorted(keys.times, times, side="right") - 1, 0, len(keys.times) - 2)
-        h = (keys.times[k + 1] - keys.times[k])[..., None]
-        u = (times - keys.times[k])[..., None] / h
-        values = hermite(keys.values[k], keys.values[k + 1], keys.right_slopes[k], keys.left_slopes[k + 1], h, u)
+        k, h, u = locate(keys.times, times)
+        ends, slopes_at_ends = (keys.values[k], keys.values[k + 1]), (keys.right_slopes[k], keys.left_slopes[k + 1])
+        values = hermite(*ends, *slopes_at_ends, h[..., None], u[..., None])
     return rotations.normalize(values) if unit else values
+
+
+def locate(knots: np.ndarray, times: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the interval between knots that contains each time.
+
+    Args:
+        knots: Increasing, at least two. [K]
+        times: Times; those outside the knots belong to the first or last interval. [...]
+
+    Returns:
+        Index of the interval's first knot, length of the interval, and fraction of it that has passed. [...] each
+    """
+    k = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(knots) - 2)
+    h = knots[k + 1] - knots[k]
+    return k, h, (times - knots[k]) / h
 
 
 def slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:

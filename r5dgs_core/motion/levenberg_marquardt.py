@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from . import robust_weights
+
 _DIFFERENCE = 1e-6
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-10, 1e10
@@ -133,8 +135,8 @@ class _Problem:
         """Normal equations at x [B, P] from the residuals there and at their neighbours. batch: [B, P + 1, S, D]"""
         values = batch[:, 0]
         squares = (values**2).sum(-1)
-        robust = 1 / (1 + squares / self.softness)
-        losses = squares if np.isinf(self.softness) else self.softness * np.log1p(squares / self.softness)
+        robust = robust_weights.cauchy_weights(squares, self.softness)
+        losses = robust_weights.cauchy_losses(squares, self.softness)
         root = np.sqrt(self.base * robust)[..., None]
         jacobian = ((batch[:, 1:] - values[:, None]) / _DIFFERENCE * root[:, None]).reshape(*x.shape, -1)
         weighted = (root * values).reshape(len(x), -1, 1)

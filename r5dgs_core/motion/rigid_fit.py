@@ -93,7 +93,7 @@ def fit_rigid(
         if len(axes) == 1:
             fitted, _, _, _ = _kabsch(source, target, current)
             start, end = rotations.rotate(known, axes[0]), rotations.rotate(fitted, axes[0])
-            quat = rotations.multiply(shortest_turn(start, end), known)
+            quat = rotations.multiply(rotations.between_vectors(start, end), known)
         residuals = np.linalg.norm(target - moved - rotations.rotate(quat, source - center), axis=-1)
     return RigidFit(quat, moved - center, center, residuals, current, axes, covariance)
 
@@ -126,16 +126,6 @@ def aliased_step(times: np.ndarray, quats: np.ndarray) -> tuple[float, float, fl
     angles = rotations.angle_between(quats[:-1], quats[1:])
     k = int(np.argmax(angles))
     return (float(angles[k]), float(times[k]), float(times[k + 1])) if angles[k] > ALIASED_RAD else None
-
-
-def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Smallest rotation from one unit vector to another; about any normal if they are opposite. [3] -> [4]"""
-    cosine = float(start @ end)
-    if cosine < -1 + 1e-12:
-        other = np.eye(3)[int(np.argmin(np.abs(start)))]
-        normal = np.cross(start, other)
-        return np.concatenate([[0.0], normal / np.linalg.norm(normal)])
-    return rotations.normalize(np.concatenate([[1 + cosine], np.cross(start, end)]))
 
 
 def _kabsch(

@@ -18,6 +18,16 @@ def cauchy_scale(sizes: np.ndarray, least: float) -> float:
     return max(2 * MEDIAN_TO_SIGMA * float(np.median(sizes)), least)
 
 
-def reweight(weights: np.ndarray, sizes: np.ndarray, scale: float) -> np.ndarray:
+def reweight(weights: float | np.ndarray, sizes: np.ndarray, scale: float) -> np.ndarray:
     """Cauchy weights for iteratively reweighted least squares: weights / (1 + (size / scale)^2). [n] -> [n]"""
     return weights / (1 + (sizes / scale) ** 2)
+
+
+def cauchy_weights(squares: np.ndarray, softness: float) -> np.ndarray:
+    """Cauchy weights of squared residuals; ``softness`` is the square at which the weight is one half. [...]"""
+    return 1 / (1 + squares / softness)
+
+
+def cauchy_losses(squares: np.ndarray, softness: float) -> np.ndarray:
+    """Cauchy losses of squared residuals: the squares themselves if ``softness`` is infinite. [...]"""
+    return squares if np.isinf(softness) else softness * np.log1p(squares / softness)

@@ -57,14 +57,5 @@ def with_axis(model: MotionModel, direction: np.ndarray, through: np.ndarray | N
     length = float(np.linalg.norm(direction))
     if old is None or not 0 < length < np.inf:
         raise ValueError(f"expected a rotating motion and a direction, got one of kind {model.kind!r} and {direction}")
-    turn = _between(old, np.asarray(direction, np.float64) / length)
+    turn = rotations.between_vectors(old, np.asarray(direction, np.float64) / length)
     return KINDS[model.kind].with_axis(model, turn, through)
-
-
-def _between(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Shortest rotation between two unit vectors, unit wxyz; a half turn about any normal if they are opposite."""
-    quat = np.array([1 + old @ new, *np.cross(old, new)])
-    if np.linalg.norm(quat) < 1e-7:
-        normal = np.cross(old, np.eye(3)[int(np.argmin(np.abs(old)))])
-        quat = np.array([0.0, *normal])
-    return rotations.normalize(quat)

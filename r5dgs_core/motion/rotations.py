@@ -247,6 +247,21 @@ def angle_between(p: Array, q: Array) -> Array:
     return 2 * xp.arctan2(xp.sqrt((vec * vec).sum(-1)), abs(turn[..., 0]))
 
 
+def between_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Smallest rotation from one unit vector to another; about any normal if they are opposite. [3] -> [4]"""
+    quat = np.concatenate([[1 + float(start @ end)], np.cross(start, end)])
+    if np.linalg.norm(quat) < 1e-7:
+        normal = np.cross(start, np.eye(3)[int(np.argmin(np.abs(start)))])
+        return np.concatenate([[0.0], normal / np.linalg.norm(normal)])
+    return normalize(quat)
+
+
+def interpolate(p: Array, q: Array, share: float) -> Array:
+    """Rotation at constant angular velocity from p (share 0) to q (share 1), which may also extrapolate. [..., 4]"""
+    turn = rotvecs_to_quats(share * quats_to_rotvecs(multiply(q, conjugate(p))))
+    return normalize(multiply(turn, p))
+
+
 def quat_rates(quats: Array, angular_velocities: Array) -> Array:
     """Time derivative q' = (0, w) q / 2 for an angular velocity in the world frame, rad per unit. [..., 4]"""
     xp = array_namespace(quats, angular_velocities)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..motion import levenberg_marquardt, models, se3
+from ..motion import levenberg_marquardt, models, robust_weights, se3
 from ..motion.models import Rates
 from ..motion.models.first_guesses import Guess
 from ..motion.pose_track import PoseTrack, Window
@@ -179,7 +179,7 @@ class Solution:
     @property
     def robust(self) -> np.ndarray:
         """Robust weights of the poses, in [0, 1]. [S]"""
-        return 1 / (1 + self.squares / SOFTNESS)
+        return robust_weights.cauchy_weights(self.squares, SOFTNESS)
 
     @property
     def parameters(self) -> int:

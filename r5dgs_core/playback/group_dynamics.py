@@ -24,9 +24,9 @@ from ..motion import (
 from ..motion import joint as joints
 from ..motion.joint import Joint
 from ..motion.models import STATIC, MotionModel
+from ..scene import visibility
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
-from . import visibility
 from .modes import SOURCES
 
 FARTHEST = 1e30  # maximum predicted displacement per axis, within the range of float32
@@ -122,9 +122,7 @@ class GroupMotion:
             quats, displacements = rotations.normalize(self._quats[:, 0]), self._displacements[:, 0].copy()
             self._carry(quats, displacements)
             return quats, displacements
-        k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
-        h = times[k + 1] - times[k]
-        u = (t - times[k]) / h
+        k, h, u = cubic_curves.locate(times, t)
         q, d = (
             cubic_curves.hermite(values[:, k], values[:, k + 1], slopes[:, k], slopes[:, k + 1], h, u)
             for values, slopes in zip((self._quats, self._displacements), self._slopes, strict=True)

@@ -53,11 +53,9 @@ class Residuals:
         if t <= times[0]:
             offsets, turns, growths = (part[:, 0].astype(np.float64) for part in self._parts)
             return offsets, _unit(turns), growths
-        k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
+        k, h, u = cubic_curves.locate(times, t)
         if self._interval is None or self._interval[0] != k:
-            self._interval = k, [_cubic(times, part, k) for part in self._parts]
-        h = times[k + 1] - times[k]
-        u = (t - times[k]) / h
+            self._interval = int(k), [_cubic(times, part, int(k)) for part in self._parts]
         offsets, turns, growths = (
             cubic_curves.hermite(a, b, left, right, h, u) for a, b, left, right in self._interval[1]
         )

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from ..scene import cameras, sh_color
+from ..scene import cameras, spherical_harmonics
 from ..scene.cameras import Camera
 from .arrays import Array
 from .settings import RasterSettings, RasterStats, SplatImage
@@ -98,7 +98,7 @@ class Backend:
 
     def sky(self, sh: np.ndarray, camera: Camera) -> np.ndarray:
         """Implement `shade.sky` for degree 1 and higher, float64 coefficients. [H, W, 3] float32"""
-        return np.clip(sh_color.to_rgb(sh, cameras.pixel_rays(camera)), 0, 1).astype(np.float32)
+        return np.clip(spherical_harmonics.to_rgb(sh, cameras.pixel_rays(camera)), 0, 1).astype(np.float32)
 
     def segment_weights(
         self,

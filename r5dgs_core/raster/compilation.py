@@ -40,7 +40,7 @@ NOTICE_UNKEPT = "rasterizer: compiling its kernels, which cannot be cached; 10 t
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _INNER: dict[str, Any] = {"no_cpython_wrapper": True}
 
-_SHARED = ("raster/**/*.py", "scene/sh_color.py", "scene/spherical_harmonics.py")  # sources that any kernel may use
+_SHARED = ("raster/**/*.py", "scene/spherical_harmonics.py")  # sources that any kernel may use
 _OURS = re.compile("r5dgs-[0-9a-f]{12}")
 _KEPT_S = 28 * 24 * 3600.0
 _SYSTEM_USERS = (0, 65534)  # root, and the owner that root's files have inside a user's container

@@ -17,6 +17,7 @@ from __future__ import annotations
 import torch
 from torch.utils.checkpoint import checkpoint
 
+from ..motion import rotations
 from ..scene.cameras import Camera
 from .settings import RasterSettings, RasterStats, SplatImage, frustum_slopes
 from .torch_backend import TorchBackend
@@ -77,15 +78,7 @@ def rotmats(quats: torch.Tensor) -> torch.Tensor:
     proper = square > 0
     length = torch.sqrt(torch.where(proper, square, 1))
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-    w, x, y, z = torch.where(proper, quats / length, identity).unbind(1)
-    return torch.stack(
-        [
-            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
-            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
-            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
-        ],
-        1,
-    )
+    return rotations.quats_to_rotmats(torch.where(proper, quats / length, identity))
 
 
 def covariances(axes: torch.Tensor, dilation: float) -> tuple[torch.Tensor, torch.Tensor]:

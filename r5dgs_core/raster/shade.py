@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..scene import sh_color
+from ..scene import spherical_harmonics
 from ..scene.cameras import Camera
 from . import backends
 from .arrays import Array, array_namespace, to_host
@@ -59,8 +59,8 @@ def seen_colors(
     ):
         if tensor is not None and tuple(tensor.shape) != shape:
             raise ValueError(f"{name}: expected shape {shape}, got {tuple(tensor.shape)}")
-    if sh_color.degree_of(count) == 0:
-        colors = array_namespace(sh).clip(sh_color.dc_to_rgb(sh[:, 0]), 0, None)
+    if spherical_harmonics.degree_of(count) == 0:
+        colors = array_namespace(sh).clip(spherical_harmonics.dc_to_rgb(sh[:, 0]), 0, None)
         return colors if factor is None else colors * factor[:, None]
     poses = _poses(eyes, view_maps, pose_ids, n)
     return backends.choose(backend, means).seen_colors(means, sh, rest, factor, poses)
@@ -77,8 +77,8 @@ def sky(sh: np.ndarray, camera: Camera) -> np.ndarray:
         Display-referred sRGB. [H, W, 3] float32
     """
     sh = np.array(sh, np.float64)
-    if sh_color.degree_of(len(sh)) == 0:
-        color = np.clip(sh_color.dc_to_rgb(sh[0]), 0, 1)
+    if spherical_harmonics.degree_of(len(sh)) == 0:
+        color = np.clip(spherical_harmonics.dc_to_rgb(sh[0]), 0, 1)
         return np.broadcast_to(color.astype(np.float32), (camera.height, camera.width, 3))
     return backends.on_cpu().sky(sh, camera)
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..scene import sh_color
+from ..scene import spherical_harmonics
 from ..scene.cameras import Camera
 from .arrays import Array, to_array
 from .backend import Backend, ViewPoses
@@ -69,7 +69,7 @@ def seen_colors(means: Tensor, sh: Tensor, rest: Tensor | None, factor: Tensor |
     at_the_eye = square <= 0
     lengths = torch.sqrt(torch.where(at_the_eye, torch.ones_like(square), square))
     directions = torch.where(at_the_eye, torch.zeros_like(offsets), offsets / lengths)
-    colors = sh_color.to_rgb(sh, directions).clamp_min(0)
+    colors = spherical_harmonics.to_rgb(sh, directions).clamp_min(0)
     return colors if factor is None else colors * factor[:, None]
 
 

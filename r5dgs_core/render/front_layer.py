@@ -15,7 +15,7 @@ from ..motion import rotations
 from ..raster.compilation import run
 from ..raster.cpu import blend_before_depths, forward, projection, tiles
 from ..raster.settings import RasterSettings
-from ..scene import cameras, sh_color
+from ..scene import cameras, spherical_harmonics
 from ..scene.cameras import Camera
 from ..scene.instance import Instance
 from ..scene.scene import Scene
@@ -93,7 +93,7 @@ def of_sky(scenes: Sequence[Scene], instances: Sequence[Instance], posed: PosedS
         world = np.eye(4) if instance.world is None else np.asarray(instance.world, np.float64)
         rays = (posed.means[rows] + posed.origin - camera.center) @ np.linalg.inv(world[:3, :3]).T
         rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-30)
-        skies = np.clip(sh_color.to_rgb(scene.background_sh, rays), 0, 1)
+        skies = np.clip(spherical_harmonics.to_rgb(scene.background_sh, rays), 0, 1)
         alike = (np.abs(colors[rows] - skies) < SKY_TOLERANCE).all(axis=1)
         faint = posed.opacity_logits[rows] < SKY_LOGIT
         result[rows] = alike & (faint | _is_beyond(scene, scene.gaussians.means[instance.start + rows - start]))

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..playback import scene_player
 from ..raster import RasterSettings, RenderOutput, rasterize, shade
-from ..scene import cameras, sh_color
+from ..scene import cameras, spherical_harmonics
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from . import posed_scene
@@ -88,7 +88,7 @@ def colors(posed: PosedScene, camera: Camera) -> np.ndarray:
     """Return the display-referred colour of each Gaussian for a camera, >= 0. [N, 3] float32"""
     factor = posed.shading_factor
     if posed.sh.shape[1] == 1:
-        rgb = np.maximum(sh_color.dc_to_rgb(np.asarray(posed.sh[:, 0], np.float32)), 0)
+        rgb = np.maximum(spherical_harmonics.dc_to_rgb(np.asarray(posed.sh[:, 0], np.float32)), 0)
         if factor is not None:
             for channel in range(3):  # by column, as numpy is slow on rows of three
                 rgb[:, channel] *= factor

@@ -1,13 +1,13 @@
-"""Basis of real spherical harmonics up to degree 3, and coefficients under linear maps.
+"""Colours of Gaussians from real spherical harmonics up to degree 3, and coefficients under linear maps.
 
 The basis has the order and signs of 3DGS files: K = (degree + 1)^2 functions, ordered by degree l and then by order
-m = -l .. l, with the Condon-Shortley sign (the three linear terms are -y, z, -x). Supports numpy and torch.
+m = -l .. l, with the Condon-Shortley sign (the three linear terms are -y, z, -x). Colours are display-referred sRGB
+with an offset of one half, so that all-zero coefficients are mid-grey. Supports numpy and torch.
 """
 
 from __future__ import annotations
 
 import math
-import sys
 from typing import Any
 
 import numpy as np
@@ -81,7 +81,38 @@ def basis(directions: Array, degree: int) -> Array:
                 C3_2_DIFFERENCE * z * (xx - yy),
                 -C3_3 * x * (xx - 3 * yy),
             ]
-    return _library(directions).stack(values, -1)
+    return rotations.array_namespace(directions).stack(values, -1)
+
+
+def evaluate(sh: Array, directions: Array) -> Array:
+    """Sum of coefficients times basis functions, without offset and clamp.
+
+    Args:
+        sh: Coefficients of each colour channel; K = 1, 4, 9 or 16. [..., K, 3]
+        directions: Unit vectors from the camera to the Gaussian, world frame. [..., 3]
+
+    Returns:
+        Colour minus one half. [..., 3]
+    """
+    degree = degree_of(sh.shape[-2])
+    if degree == 0:  # independent of the direction
+        return C0 * sh[..., 0, :]
+    return (basis(directions, degree)[..., None] * sh).sum(-2)
+
+
+def to_rgb(sh: Array, directions: Array) -> Array:
+    """Display-referred colour seen along ``directions``: 0.5 + `evaluate`, not clamped. [..., K, 3] -> [..., 3]"""
+    return 0.5 + evaluate(sh, directions)
+
+
+def rgb_to_dc(rgb: Array) -> Array:
+    """Degree-0 coefficient of a display-referred colour that is the same from all directions. [..., 3] -> [..., 3]"""
+    return (rgb - 0.5) / C0
+
+
+def dc_to_rgb(dc: Array) -> Array:
+    """Inverse of `rgb_to_dc`: the colour averaged over all directions. [..., 3] -> [..., 3]"""
+    return 0.5 + C0 * dc
 
 
 def change_of_basis(linear: np.ndarray, degree: int) -> np.ndarray:
@@ -147,9 +178,3 @@ def turned(sh: np.ndarray, quats: np.ndarray) -> np.ndarray:
         change = inverse @ basis(rotations.rotate(back, _DIRECTIONS), degree)
         result[rows] = change @ sh[rows]
     return result
-
-
-def _library(array: Array):
-    """Return torch if the array is a tensor, else numpy. Never imports torch."""
-    torch = sys.modules.get("torch")
-    return torch if torch is not None and isinstance(array, torch.Tensor) else np

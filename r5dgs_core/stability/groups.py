@@ -67,7 +67,7 @@ def _direction(shape: str) -> float:
     for quat, fit in _fits(shape):
         direction = rotations.rotate(fit.quat, along)
         worst = max(worst, float(np.linalg.norm(direction - rotations.rotate(quat, along))))
-        least = rigid_fit.shortest_turn(along, direction)
+        least = rotations.between_vectors(along, direction)
         if len(fit.undetermined_axes) != 1 or angle(fit.quat, least) > 1e-9:
             return math.inf
     return worst

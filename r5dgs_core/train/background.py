@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..scene import cameras, sh_color
+from ..scene import cameras, spherical_harmonics
 from ..scene.cameras import Camera
 from .initialization import sky
 
@@ -34,12 +34,12 @@ class Background:
         """Return the background of a camera: [3] if the colour is fixed, else [H, W, 3]."""
         coefficients = self.params["background"]
         if not self.learned:
-            return sh_color.dc_to_rgb(coefficients[0]).clamp(0, 1)
+            return spherical_harmonics.dc_to_rgb(coefficients[0]).clamp(0, 1)
         shape = (camera.height, camera.width, 3)
         key = (*shape, camera.T_cam_world[:3, :3].tobytes(), camera.intrinsics.tobytes(), len(coefficients))
         if key not in self._bases:
             rays = torch.from_numpy(cameras.pixel_rays(camera).reshape(-1, 3).astype(np.float32))
-            basis = sh_color.basis(rays, sh_color.degree_of(len(coefficients)))
+            basis = spherical_harmonics.basis(rays, spherical_harmonics.degree_of(len(coefficients)))
             if sum(b.nbytes for b in self._bases.values()) + basis.nbytes > BASES_BYTES:
                 self._bases.clear()
             self._bases[key] = basis
@@ -48,7 +48,7 @@ class Background:
 
 def fixed(color: np.ndarray) -> Background:
     """Return a background of one fixed colour [3]."""
-    return Background(torch.from_numpy(sh_color.rgb_to_dc(np.asarray(color, np.float32)))[None], False)
+    return Background(torch.from_numpy(spherical_harmonics.rgb_to_dc(np.asarray(color, np.float32)))[None], False)
 
 
 def learned(coefficients: np.ndarray, degree: int = sky.DEGREE) -> Background:

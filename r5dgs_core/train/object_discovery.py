@@ -21,6 +21,7 @@ from ..config.config import Config
 from ..data.dataset import Dataset
 from ..motion import rotations
 from ..raster import rasterize_splats
+from ..scene import visibility
 from . import motion_clusters
 from .representations import gating
 from .representations.field import FieldRepresentation
@@ -32,7 +33,6 @@ log = logging.getLogger(__name__)
 
 JUDGES = 20  # number of views that decide if a part is needed
 GAIN = 2.0  # minimum gain in PSNR by the motion of a part, dB
-OPAQUE = 0.3  # opacity below which Gaussians do not define parts
 TOLERANCE = 0.02  # residual allowed for points that hardly move, normalised units
 SPECK = 0.1  # minimum size of a piece of a mask / size of its largest piece
 NAME = "discovery"  # name of the progress events
@@ -111,7 +111,7 @@ def _short(config: Config, last: float) -> Config:
 def parts(trainer: Trainer, config: Config) -> np.ndarray:
     """Return the rigidly moving part of each opaque Gaussian of a field, -1 for none. [N]"""
     rows, opacities = _movers(trainer)
-    rows, opacities = rows[opacities > OPAQUE], opacities[opacities > OPAQUE]
+    rows, opacities = rows[opacities > visibility.SEEN_OPACITY], opacities[opacities > visibility.SEEN_OPACITY]
     return _labelled(trainer, config, rows, opacities, _paths(trainer, rows))
 
 
@@ -124,7 +124,7 @@ def sort(trainer: Trainer) -> np.ndarray:
         trainer: A finished run of a field.
     """
     rows, opacities = _movers(trainer)
-    paths, opaque = _paths(trainer, rows), opacities > OPAQUE
+    paths, opaque = _paths(trainer, rows), opacities > visibility.SEEN_OPACITY
     labels = _labelled(trainer, trainer.config, rows[opaque], opacities[opaque], paths[opaque])
     labels[rows] = motion_clusters.attach(paths, opacities, TOLERANCE, labels[rows])
     return labels

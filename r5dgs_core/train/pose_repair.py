@@ -170,8 +170,7 @@ def _quats(trainer: Trainer, body: int) -> np.ndarray:
 def _between(times: np.ndarray, quats: np.ndarray, a: int, b: int, s: int) -> np.ndarray:
     """Rotation at knot s by constant spin from knot a to knot b; s may lie outside. [4]"""
     share = (times[s] - times[a]) / (times[b] - times[a])
-    turn = rotations.quats_to_rotvecs(rotations.multiply(quats[b], rotations.conjugate(quats[a])))
-    return rotations.normalize(rotations.multiply(rotations.rotvecs_to_quats(share * turn), quats[a]))
+    return rotations.interpolate(quats[a], quats[b], share)
 
 
 def _turned(pose: Pose) -> list[Pose]:

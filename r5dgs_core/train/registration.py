@@ -18,7 +18,7 @@ from ..model.group_poses import GroupPoses
 from ..motion import rotations
 from ..motion.se3 import Pose
 from ..raster import rasterize_splats
-from ..scene import cameras, sh_color
+from ..scene import cameras, spherical_harmonics
 from ..scene.cameras import Camera
 from . import train_views
 from .representations import fused_posing
@@ -63,7 +63,7 @@ class Registration:
         rows = torch.from_numpy(np.flatnonzero(trainer.gaussians.motion_ids.numpy() == body))
         names = ("means", "quats", "log_scales", "opacity_logits", "shading")
         self._shape = {name: params[name].detach()[rows] for name in names}
-        self._shape["colors"] = sh_color.dc_to_rgb(params["sh"].detach()[rows, 0])
+        self._shape["colors"] = spherical_harmonics.dc_to_rgb(params["sh"].detach()[rows, 0])
         shown = train_views.spread(
             [v for v in views_at(trainer, knot) if (v.mask == object_id).sum() >= FEWEST_PIXELS], most
         )

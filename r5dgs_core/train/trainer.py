@@ -22,7 +22,7 @@ from ..data.dataset import Dataset
 from ..errors import CheckpointError, DatasetError, TrainingError
 from ..model.gaussians import Gaussians
 from ..raster import RasterStats, rasterize_splats
-from ..scene import sh_color
+from ..scene import spherical_harmonics
 from ..scene.cameras import Camera
 from . import background as backgrounds
 from . import curriculum, losses, normalization, train_views
@@ -145,7 +145,7 @@ class Trainer:
     def _mean_color(self) -> np.ndarray:
         """Coefficients of the median colour of all pixels, for scenes in which no sky was found. [1, 3]"""
         color = np.median([np.median(v.image.reshape(-1, 3), axis=0) for v in self.views], axis=0) / 255
-        return sh_color.rgb_to_dc(color)[None]
+        return spherical_harmonics.rgb_to_dc(color)[None]
 
     @property
     def params(self) -> dict[str, Tensor]:

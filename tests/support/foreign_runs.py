@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r5dgs_core.scene import sh_color
+from r5dgs_core.scene import spherical_harmonics
 from r5dgs_core.scene.cameras import Camera
 from tests.support import scenes
 
@@ -303,7 +303,7 @@ def picture(cloud: Cloud, shown: Drawn, camera: Camera, background: float) -> np
     sharp = torch.linalg.inv(flat)
     centers = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
     directions = shown.means - torch.from_numpy(camera.center)
-    rgb = sh_color.to_rgb(cloud.sh, unit(directions)).clamp_min(0)
+    rgb = spherical_harmonics.to_rgb(cloud.sh, unit(directions)).clamp_min(0)
     image = np.zeros((camera.height, camera.width, 3))
     for row in range(camera.height):
         for column in range(camera.width):

@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numba import float32
 
-from ...scene.sh_color import C0, C1, C2_XX_YY, C2_XY, C2_ZZ, C3_0, C3_1, C3_2, C3_2_DIFFERENCE, C3_3
+from ...scene.spherical_harmonics import C0, C1, C2_XX_YY, C2_XY, C2_ZZ, C3_0, C3_1, C3_2, C3_2_DIFFERENCE, C3_3
 from ..compilation import helper, kernel
 
 BASES = 16  # up to degree 3

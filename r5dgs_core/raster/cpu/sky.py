@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import float32
 
-from ...scene.sh_color import C0
+from ...scene.spherical_harmonics import C0
 from ..compilation import helper, kernel
 from .sh_kernels import BASES, evaluate_basis
 

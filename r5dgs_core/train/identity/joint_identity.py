@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...config.config import Config
 from ...model.gaussians import Gaussians
-from ...scene import sh_color
+from ...scene import spherical_harmonics
 from ...scene.scene import IDENTITY_DIM
 from ..representations.fused_posing import PosedSplats
 from ..train_views import TrainView
@@ -92,7 +92,7 @@ class JointIdentity:
         """
         if self.with_geometry:
             draws = torch.rand(len(gaussians), IDENTITY_DIM, generator=self._generator)
-            encodings = sh_color.rgb_to_dc(draws)
+            encodings = spherical_harmonics.rgb_to_dc(draws)
         else:
             weight = self.params["classifier.weight"].detach()
             ids = gaussians.motion_ids

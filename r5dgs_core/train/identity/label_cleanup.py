@@ -22,7 +22,7 @@ from scipy import sparse, spatial
 from scipy.sparse import csgraph
 
 from ...motion import rotations
-from ...playback import visibility
+from ...scene import visibility
 from ..observed_motion import GroupTrack
 
 log = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ import torch
 from scipy.spatial import KDTree
 
 from ...model.gaussians import Gaussians
-from ...scene import sh_color
+from ...scene import spherical_harmonics
 from . import shadows
 
 SHADOW_OPACITY = 0.03
@@ -108,7 +108,7 @@ def gaussians_of(parts: Sequence[SeedPoints], sh_degree: int) -> Gaussians:
         "quats": quats,
         "log_scales": log_scales,
         "opacity_logits": np.log(opacities / (1 - opacities)),
-        "sh": sh_color.rgb_to_dc(colors)[:, None, :],
+        "sh": spherical_harmonics.rgb_to_dc(colors)[:, None, :],
         "sh_rest": np.zeros((len(means), (sh_degree + 1) ** 2 - 1, 3)),
         "shading": np.zeros((len(means), 3)),
     }

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...scene import sh_color
+from ...scene import spherical_harmonics
 
 DEGREE = 2
 AGREES = 0.025  # maximum colour difference at which a ray is sky
@@ -34,7 +34,7 @@ def fit(
     """
     if candidates.sum() < 50:
         return None
-    basis = sh_color.basis(directions, DEGREE)
+    basis = spherical_harmonics.basis(directions, DEGREE)
     height = directions @ up
     inliers = candidates & (height >= np.quantile(height[candidates], 0.7))
     coefficients = np.zeros((basis.shape[1], 3))

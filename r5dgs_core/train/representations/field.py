@@ -30,7 +30,7 @@ from ...model.trd import SHAPES as TRD_SHAPES
 from ...model.trd import TRD
 from ...motion import rotations
 from ...raster import shade
-from ...scene import sh_color
+from ...scene import spherical_harmonics
 from ...scene.cameras import Camera
 from ..observed_motion import ObservedMotion
 from . import field_fitting, field_to_groups, fused_posing, gating, rigidity, shading
@@ -110,7 +110,7 @@ class FieldRepresentation(Representation):
         turned = rotations.multiply(moved.quats, rotations.normalize(params["quats"][rows]))
         quats = params["quats"].index_copy(0, rows, turned)
         if params["sh_rest"].shape[1] == 0:
-            colors = sh_color.dc_to_rgb(params["sh"][:, 0])
+            colors = spherical_harmonics.dc_to_rgb(params["sh"][:, 0])
         else:
             colors = shade.seen_colors(
                 means.detach(), params["sh"], np.asarray(camera.center)[None], rest=params["sh_rest"]
@@ -119,7 +119,7 @@ class FieldRepresentation(Representation):
             seen = means.detach()[rows] - torch.from_numpy(np.asarray(camera.center)).float()
             seen = rotations.rotate(rotations.conjugate(moved.quats.detach()), seen / seen.norm(dim=1, keepdim=True))
             both = torch.cat([params["sh"][rows], params["sh_rest"][rows]], dim=1)
-            colors = colors.index_copy(0, rows, sh_color.to_rgb(both, seen))
+            colors = colors.index_copy(0, rows, spherical_harmonics.to_rgb(both, seen))
         if self._config.train.shading:
             change = rotations.rotate(rotations.conjugate(moved.quats), self.light) - self.light
             factor = 1 + (change * params["shading"][rows]).sum(-1, keepdim=True)
@@ -345,7 +345,7 @@ def bring_together(gaussians: Gaussians, tracks: Tracks, knot: int, light: Tenso
             return
         sh = torch.cat([gaussians.sh, gaussians.sh_rest], dim=1).double().numpy()
         vectors, turns = gaussians.shading.double().numpy(), poses.quats[ids].double().numpy()
-        sh = sh_color.rotate(sh, turns)
+        sh = spherical_harmonics.turned(sh, turns)
         # Unlit surfaces start dark; factors at rest are dropped, as training assumes 1.
         sh, vectors, _ = shading.rebind(sh, vectors, np.ones(len(sh)), turns, light.double().numpy())
         gaussians.sh.copy_(torch.from_numpy(sh[:, :1]))

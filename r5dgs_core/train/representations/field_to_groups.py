@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ...motion import rigid_fit, rotations, se3
 from ...motion_fit import backtest
-from ...scene import sh_color
+from ...scene import spherical_harmonics
 from ...scene.splats import to_opacities
 from ..observed_motion import GroupTrack, ObservedMotion, PointMotion
 from . import regrouping as regroup
@@ -122,7 +122,9 @@ def _bind_state(
     """
     rows = points.rows
     bind = {name: tensor.numpy().copy() for name, tensor in gaussians.items()}
-    sh = sh_color.rotate(np.concatenate([bind["sh"], bind["sh_rest"]], axis=1).astype(np.float64)[rows], since)
+    sh = spherical_harmonics.turned(
+        np.concatenate([bind["sh"], bind["sh_rest"]], axis=1).astype(np.float64)[rows], since
+    )
     ones = np.ones(len(sh))
     sh, vectors, lit = shading.rebind(sh, bind["shading"][rows].astype(np.float64), ones, since, light)
     bind["shading_rest"] = np.ones(len(bind["means"]))

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import spatial
 
 from ...motion import rotations
-from ...playback import visibility
+from ...scene import visibility
 from ..observed_motion import GroupTrack, RegroupCounts
 
 log = logging.getLogger(__name__)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...motion import rotations
-from ...playback.visibility import SEEN_OPACITY
+from ...scene.visibility import SEEN_OPACITY
 
 QUAT_WEIGHT = 0.05  # weight of squared quaternion differences relative to squared distances in normalised units
 SOFTENING = 1e-6  # length that keeps the gradient of a distance finite at 0

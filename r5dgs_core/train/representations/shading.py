@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...motion import rotations
-from ...scene import sh_color
+from ...scene import spherical_harmonics
 
 MIN_FACTOR = 0.1  # the s above
 
@@ -22,7 +22,7 @@ def rebind(
     """Return colours, shading vectors and factors at rest for a turned state; all rendered colours stay the same.
 
     Args:
-        sh: Harmonics, already in the frame of the new state (`sh_color.rotate`). [N, K, 3]
+        sh: Harmonics, already in the frame of the new state (`spherical_harmonics.turned`). [N, K, 3]
         shading: The vectors g. [N, 3]
         rest: The factors r. [N]
         quats: Rotation Q from the old state to the new one, unit wxyz, one for all or one for each. [4] or [N, 4]
@@ -36,5 +36,5 @@ def rebind(
     scale = np.maximum(factor, MIN_FACTOR)
     colored = sh * scale[:, None, None]
     # The offset of one half scales too: dc_to_rgb(dc') = scale * dc_to_rgb(dc).
-    colored[:, 0] = sh_color.rgb_to_dc(sh_color.dc_to_rgb(sh[:, 0]) * scale[:, None])
+    colored[:, 0] = spherical_harmonics.rgb_to_dc(spherical_harmonics.dc_to_rgb(sh[:, 0]) * scale[:, None])
     return colored, rotations.rotate(quats, shading) / scale[:, None], factor / scale

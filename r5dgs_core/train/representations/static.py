@@ -16,7 +16,7 @@ from ...model import group_poses
 from ...model.gaussians import Gaussians
 from ...motion import robust_weights, rotations
 from ...raster import shade
-from ...scene import sh_color
+from ...scene import spherical_harmonics
 from ...scene.cameras import Camera
 from ..initialization import initialize
 from ..observed_motion import GroupTrack, ObservedMotion
@@ -49,7 +49,7 @@ class StillRepresentation(Representation):
         """See `Representation.splats`; the result is the same at all times."""
         params = gaussians.params
         if params["sh_rest"].shape[1] == 0:
-            colors = sh_color.dc_to_rgb(params["sh"][:, 0])
+            colors = spherical_harmonics.dc_to_rgb(params["sh"][:, 0])
         else:
             eye, means = np.asarray(camera.center)[None], params["means"].detach()
             colors = shade.seen_colors(means, params["sh"], eye, rest=params["sh_rest"])

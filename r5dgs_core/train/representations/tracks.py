@@ -15,7 +15,7 @@ from ...model.gaussians import Gaussians
 from ...model.tracks import Tracks
 from ...motion import rotations
 from ...raster import shade
-from ...scene import sh_color
+from ...scene import spherical_harmonics
 from ...scene.cameras import Camera
 from ..initialization import initialize
 from ..observed_motion import GroupTrack, ObservedMotion
@@ -74,7 +74,7 @@ class TracksRepresentation(Representation):
         centers = self.tracks.group_centers()
         params = gaussians.params
         if params["sh_rest"].shape[1] == 0:
-            colors = sh_color.dc_to_rgb(params["sh"][:, 0])
+            colors = spherical_harmonics.dc_to_rgb(params["sh"][:, 0])
         else:
             # The harmonics are defined in each group's own frame, so the camera is transformed into it.
             with torch.no_grad():

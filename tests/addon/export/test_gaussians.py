@@ -10,7 +10,7 @@ from r5dgs_core.cli.commands import export as export_command
 from r5dgs_core.formats import ply
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import posed_scene, scene_renderer
-from r5dgs_core.scene import cameras, scene_file, sh_color
+from r5dgs_core.scene import cameras, scene_file, spherical_harmonics
 from r5dgs_core.scene.instance import Instance
 from r5dgs_core.scene.splats import Splats
 from tests.support import motions, scenes
@@ -71,7 +71,7 @@ def render(splats, scene, camera, backend="reference"):
         splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh,
         np.zeros(len(splats.means), np.int32), np.eye(3)[None], np.zeros(len(splats.means), np.int64), None,
     )  # fmt: skip
-    background = sh_color.dc_to_rgb(scene.background_sh[0])
+    background = spherical_harmonics.dc_to_rgb(scene.background_sh[0])
     picture = scene_renderer.render_frame(scene, posed, camera, background=background, backend=backend)
     return np.clip(picture.color, 0, 1)
 
@@ -87,7 +87,7 @@ def shown(scene, collection, camera):
         for o in collection.all_objects
         if o.r5dgs.role == "CLOUD" and o.visible_get()
     ]
-    background = sh_color.dc_to_rgb(scene.background_sh[0])
+    background = spherical_harmonics.dc_to_rgb(scene.background_sh[0])
     pose = posed_scene.pose_instances(scene, instances)
     return np.clip(scene_renderer.render_frame(scene, pose, camera, background=background).color, 0, 1)
 
@@ -174,7 +174,7 @@ def test_an_unedited_scene_matches_playback(blender, scene, loaded, tmp_path):
     np.testing.assert_allclose(np.sort(splats.means, axis=0), np.sort(frame.means, axis=0), atol=1e-5 * scene.extent)
     wanted = np.clip(
         scene_renderer.render_frame(
-            scene, frame, scene.cameras[0], background=sh_color.dc_to_rgb(scene.background_sh[0])
+            scene, frame, scene.cameras[0], background=spherical_harmonics.dc_to_rgb(scene.background_sh[0])
         ).color, 0, 1,
     )  # fmt: skip
     assert psnr(render(splats, scene, scene.cameras[0]), wanted) > 50
@@ -206,7 +206,7 @@ def test_a_tint_is_baked_into_the_colours(blender, loaded, tmp_path):
     mug.r5dgs_look.tint = (0.5, 1.0, 0.25)
     after = export(blender, tmp_path / "b.ply")
     rows = after.object_ids == mug.r5dgs.object_id
-    colour = sh_color.dc_to_rgb
+    colour = spherical_harmonics.dc_to_rgb
     np.testing.assert_allclose(colour(after.sh[rows, 0]), colour(before.sh[rows, 0]) * (0.5, 1, 0.25), atol=1e-6)
     np.testing.assert_array_equal(after.sh[~rows], before.sh[~rows])
 

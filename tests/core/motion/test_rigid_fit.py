@@ -134,7 +134,7 @@ def test_ambiguous_rotation_steps_are_reported(degrees, told):
 
 
 def test_opposite_points_give_a_half_turn_about_a_normal():
-    quat = rigid_fit.shortest_turn(np.array([0, 0, 1.0]), np.array([0, 0, -1.0]))
+    quat = rotations.between_vectors(np.array([0, 0, 1.0]), np.array([0, 0, -1.0]))
     np.testing.assert_allclose(rotations.rotate(quat, np.array([0, 0, 1.0])), [0, 0, -1], atol=1e-12)
 
 

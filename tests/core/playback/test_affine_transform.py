@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import affine_transform, residuals, scene_player
 from r5dgs_core.render import posed_scene, scene_renderer
-from r5dgs_core.scene import sh_color, spherical_harmonics
+from r5dgs_core.scene import spherical_harmonics
 from r5dgs_core.scene.instance import Instance
 from r5dgs_core.scene.splats import Splats
 from tests.support.scenes import make_scene
@@ -46,26 +46,26 @@ def test_colours_turn_exactly_with_turned_mirrored_and_scaled_bodies(degree, mir
     sh, d = random_sh(degree), directions()
     before = d @ np.linalg.inv(linear).T
     before /= np.linalg.norm(before, axis=-1, keepdims=True)
-    seen = sh_color.to_rgb(spherical_harmonics.carried(sh, linear)[:, None], d)
-    np.testing.assert_allclose(seen, sh_color.to_rgb(sh[:, None], before), atol=1e-10)
+    seen = spherical_harmonics.to_rgb(spherical_harmonics.carried(sh, linear)[:, None], d)
+    np.testing.assert_allclose(seen, spherical_harmonics.to_rgb(sh[:, None], before), atol=1e-10)
 
 
 def test_turning_harmonics_agrees_with_the_core():
     sh, quat = random_sh(3), rotations.rotmats_to_quats(TURN)
-    np.testing.assert_allclose(spherical_harmonics.carried(sh, TURN), sh_color.rotate(sh, quat), atol=1e-12)
+    np.testing.assert_allclose(spherical_harmonics.carried(sh, TURN), spherical_harmonics.turned(sh, quat), atol=1e-12)
 
 
 def test_no_other_coefficients_fit_a_stretched_body_better():
     linear, sh, d = np.diag([1.0, 1.4, 0.8]), random_sh(3, 1), directions(4000)
     before = d @ np.linalg.inv(linear).T
-    wanted = sh_color.to_rgb(sh[:, None], before / np.linalg.norm(before, axis=-1, keepdims=True))
+    wanted = spherical_harmonics.to_rgb(sh[:, None], before / np.linalg.norm(before, axis=-1, keepdims=True))
 
     def error(coefficients):
-        return float(((sh_color.to_rgb(coefficients[:, None], d) - wanted) ** 2).mean())
+        return float(((spherical_harmonics.to_rgb(coefficients[:, None], d) - wanted) ** 2).mean())
 
     ours = error(spherical_harmonics.carried(sh, linear))
     assert ours < 0.5 * error(spherical_harmonics.carried(sh, affine_transform.nearest_rotation(linear)))
-    assert ours < 1.1 * error(np.linalg.lstsq(sh_color.basis(d, 3), wanted[0], rcond=None)[0][None])
+    assert ours < 1.1 * error(np.linalg.lstsq(spherical_harmonics.basis(d, 3), wanted[0], rcond=None)[0][None])
 
 
 STRETCHED = TURN @ np.diag([1.0, 3.0, 0.2]) @ TURN
@@ -98,7 +98,9 @@ def test_a_placed_range_has_the_colours_that_the_renderer_gives_it(tint):
     posed = posed_scene.pose_instances(scene, [Instance(start, count, matrix)])
     wanted = scene_renderer.colors(posed, scene.cameras[0]) * (1 if tint is None else np.array(tint))
     towards = placed.means - scene.cameras[0].center
-    seen = sh_color.to_rgb(placed.sh.astype(np.float64), towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+    seen = spherical_harmonics.to_rgb(
+        placed.sh.astype(np.float64), towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    )
     np.testing.assert_allclose(np.maximum(seen, 0), wanted, atol=2e-5)
     np.testing.assert_array_equal(placed.means, posed.means)
     np.testing.assert_array_equal(placed.object_ids, scene.gaussians.object_ids[start : start + count])
@@ -152,7 +154,9 @@ def test_deformed_gaussians_match_the_renderer(t, turns_harmonics):
         np.testing.assert_allclose(getattr(placed, name), getattr(posed, name), atol=2e-6, err_msg=name)
     np.testing.assert_allclose(np.abs((placed.quats * posed.quats).sum(-1)), 1, atol=1e-6)
     towards = placed.means - scene.cameras[0].center
-    seen = sh_color.to_rgb(placed.sh.astype(np.float64), towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+    seen = spherical_harmonics.to_rgb(
+        placed.sh.astype(np.float64), towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    )
     np.testing.assert_allclose(np.maximum(seen, 0), scene_renderer.colors(posed, scene.cameras[0]), atol=3e-5)
 
 

@@ -7,12 +7,12 @@ import pytest
 
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import played_splats, scene_player
-from r5dgs_core.scene import sh_color
+from r5dgs_core.scene import spherical_harmonics
 from tests.support.scenes import TIMES, make_scene
 
 
 def colors(sh, towards):
-    return np.maximum(sh_color.to_rgb(sh.astype(np.float64), towards), 0)
+    return np.maximum(spherical_harmonics.to_rgb(sh.astype(np.float64), towards), 0)
 
 
 @pytest.mark.parametrize("t", [0.02, 0.4, 0.75, 1.2])

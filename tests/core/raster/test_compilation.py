@@ -180,7 +180,7 @@ def test_kernels_depend_only_on_their_own_file_and_the_shared_sources():
     for path, tree in found.items():
         strange = set(imported_from_the_core(path, tree)) - shared
         assert not strange, f"{path.name} imports {strange}, which compilation._SHARED lacks"
-    # The constants that `scene.sh_color` hands on.
+    # Constants of `scene.spherical_harmonics`.
     assert CORE / "scene" / "spherical_harmonics.py" in shared
 
 

@@ -23,7 +23,7 @@ from r5dgs_core.raster import (
 )
 from r5dgs_core.raster.cpu import blend, blend_backward, forward, projection, tiles
 from r5dgs_core.render import warm_up
-from r5dgs_core.scene import cameras, sh_color
+from r5dgs_core.scene import cameras, spherical_harmonics
 from tests.support.splats import camera, draw, relative, splats
 
 pytestmark = pytest.mark.heavy
@@ -460,7 +460,7 @@ def test_a_label_that_cannot_be_counted_is_named():
 
 def gaussians(n=300, k=16, seed=16):
     means, quats, scales, opacities, colors = (t.float() for t in splats(n, 3, seed=seed))
-    sh = torch.cat([sh_color.rgb_to_dc(colors)[:, None], 0.2 * torch.randn(n, k - 1, 3)], 1)
+    sh = torch.cat([spherical_harmonics.rgb_to_dc(colors)[:, None], 0.2 * torch.randn(n, k - 1, 3)], 1)
     return SimpleNamespace(
         means=means, quats=quats, log_scales=scales.log(), opacity_logits=torch.logit(opacities, 1e-4), sh=sh
     )
@@ -477,7 +477,7 @@ def test_colours_come_from_the_harmonics_along_the_line_of_sight(k):
     scene, view = gaussians(k=k), camera()
     directions = scene.means - torch.tensor(view.center, dtype=torch.float32)
     directions = directions / directions.norm(dim=1, keepdim=True)
-    colors = (0.5 + sh_color.evaluate(scene.sh, directions)).clamp_min(0)
+    colors = (0.5 + spherical_harmonics.evaluate(scene.sh, directions)).clamp_min(0)
     expected = blended(scene, colors, view)
     torch.testing.assert_close(rasterize(scene, view).color, expected.image, atol=1e-5, rtol=1e-4)
 

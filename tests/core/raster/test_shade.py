@@ -9,7 +9,7 @@ import torch
 from r5dgs_core.raster import backends, compilation, rasterize, rasterizer, shade
 from r5dgs_core.raster.cpu import forward
 from r5dgs_core.render import posed_scene
-from r5dgs_core.scene import sh_color
+from r5dgs_core.scene import spherical_harmonics
 from r5dgs_core.scene.cameras import Camera
 from tests.support import scenes, splats
 
@@ -112,7 +112,7 @@ def test_a_gaussian_at_the_eye_shows_degree_zero_and_sends_no_gradient_to_its_ce
         lambda means, sh: shade.seen_colors(means, sh, eye, backend=backend),
         {name: tensors[name] for name in ("means", "sh")},
     )
-    torch.testing.assert_close(colors[3], sh_color.dc_to_rgb(tensors["sh"][3, 0]).clamp_min(0))
+    torch.testing.assert_close(colors[3], spherical_harmonics.dc_to_rgb(tensors["sh"][3, 0]).clamp_min(0))
     assert (gradients["means"][3] == 0).all() and (gradients["sh"][3, 1:] == 0).all()
     assert all(torch.isfinite(gradient).all() for gradient in gradients.values())
     assert (gradients["means"][4] != 0).any()

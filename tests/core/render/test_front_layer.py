@@ -6,7 +6,7 @@ import pytest
 from r5dgs_core.playback import scene_player
 from r5dgs_core.raster import RasterSettings
 from r5dgs_core.render import front_layer, mesh_depths, posed_scene, scene_renderer
-from r5dgs_core.scene import sh_color
+from r5dgs_core.scene import spherical_harmonics
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.scene.instance import Instance
 from tests.support import scenes
@@ -96,14 +96,14 @@ def one_gaussian(depth, scale):
 
 def test_faint_background_gaussians_of_the_colour_of_the_sky_belong_to_it(posed):
     scene, pose = posed
-    sky, count = sh_color.dc_to_rgb(scene.background_sh[0]), len(pose.means)
+    sky, count = spherical_harmonics.dc_to_rgb(scene.background_sh[0]), len(pose.means)
     pose = posed_scene.PosedScene(**{**vars(pose), "sh": pose.sh.copy(), "opacity_logits": pose.opacity_logits.copy()})
     background = np.flatnonzero(scene.gaussians.object_ids == 0)[:4]
     pose.sh[:], pose.opacity_logits[:] = 0, -2
-    pose.sh[:, 0] = sh_color.rgb_to_dc(sky + 0.5)
+    pose.sh[:, 0] = spherical_harmonics.rgb_to_dc(sky + 0.5)
     alike, other, opaque, object_ = *background[:3], int(np.flatnonzero(scene.gaussians.object_ids == 1)[0])
     for row in (alike, opaque, object_):
-        pose.sh[row, 0] = sh_color.rgb_to_dc(sky + 0.02)
+        pose.sh[row, 0] = spherical_harmonics.rgb_to_dc(sky + 0.02)
     pose.opacity_logits[opaque] = 4
     found = front_layer.of_sky([scene], [Instance(0, count, np.eye(4))], pose, scene.cameras[0])
     assert found[alike] and not found[[other, opaque, object_]].any() and found.sum() == 1

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from r5dgs_core.motion import rotations
-from r5dgs_core.scene import sh_color as harmonics
+from r5dgs_core.scene import spherical_harmonics as harmonics
 
 
 def sphere_quadrature(n=16):
@@ -86,8 +86,8 @@ def test_rotated_coefficients_equal_the_old_ones_in_the_rotated_direction(degree
     quats = rotations.normalize(draws.normal(size=(5, 4)))
     directions = draws.normal(size=(5, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    turned = harmonics.rotate(sh, quats)
+    turned = harmonics.turned(sh, quats)
     seen = harmonics.evaluate(turned, rotations.rotate(quats, directions))
     np.testing.assert_allclose(seen, harmonics.evaluate(sh, directions), atol=1e-12)
-    one = harmonics.rotate(sh, quats[2])
+    one = harmonics.turned(sh, quats[2])
     np.testing.assert_allclose(one[2], turned[2], atol=1e-12)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from r5dgs_core.scene import sh_color
+from r5dgs_core.scene import spherical_harmonics
 from r5dgs_core.train.initialization import sky
 
 UP = np.array([0.0, 0, 1])
@@ -29,7 +29,7 @@ def test_a_gradient_sky_is_fitted_and_objects_in_front_are_not_sky():
     assert found is not None
     coefficients, is_sky = found
     assert (is_sky == (candidates & ~house)).mean() > 0.99
-    seen = sh_color.basis(directions[is_sky], sky.DEGREE) @ coefficients + 0.5
+    seen = spherical_harmonics.basis(directions[is_sky], sky.DEGREE) @ coefficients + 0.5
     assert np.abs(seen - colors[is_sky]).max() < sky.AGREES
 
 
