@@ -7,7 +7,7 @@ from ..r5dgs_addon.ui import plural
 from ..r5dgs_addon.worker import worker_operator
 
 
-class R5DGS_OT_add_shadows(worker_operator.Waiting, bpy.types.Operator):
+class R5DGS_OT_add_shadows(worker_operator.WaitsForWorker, bpy.types.Operator):
     """Let meshes and Gaussians cast shadows on each other; adds proxies of the Gaussians to the scene of the meshes"""
 
     bl_idname = "r5dgs.add_shadows"
@@ -25,7 +25,7 @@ class R5DGS_OT_add_shadows(worker_operator.Waiting, bpy.types.Operator):
 
     def _begin(self, context):
         self._background = mesh_shadows.views(context)
-        return mesh_shadows.start(self._background)
+        return mesh_shadows.start_depths(self._background)
 
     def _finish(self, context, answer):
         pictures = [arrays for _, arrays in self._job.answers() if "depth" in arrays]

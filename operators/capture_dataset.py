@@ -14,7 +14,7 @@ def _items(identifiers, descriptions):
     return [(name, name.replace("_", " ").title(), text) for name, text in zip(identifiers, descriptions, strict=True)]
 
 
-class R5DGS_OT_capture_dataset(stepwise_operator.Running, bpy.types.Operator):
+class R5DGS_OT_capture_dataset(stepwise_operator.Stepwise, bpy.types.Operator):
     """Render this scene from many cameras into a data set for training R5DGS"""
 
     bl_idname = "r5dgs.capture_dataset"

@@ -12,7 +12,7 @@ from ..r5dgs_core import errors
 KEY = "check"
 
 
-class R5DGS_OT_check_worker(worker_operator.Waiting, bpy.types.Operator):
+class R5DGS_OT_check_worker(worker_operator.WaitsForWorker, bpy.types.Operator):
     """Restart the worker and report versions, device and speed; the first test compiles the rasterizer (10 to 30 s)"""
 
     bl_idname = "r5dgs.check_worker"
@@ -37,10 +37,10 @@ class R5DGS_OT_check_worker(worker_operator.Waiting, bpy.types.Operator):
     def modal(self, context, event):
         if event.type == "TIMER":
             worker_status.redraw()
-        return worker_operator.Waiting.modal(self, context, event)
+        return worker_operator.WaitsForWorker.modal(self, context, event)
 
     def cancel(self, context):
-        worker_operator.Waiting.cancel(self, context)
+        worker_operator.WaitsForWorker.cancel(self, context)
         worker_status.end("Stopped", "CANCEL")
 
     def _answered(self, context):

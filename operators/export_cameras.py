@@ -8,7 +8,7 @@ from ..r5dgs_addon.ui import stepwise_operator
 from ..r5dgs_core.formats import registry
 
 
-class R5DGS_OT_export_cameras(stepwise_operator.Running, bpy.types.Operator):
+class R5DGS_OT_export_cameras(stepwise_operator.Stepwise, bpy.types.Operator):
     """Export cameras with lens, pose and time for radiance field tools"""
 
     bl_idname = "r5dgs.export_cameras"

@@ -17,7 +17,7 @@ def _formats(operator, context):
     return _items
 
 
-class R5DGS_OT_export_format(polls.NeedsScene, stepwise_operator.Running, bpy.types.Operator):
+class R5DGS_OT_export_format(polls.NeedsScene, stepwise_operator.Stepwise, bpy.types.Operator):
     """Export the active scene with its edits for other tools"""
 
     bl_idname = "r5dgs.export_format"

@@ -8,7 +8,7 @@ from ..r5dgs_addon.scene import polls
 from ..r5dgs_addon.ui import stepwise_operator
 
 
-class R5DGS_OT_export_masks(stepwise_operator.Running, polls.NeedsCamera, bpy.types.Operator):
+class R5DGS_OT_export_masks(stepwise_operator.Stepwise, polls.NeedsCamera, bpy.types.Operator):
     """Save the object that each pixel of the active camera shows to image files, rendered by the worker"""
 
     bl_idname = "r5dgs.export_masks"

@@ -11,7 +11,7 @@ from ..r5dgs_core.formats import registry
 FORMAT = registry.get("ply")
 
 
-class R5DGS_OT_export_ply(stepwise_operator.Running, bpy.types.Operator):
+class R5DGS_OT_export_ply(stepwise_operator.Stepwise, bpy.types.Operator):
     """Export Gaussians with all edits and at their current positions as PLY files for other splat tools"""
 
     bl_idname = "r5dgs.export_ply"

@@ -10,7 +10,7 @@ from ..r5dgs_addon.ui import stepwise_operator
 from ..r5dgs_core import errors
 
 
-class R5DGS_OT_export_scene(polls.NeedsScene, stepwise_operator.Running, bpy.types.Operator):
+class R5DGS_OT_export_scene(polls.NeedsScene, stepwise_operator.Stepwise, bpy.types.Operator):
     """Save the active scene with its edits as a .r5dgs file: names, colors, deleted and moved objects, motion"""
 
     bl_idname = "r5dgs.export_scene"

@@ -127,7 +127,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             frame_views=self.frame_views,
             cameras=self.cameras,
             display=self.display,
-            bend=self.bend,
+            play_residuals=self.bend,
         )
         try:
             with stepwise_operator.cursor(context) as progress:

@@ -7,7 +7,7 @@ from ..r5dgs_addon.scene import polls
 from ..r5dgs_addon.worker import worker_operator
 
 
-class R5DGS_OT_preview(worker_operator.Waiting, polls.NeedsCamera, bpy.types.Operator):
+class R5DGS_OT_preview(worker_operator.WaitsForWorker, polls.NeedsCamera, bpy.types.Operator):
     """Render the loaded scenes through the active camera into the image 'R5DGS Preview'"""
 
     bl_idname = "r5dgs.preview"

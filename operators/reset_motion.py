@@ -32,7 +32,7 @@ class R5DGS_OT_reset_motion(bpy.types.Operator):
                 extrapolate.check(anchors, curves=False)
                 members = duplicate_delete.by_scene(anchors)
                 sources = [
-                    extrapolate.source(own, render_request.scene_path(collection))
+                    extrapolate.read_source(own, render_request.scene_path(collection))
                     for collection, own in members.items()
                 ]
                 for own, scene in zip(members.values(), sources, strict=True):

@@ -46,7 +46,7 @@ class R5DGS_OT_select_by_prompt(polls.Selects, bpy.types.Operator):
         if answer.error:
             self.report({"ERROR"}, answer.error)
             return {"CANCELLED"}
-        if answer.nothing:
+        if answer.asks_for_nothing:
             selection.select(context, [], self.mode)
             self.report({"INFO"}, "The prompt selects no objects")
             return {"FINISHED"}

@@ -48,7 +48,7 @@ class Options:
         frame_views: True to look at the scene in all 3D views.
         cameras: True to create the captured cameras.
         display: Key of `viewport_display.ITEMS`.
-        bend: True to play the residual motion of single Gaussians.
+        play_residuals: True to play the residual motion of single Gaussians.
     """
 
     world_convention: str = ""
@@ -60,7 +60,7 @@ class Options:
     frame_views: bool = True
     cameras: bool = True
     display: str = viewport_display.SPLATS
-    bend: bool = True
+    play_residuals: bool = True
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def ranges(scene: Scene) -> list[Range]:
     ]
 
 
-def homes(scene: Scene, parts: list[Range]) -> list[Range]:
+def anchor_ranges(scene: Scene, parts: list[Range]) -> list[Range]:
     """Return one range per anchor, whose object collection holds the anchor.
 
     Each motion group has one anchor; the pinned group 0 has one per object. The anchor of a body goes to the group's
@@ -140,7 +140,7 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
             timeline.fit(context.scene, times)
             event_markers.show(context.scene, collection)
         context.view_layer.update()
-        if options.bend and scene.residuals is not None and len(scene.residuals.rows):
+        if options.play_residuals and scene.residuals is not None and len(scene.residuals.rows):
             exact_mode.switch_on(context, collection, scene)
     if options.frame_views:
         first_view.show(context, collection)
@@ -184,10 +184,12 @@ def _objects(
         key, name = (part.object_id, part == largest[part.object_id]), object_name(scene, part.object_id)
         if key not in children:
             above = collection if key[1] else children[part.object_id, True]
-            children[key] = bpy.data.collections.new(object_names.fit(name if key[1] else name + object_names.FRINGE))
+            children[key] = bpy.data.collections.new(
+                object_names.fit(name if key[1] else name + object_names.OTHERS_SUFFIX)
+            )
             above.children.link(children[key])
     anchors = {}
-    for part in homes(scene, parts):
+    for part in anchor_ranges(scene, parts):
         home = children[part.object_id, part == largest[part.object_id]]
         anchors[_anchor_key(part)] = _anchor(home, root, scene, part, largest, extent)
     for part, data in zip(parts, compat.new_point_clouds([part.count for part in parts]), strict=True):

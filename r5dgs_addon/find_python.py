@@ -17,7 +17,7 @@ NEEDED = ("numpy", "numba")  # for pictures
 WANTED = ("torch",)  # for text encoders and GPUs
 OLDEST = (3, 11)
 TIMEOUT_S = 20.0
-LOOK_S = 0.05  # polling interval of the stop callback
+POLL_S = 0.05  # polling interval of the stop callback
 # `find_spec` takes milliseconds; importing torch would take seconds.
 CHECK = f"""
 import importlib.util, sys
@@ -122,7 +122,7 @@ def lacking(python: str, packages: Sequence[str] = NEEDED, stopped: Callable[[],
             if late or stopped():
                 group.end()
                 return f"no answer within {TIMEOUT_S:g} s" if late else "the search was stopped"
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
         group.end()
         if group.process.returncode == 0:
             return None

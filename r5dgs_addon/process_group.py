@@ -16,7 +16,7 @@ from typing import Any
 
 GRACE_S = 0.5  # time between SIGTERM and SIGKILL
 GONE_S = 1.0  # a killed process takes longer only inside an uninterruptible system call
-_LOOK_S = 0.01
+_POLL_S = 0.01
 
 
 class ProcessGroup:
@@ -62,7 +62,7 @@ class ProcessGroup:
                 self._signal("SIGTERM")
                 deadline = time.monotonic() + GRACE_S
                 while self.alive and time.monotonic() < deadline:
-                    time.sleep(_LOOK_S)
+                    time.sleep(_POLL_S)
                 self._signal("SIGKILL")
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(timeout=GONE_S)

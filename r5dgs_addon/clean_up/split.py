@@ -22,7 +22,7 @@ def delete(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
     members = selected_points.selected_clouds(collection)
     for cloud in members:
         selected_points.check_editable(cloud)
-    return _take(context, members)
+    return _remove_selected(context, members)
 
 
 def assign(context: bpy.types.Context, collection: bpy.types.Collection, object_id: int) -> int:
@@ -52,10 +52,12 @@ def assign(context: bpy.types.Context, collection: bpy.types.Collection, object_
     for cloud in (home, *members):
         selected_points.check_editable(cloud)
     name_of = {cloud: object_names.fit(f"{name} from {cloud.name}") for cloud in members}
-    return _take(context, members, lambda cloud, chosen: _part(cloud, home, chosen, name_of[cloud]))
+    return _remove_selected(
+        context, members, lambda cloud, chosen: _cloud_of_selected(cloud, home, chosen, name_of[cloud])
+    )
 
 
-def _take(
+def _remove_selected(
     context: bpy.types.Context,
     members: list[bpy.types.Object],
     use: Callable[[bpy.types.Object, np.ndarray], object] = lambda cloud, chosen: None,
@@ -81,7 +83,9 @@ def _take(
     return total
 
 
-def _part(cloud: bpy.types.Object, home: bpy.types.Object, chosen: np.ndarray, name: str) -> bpy.types.Object:
+def _cloud_of_selected(
+    cloud: bpy.types.Object, home: bpy.types.Object, chosen: np.ndarray, name: str
+) -> bpy.types.Object:
     """Copy the points in a mask [n] to a new cloud, which belongs to the object of ``home`` and its anchor."""
     part = cloud.copy()
     part.name, part.data = name, _unselected(point_subset.of(cloud.data, chosen))

@@ -52,12 +52,12 @@ def scene_linear(
 
 def inverts(scene: bpy.types.Scene) -> bool:
     """True if the scene's view transform is inverted by a table."""
-    return render_settings.of(scene).as_trained and view_transform.can(scene) and bool(differences(scene))
+    return render_settings.of(scene).as_trained and view_transform.is_supported(scene) and bool(differences(scene))
 
 
 def inverse(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
     """Inverse of the scene's view transform, or None if not needed, unusable, or not yet computed (then scheduled)."""
-    found = view_transform.want(scene) if inverts(scene) else None
+    found = view_transform.cached_or_requested(scene) if inverts(scene) else None
     return found if found is not None and found.error <= POOR else None
 
 

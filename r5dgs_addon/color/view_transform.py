@@ -23,7 +23,7 @@ from .. import compat
 from ..ui import status_bar
 
 DISPLAY = "sRGB"  # display device of the training images
-LOOK_S = 0.25  # timer interval
+POLL_S = 0.25  # timer interval
 REST_S = 0.3  # delay after the last viewport request, because sliders change continuously
 WAIT_S = 30.0  # maximum wait of a render
 KEPT = 4  # number of cached tables (half a megabyte each, curves one megabyte)
@@ -123,12 +123,12 @@ _inverses: dict[Management, view_inverse.Inverse | None] = {}  # None if Blender
 _wanted: dict[Management, float] = {}  # requested tables and the time from which the timer computes them
 
 
-def can(scene: bpy.types.Scene) -> bool:
+def is_supported(scene: bpy.types.Scene) -> bool:
     """True if tables support the scene's display device."""
     return scene.display_settings.display_device == DISPLAY
 
 
-def want(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
+def cached_or_requested(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
     """Return the inverse if cached; otherwise request it from the timer, replacing any earlier request.
 
     Writes no Blender data, so draw callbacks may call it.
@@ -244,7 +244,7 @@ class _Sampler:
         self._folder.cleanup()
 
 
-def look() -> float:
+def compute_due() -> float:
     """Compute the requested tables that are due. Returns the timer interval in seconds."""
     for management, since in list(_wanted.items()):
         if time.monotonic() < since:
@@ -253,18 +253,18 @@ def look() -> float:
         if management not in _inverses:
             _make(management)
             status_bar.redraw("VIEW_3D", "PROPERTIES")
-    return LOOK_S
+    return POLL_S
 
 
 def register():
     """Start the timer."""
-    bpy.app.timers.register(look, first_interval=LOOK_S, persistent=True)
+    bpy.app.timers.register(compute_due, first_interval=POLL_S, persistent=True)
 
 
 def unregister():
     """Stop the timer and clear the caches."""
-    if bpy.app.timers.is_registered(look):
-        bpy.app.timers.unregister(look)
+    if bpy.app.timers.is_registered(compute_due):
+        bpy.app.timers.unregister(compute_due)
     _wanted.clear()
     _inverses.clear()
     _exposed.cache_clear()

@@ -31,7 +31,7 @@ from . import (
 )
 
 ENGINE = "R5DGS"
-LOOK_S = 0.005  # polling interval of the worker and of the user's request to stop
+POLL_S = 0.005  # polling interval of the worker and of the user's request to stop
 GRACE_S = 0.2  # time that a stopped render may take to finish before the worker is ended
 
 
@@ -202,7 +202,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
     def _stopped(self, doing: str) -> bool:
         """Show the current status, wait briefly, and return True if the user wants to stop."""
         self._say(f"{doing[:1].upper()}{doing[1:]}")
-        time.sleep(LOOK_S)
+        time.sleep(POLL_S)
         return self.test_break()
 
     def _say(self, text: str) -> None:
@@ -216,7 +216,7 @@ def _leave(job: jobs.Job) -> None:
     """Abandon a job. If it ends within `GRACE_S`, the worker is kept."""
     end = time.monotonic() + GRACE_S
     while not (job.done or job.drop()) and time.monotonic() < end:
-        time.sleep(LOOK_S)
+        time.sleep(POLL_S)
     job.cancel()
 
 

@@ -60,7 +60,7 @@ def _is_same(camera: cameras.Camera, other: cameras.Camera) -> bool:
     )
 
 
-def start(background: Sequence[render_request.VisibleParts]) -> jobs.Job:
+def start_depths(background: Sequence[render_request.VisibleParts]) -> jobs.Job:
     """Start rendering the depths of `views`. Pass the job's answers to `add`."""
     steps = [step for one in background for step in render_request.steps(one, ("depth", "alpha"), sky=False)]
     return jobs.start(steps)

@@ -24,13 +24,13 @@ class Pass:
         name: Blender's name of the pass.
         channels: Channel names, one letter each.
         kind: Type of its compositor socket, COLOR or VALUE.
-        want: Array of the worker from which the pass is made; "" for colour.
+        worker_array: Array of the worker from which the pass is made; "" for colour.
     """
 
     name: str
     channels: str
     kind: str
-    want: str = ""
+    worker_array: str = ""
 
 
 COMBINED = Pass("Combined", "RGBA", "COLOR")
@@ -58,7 +58,7 @@ def of_layer(view_layer: bpy.types.ViewLayer, merged: bool) -> list[Pass]:
 
 def wanted(passes: Sequence[Pass], transparent: bool) -> tuple[str, ...]:
     """Names of the arrays to request from the worker in addition to the colour."""
-    names = [one.want for one in passes if one.want and one != FRONT]
+    names = [one.worker_array for one in passes if one.worker_array and one != FRONT]
     return (*names, "alpha") if transparent or DEPTH in passes else tuple(names)
 
 

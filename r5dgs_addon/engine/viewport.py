@@ -41,7 +41,7 @@ class ImageRequest:
         seen: Visible parts of the scenes, with a camera of full size.
         sky: True to draw the sky as background.
         transparent: True if the film is transparent.
-        moving: Factor by which the image is smaller while the view moves.
+        moving_reduction: Factor by which the image is smaller while the view moves.
         inverse: Inverse of the view transform, or None for *Standard*.
     """
 
@@ -50,12 +50,12 @@ class ImageRequest:
         seen: render_request.VisibleParts,
         sky: bool,
         transparent: bool,
-        moving: int,
+        moving_reduction: int,
         inverse: view_inverse.Inverse | None = None,
     ):
         self.camera = seen.camera
         self.transparent = transparent
-        self.moving = moving
+        self.moving_reduction = moving_reduction
         self.inverse = inverse
         self.steps = render_request.steps(seen, ("alpha",) if transparent else (), sky)
         self.since = time.monotonic()
@@ -66,12 +66,12 @@ class ImageRequest:
             return False
         return (self.steps, self.transparent) == (other.steps, other.transparent)
 
-    def requests(self, smaller: int) -> list[tuple[str, str, dict[str, Any]]]:
+    def requests(self, reduction: int) -> list[tuple[str, str, dict[str, Any]]]:
         """Worker requests for the image, reduced in size by a factor."""
         *before, (doing, command, arguments) = self.steps
-        if smaller == FULL:
+        if reduction == FULL:
             return self.steps
-        size = (max(self.camera.width // smaller, 1), max(self.camera.height // smaller, 1))
+        size = (max(self.camera.width // reduction, 1), max(self.camera.height // reduction, 1))
         camera = messages.camera_to_json(cameras.resize(self.camera, *size))
         return [*before, (doing, command, {**arguments, "camera": camera})]
 
@@ -124,22 +124,22 @@ class ViewportImage:
         done = self._shown is not None and request.same(self._shown[0])
         if done and self._shown[1] == FULL:
             return None
-        quick = self._full_ms <= QUICK_MS or request.moving == FULL
-        return request, FULL if done or quick else request.moving
+        quick = self._full_ms <= QUICK_MS or request.moving_reduction == FULL
+        return request, FULL if done or quick else request.moving_reduction
 
     def rests(self) -> bool:
         """True if the view has not moved for `REST_S`."""
         return self._requested is not None and time.monotonic() - self._requested.since >= REST_S
 
-    def take(self, request: ImageRequest, smaller: int, answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> None:
+    def take(self, request: ImageRequest, reduction: int, answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> None:
         """Store an image from the worker for the next redraw."""
         result, arrays = answer
         milliseconds = result["ms_motion"] + result["ms_raster"]
         alpha = render_passes.alpha(arrays, request.transparent)
         linear = display_to_linear.scene_linear(arrays["color"], alpha, request.inverse)
         self._pixels = np.ascontiguousarray(linear[::-1])
-        self._shown = request, smaller
-        if smaller == FULL:
+        self._shown = request, reduction
+        if reduction == FULL:
             self._full_ms = milliseconds
         self._message = f"{plural.of(result['gaussians'], 'Gaussian')} in {milliseconds:.0f} ms"
 
@@ -168,7 +168,7 @@ def poll() -> float | None:
     """Receive a finished image and submit the next request. Returns the timer interval, or None to stop."""
     global _running
     if _running is not None:
-        job, viewport, request, smaller = _running
+        job, viewport, request, reduction = _running
         if not job.done:
             if job.seconds > 1.0:
                 viewport.set_message(f"{job.doing[:1].upper()}{job.doing[1:]}, {job.seconds:.0f} s")
@@ -176,7 +176,7 @@ def poll() -> float | None:
             return POLL_S if job.seconds < 1.0 else 0.25
         _running = None
         try:
-            viewport.take(request, smaller, job.answer())
+            viewport.take(request, reduction, job.answer())
         except errors.R5dgsError as error:
             viewport.fail(request, error)
         status_bar.redraw("VIEW_3D")
@@ -185,11 +185,11 @@ def poll() -> float | None:
         return None
     if jobs.busy() or bpy.app.is_job_running("RENDER"):
         return 0.1
-    for viewport, request, smaller in sorted(waiting, key=lambda one: -one[2]):  # moving views first
-        if smaller == FULL and request.moving != FULL and not viewport.rests():
+    for viewport, request, reduction in sorted(waiting, key=lambda one: -one[2]):  # moving views first
+        if reduction == FULL and request.moving_reduction != FULL and not viewport.rests():
             continue
         try:
-            _running = jobs.submit(KEY, request.requests(smaller)), viewport, request, smaller
+            _running = jobs.submit(KEY, request.requests(reduction)), viewport, request, reduction
         except errors.R5dgsError as error:
             viewport.fail(request, error)
             status_bar.redraw("VIEW_3D")

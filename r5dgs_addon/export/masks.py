@@ -17,7 +17,7 @@ from ..ui.stepwise_operator import Outcome, Step, Steps
 from ..worker import jobs
 from . import cameras, frame_range
 
-LOOK_S = 0.005  # polling interval of the worker
+POLL_S = 0.005  # polling interval of the worker
 LAYER = "R5DGS"  # layer name of the EXR channels, as in Blender's own multilayer files
 FORMATS = (
     ("PNG", "Masks", "PNG of 8 bits, or 16 if an id exceeds 255, in object_mask; 0 is the background"),
@@ -52,7 +52,7 @@ def steps(context: bpy.types.Context, folder: Path, *, format: str, every: bool,
             try:
                 while not job.done:
                     yield Step(number, len(frames), f"frame {frame}, {job.doing}")
-                    time.sleep(LOOK_S)
+                    time.sleep(POLL_S)
                 _, arrays = job.answer()
             finally:
                 if not job.done:

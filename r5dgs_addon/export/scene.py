@@ -30,7 +30,7 @@ from ..ui.stepwise_operator import Outcome, Step, Steps
 from . import frame_range
 
 TOLERANCE = 1e-5  # tolerated difference between Blender and playback without keys, as a fraction of the scene's extent
-KEY_SHARE = 1.5  # further tolerance, as a share of the key tolerance
+KEY_TOLERANCE_SHARE = 1.5  # further tolerance, as a share of the key tolerance
 MOST_LATER = 64  # maximum number of sampled times past t_max
 MOST_EARLIER = 16  # maximum number of sampled frames before the first observed time
 _STILL = 1e-6  # maximum deviation of a parent's linear part that counts as the identity
@@ -127,7 +127,9 @@ def edited_steps(
             before.append([back @ _matrix(member.cloud, depsgraph) for member in members])
         for number, t in enumerate(when):
             yield Step(number, total, f"frame {times.frame(t):.4g}")
-            _look(context, collection, members, times.frame(float(t)), bind=number == len(source.tracks.times) - 1)
+            _record_poses(
+                context, collection, members, times.frame(float(t)), bind=number == len(source.tracks.times) - 1
+            )
     yield Step(len(when), total, "fitting the edited motion", slow=True)
     changed = [member for member in members if member.points.edit is not None]
     extended, places = point_edits.extend(source, [member.points.edit.points for member in changed])
@@ -144,7 +146,7 @@ def edited_steps(
             f"{', '.join(lost)}: motion before frame {times.frame(times.t_start):.4g}, the first observed time, is not "
             "exported; move those keys after it"
         )
-    if not _rests(collection):
+    if not _is_root_unmoved(collection):
         notes.append("The root was moved; positions in the file are relative to the root")
     return EditedScene(result, notes, len(when) + 1)
 
@@ -241,7 +243,7 @@ def _anchor(cloud: bpy.types.Object) -> bpy.types.Object | None:
     return parent if parent is not None and parent.r5dgs.role == "ANCHOR" else None
 
 
-def _look(
+def _record_poses(
     context: bpy.types.Context, collection: bpy.types.Collection, members: list[_Member], frame: float, bind: bool
 ) -> None:
     """Record the pose of each point cloud in the file's world; at t_max (``bind``), also points and anchor."""
@@ -295,7 +297,7 @@ def _pieces(member: _Member, source: Scene, place: point_edits.Place | None) -> 
             pivot=member.pivot,
             parent=member.parent,
             model=model,
-            allowed=TOLERANCE * source.extent + KEY_SHARE * keys,
+            allowed=TOLERANCE * source.extent + KEY_TOLERANCE_SHARE * keys,
             tint=object_tint.tint(cloud) if object_tint.is_tinted(cloud) else None,
         )
     ]
@@ -324,8 +326,8 @@ def _table(
     return result
 
 
-def _rests(collection: bpy.types.Collection) -> bool:
-    """True if the root's only transform is a world convention."""
+def _is_root_unmoved(collection: bpy.types.Collection) -> bool:
+    """Return True if the transform of the root is only a world convention."""
     world = visible_clouds.world_of(collection)
     turns = cameras.WORLD_TO_BLENDER.values()
     return not world[:3, 3].any() and any(np.allclose(world[:3, :3], turn, atol=1e-5) for turn in turns)

@@ -46,19 +46,19 @@ class Answer:
 
     Attributes:
         matches: Matches, best first.
-        meant: Suggested names if nothing matches.
+        suggestions: Suggested names if nothing matches.
         notes: Messages, for example about deleted objects or missing files.
         missing: Phrases that the encoder of the preferences could embed but has not yet.
         error: Reason why the prompt is invalid, or "".
-        nothing: True if the prompt asks for no object, such as "none".
+        asks_for_nothing: True if the prompt asks for no object, such as "none".
     """
 
     matches: list[Match]
-    meant: list[str]
+    suggestions: list[str]
     notes: list[str]
     missing: tuple[str, ...] = ()
     error: str = ""
-    nothing: bool = False
+    asks_for_nothing: bool = False
 
     @property
     def objects(self) -> list[selection.Wanted]:
@@ -84,9 +84,9 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = obj
 
 
 def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> Answer:
-    matches, deleted, notes, known, missing, lost = [], [], [], [], [], []
-    left: list[list[str]] = []
-    kept: list[list[str]] = []  # excluded phrases that match nothing
+    matches, deleted, notes, known, missing, without_encoder = [], [], [], [], [], []
+    unanswered: list[list[str]] = []
+    not_excluded: list[list[str]] = []  # excluded phrases that match nothing
     for collection in loaded:
         labels = object_names.labels(collection)
         there = object_names.present(collection)
@@ -98,34 +98,40 @@ def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> 
         if embeddings is not None and embeddings.table is not None:
             card, unknown = embeddings.table.encoder, object_search.unknown(labels, text, embeddings)
             missing += phrase_embeddings.missing(unknown)
-            lost += [] if phrase_embeddings.has_encoder() else unknown
+            without_encoder += [] if phrase_embeddings.has_encoder() else unknown
             other = phrase_embeddings.other_encoder(unknown, card)
             notes += [OTHER_ENCODER.format(collection.name, card.name, other)] if other else []
             embed = functools.partial(phrase_embeddings.of, card=card)
-        left.append(object_search.unanswered(labels, text, threshold, embeddings, embed))
-        kept.append(object_search.not_excluded(labels, text, threshold, embeddings, embed))
+        unanswered.append(object_search.unanswered(labels, text, threshold, embeddings, embed))
+        not_excluded.append(object_search.not_excluded(labels, text, threshold, embeddings, embed))
         for found in object_search.search_labels(labels, text, threshold, embeddings, embed):
             if found.object_id in there:
                 matches.append(Match(collection, found.object_id, names[found.object_id], found.score, found.why))
             elif not found.why.startswith(object_search.EVERYTHING):
                 deleted.append(names[found.object_id])
-    unfit = [phrase for phrase in kept[0] if all(phrase in each for each in kept)] if kept else []
+    unfit = (
+        [phrase for phrase in not_excluded[0] if all(phrase in each for each in not_excluded)] if not_excluded else []
+    )
     if unfit:  # until the encoder responds, the exclusions are unknown
         matches = []
         object_search.check_exclusions(known, text, [phrase for phrase in unfit if phrase not in missing])
-    if lost and not matches:
-        asked = " and ".join(repr(phrase) for phrase in dict.fromkeys(lost))
+    if without_encoder and not matches:
+        asked = " and ".join(repr(phrase) for phrase in dict.fromkeys(without_encoder))
         notes.append(f"{asked}: no stored word; name the scene's encoder under Text Encoder in the preferences")
     if matches:  # one of several phrases may have no match
-        void = [phrase for phrase in left[0] if phrase not in missing and all(phrase in each for each in left)]
+        void = [
+            phrase for phrase in unanswered[0] if phrase not in missing and all(phrase in each for each in unanswered)
+        ]
         notes += [f"Nothing matches {' and '.join(map(repr, void))}"] if void else []
     if deleted:
         notes.insert(0, f"Deleted: {', '.join(deleted)}")
     notes += _instances({match.scene for match in matches})
     matches.sort(key=lambda match: -round(match.score, 6))
-    meant = [] if matches or not text.strip() else list(dict.fromkeys(object_search.suggest(known, text)))
-    nothing = bool(loaded) and all(object_search.is_nothing(object_names.labels(each), text) for each in loaded)
-    return Answer(matches, meant, notes, tuple(dict.fromkeys(missing)), nothing=nothing)
+    suggestions = [] if matches or not text.strip() else list(dict.fromkeys(object_search.suggest(known, text)))
+    asks_for_nothing = bool(loaded) and all(
+        object_search.is_nothing(object_names.labels(each), text) for each in loaded
+    )
+    return Answer(matches, suggestions, notes, tuple(dict.fromkeys(missing)), asks_for_nothing=asks_for_nothing)
 
 
 def _instances(found: set[bpy.types.Collection]) -> list[str]:
@@ -158,7 +164,7 @@ def ask(context: bpy.types.Context, text: str) -> Answer:
     answer = _answer(context, text)
     if answer.missing:
         answer = _with_encoder(context, text, answer)
-    return _told(context, text, answer)
+    return _show_and_store(context, text, answer)
 
 
 def _answer(context: bpy.types.Context, text: str) -> Answer:
@@ -169,7 +175,7 @@ def _with_encoder(context: bpy.types.Context, text: str, answer: Answer) -> Answ
     """Result including the encoder's matches, or with a note that it is running or why it failed."""
     asked = " and ".join(repr(phrase) for phrase in answer.missing)
     if _has_window():
-        phrase_embeddings.start(answer.missing, functools.partial(_join, text))
+        phrase_embeddings.start(answer.missing, functools.partial(_show_again, text))
         return replace(answer, notes=[*answer.notes, f"{ASKING}{asked}"])
     try:
         phrase_embeddings.fetch(answer.missing)
@@ -183,18 +189,20 @@ def _has_window() -> bool:
     return not bpy.app.background and bool(bpy.context.window_manager.windows)
 
 
-def _join(text: str, wrong: str) -> None:
+def _show_again(text: str, wrong: str) -> None:
     """Show the result again with the encoder's matches."""
     there = bpy.context.window_manager.windows
     if not there or bpy.context.window_manager.r5dgs_words.asked != text:
         return
     with bpy.context.temp_override(window=there[0]):
         answer = _answer(bpy.context, text)
-        _told(bpy.context, text, replace(answer, notes=[*answer.notes, f"Text encoder: {wrong}"]) if wrong else answer)
+        _show_and_store(
+            bpy.context, text, replace(answer, notes=[*answer.notes, f"Text encoder: {wrong}"]) if wrong else answer
+        )
     status_bar.redraw()
 
 
-def _told(context: bpy.types.Context, text: str, answer: Answer) -> Answer:
+def _show_and_store(context: bpy.types.Context, text: str, answer: Answer) -> Answer:
     """Show the result and store the prompt. Returns the result."""
     settings = context.scene.r5dgs_words
     _show(context.window_manager.r5dgs_words, text, answer)
@@ -232,7 +240,7 @@ def _show(session: bpy.types.PropertyGroup, text: str, answer: Answer) -> None:
         item = session.matches.add()
         item.name, item.scene, item.object_id = match.name, match.scene.name, match.object_id
         item.score, item.why = match.score, match.why
-    for items, texts in ((session.meant, answer.meant), (session.notes, answer.notes)):
+    for items, texts in ((session.meant, answer.suggestions), (session.notes, answer.notes)):
         items.clear()
         for line in texts:
             items.add().name = line

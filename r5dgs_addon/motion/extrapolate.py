@@ -81,7 +81,7 @@ def re_extrapolate(anchors: list[bpy.types.Object], t_end: float | None = None) 
 
 
 def _plans(anchors: list[bpy.types.Object], t_end: float | None) -> list[PendingKeys]:
-    most = keyframes.share(len(anchors))
+    most = keyframes.intervals_per_object(len(anchors))
     return [_plan(anchor, t_end, most) for anchor in anchors]
 
 
@@ -92,7 +92,7 @@ def _plan(anchor: bpy.types.Object, t_end: float | None, most: int) -> PendingKe
     if times.t_end > times.t_max:
         allowed, reach = physics.key_error(anchor)
         sample, model = _sampler(anchor, location, quat, times, most)
-        future = keyframes.few(sample, times.t_max, times, allowed, reach, most, model)
+        future = keyframes.reduced_keys(sample, times.t_max, times, allowed, reach, most, model)
         too_fast = not future.followed
         tails = {
             "location": fcurves.frames(future.location, times),
@@ -107,7 +107,7 @@ def _apply(plan: PendingKeys) -> None:
         curve_place.make_own(anchor)
         place = curve_place.find(anchor)
     fcurves.replace_after(anchor, place, plan.times.frame(plan.times.t_max), plan.tails)
-    physics.sign(anchor, plan.times)
+    physics.store_digests(anchor, plan.times)
     anchor.r5dgs_motion.too_fast = plan.too_fast
     confidence_tubes.refresh(anchor, plan.times)
 
@@ -228,7 +228,7 @@ def check(anchors: list[bpy.types.Object], curves: bool = True) -> None:
             physics.model(leader)
 
 
-def source(anchors: list[bpy.types.Object], path: Path) -> Scene:
+def read_source(anchors: list[bpy.types.Object], path: Path) -> Scene:
     """Read the scene that anchors were made from, for `reload`.
 
     Args:
@@ -257,7 +257,7 @@ def reload(anchors: list[bpy.types.Object], scene: Scene) -> None:
 
     Args:
         anchors: Anchors of one loaded scene.
-        scene: Result of `source` for them.
+        scene: Result of `read_source` for them.
     """
     for anchor in anchors:
         times = times_of(anchor)
@@ -269,7 +269,7 @@ def reload(anchors: list[bpy.types.Object], scene: Scene) -> None:
         exact = replace(times, t_max=float(scene.t_max))
         keyframes.animate(anchor, scene, anchor.r5dgs.motion_id, exact, allowed / scene.extent, reach)
         physics.reset(anchor)
-        physics.sign(anchor, times)
+        physics.store_digests(anchor, times)
         confidence_tubes.refresh(anchor, times)
 
 

@@ -20,7 +20,7 @@ from ..scene import timeline
 from . import keyframes
 from .curve_place import COMPONENTS, Place
 
-AT = 1e-3  # tolerance in frames for a key to count as being at a frame
+FRAME_TOLERANCE = 1e-3  # tolerance in frames for a key to count as being at a frame
 _CUT = ("BEZIER", "LINEAR", "CONSTANT")  # interpolations of segments that can be split
 
 
@@ -67,10 +67,10 @@ class KeyArrays:
 
     def last(self, frame: float) -> int:
         """Index of the last key at or before a frame, or -1."""
-        return int(np.searchsorted(self.co[:, 0], frame + AT, side="right")) - 1
+        return int(np.searchsorted(self.co[:, 0], frame + FRAME_TOLERANCE, side="right")) - 1
 
     def at(self, k: int, frame: float) -> bool:
-        return abs(float(self.co[k, 0]) - frame) <= AT
+        return abs(float(self.co[k, 0]) - frame) <= FRAME_TOLERANCE
 
 
 def _cut(name: str, curve: bpy.types.FCurve, points: KeyArrays, k: int, frame: float) -> np.ndarray:

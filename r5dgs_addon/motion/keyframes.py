@@ -80,17 +80,17 @@ def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float
     observed = _observed(scene, motion_id, allowed, reach)
     if times.t_end <= scene.t_max:
         return observed
-    most = share(len(scene.groups))
+    most = intervals_per_object(len(scene.groups))
     sample, model = _future(scene, motion_id, most)
-    return cubic_curves.join(observed, few(sample, scene.t_max, times, allowed, reach, most, model))
+    return cubic_curves.join(observed, reduced_keys(sample, scene.t_max, times, allowed, reach, most, model))
 
 
-def share(objects: int) -> int:
-    """Maximum number of key intervals per object, passed to `few`."""
+def intervals_per_object(objects: int) -> int:
+    """Maximum number of key intervals per object, passed to `reduced_keys`."""
     return min(max(_INTERVALS // max(objects, 1), reduction.FEWEST_INTERVALS), reduction.MOST_INTERVALS)
 
 
-def few(
+def reduced_keys(
     sample: reduction.Sampler,
     start: float,
     times: timeline.Times,
@@ -107,7 +107,7 @@ def few(
         times: Scene times and their frames.
         allowed: Maximum error of reduced keys at the members, world units.
         reach: Largest distance of a member from the pivot, world units.
-        most: Maximum number of intervals between keys, from `share`.
+        most: Maximum number of intervals between keys, from `intervals_per_object`.
         model: Motion behind the samples since ``start``, whose kinks become keys.
     """
     kinks = start + models.kinks(model, times.t_end - start)

@@ -60,11 +60,11 @@ def remember(
         )
         state.frames_per_unit = scene.frames_per_unit
         state.leader = state.learned_leader = leader
-        show(state, group.model)
-        sign(anchor, times)
+        set_fields(state, group.model)
+        store_digests(anchor, times)
 
 
-def sign(anchor: bpy.types.Object, times: timeline.Times) -> None:
+def store_digests(anchor: bpy.types.Object, times: timeline.Times) -> None:
     """Store digests of the keys past t_max and of their motion, for `hand_edited` and `is_written`."""
     place = curve_place.find(anchor)
     anchor.r5dgs_motion.written = fcurves.digest(place, times.frame(times.t_max))
@@ -115,7 +115,7 @@ def has_motion(anchor: bpy.types.Object) -> bool:
     return bool(anchor.r5dgs_motion.learned)
 
 
-def show(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
+def set_fields(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
     """Set the fields of an anchor to a motion."""
     state.kind = model.kind
     for name in models.FIELDS:
@@ -123,7 +123,7 @@ def show(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
     state.stored_pivot = (0.0, 0.0, 0.0)
 
 
-def take(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -> None:
+def copy_motion(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -> None:
     """Copy the motion of an anchor without a leader to another anchor, which keeps its learned motion stored.
 
     Args:
@@ -146,7 +146,7 @@ def reset(anchor: bpy.types.Object) -> None:
     """Reset the fields of an anchor to the learned motion."""
     state = anchor.r5dgs_motion
     state.taken = ""
-    show(state, basis(state))
+    set_fields(state, basis(state))
     state.leader = state.learned_leader
 
 
@@ -223,7 +223,7 @@ def inertia(anchor: bpy.types.Object) -> np.ndarray:
     return body + _LEAST_MOMENT * float(np.linalg.eigvalsh(body)[-1]) * np.eye(3)
 
 
-def allow(anchor: bpy.types.Object, error: float) -> None:
+def set_allowed_error(anchor: bpy.types.Object, error: float) -> None:
     """Set the allowed error of an anchor's keys, in scene units."""
     kept = _parsed(anchor.r5dgs_motion.learned)
     anchor.r5dgs_motion.learned = json.dumps({**kept, "allowed": error})

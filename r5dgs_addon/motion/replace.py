@@ -112,8 +112,8 @@ def apply(plan: Replacement) -> None:
         owned = compat.own_fcurves(target, target.name)
         for (path, index), part in plan.curves.items():
             _write(owned.new(path, index=index), part)
-    physics.take(plan.source, target, plan.turn)
-    physics.sign(target, plan.times)
+    physics.copy_motion(plan.source, target, plan.turn)
+    physics.store_digests(target, plan.times)
     confidence_tubes.refresh(target, plan.times)
 
 

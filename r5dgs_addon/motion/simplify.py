@@ -39,8 +39,8 @@ def simplify(anchors: list[bpy.types.Object], share: float) -> tuple[int, int]:
             owned = compat.own_fcurves(anchor, anchor.name)
             for path, keys in written.items():
                 keyframes.write(owned, path, _over_time(keys, times), times)
-        physics.allow(anchor, allowed)
-        physics.sign(anchor, times)
+        physics.set_allowed_error(anchor, allowed)
+        physics.store_digests(anchor, times)
     return before, key_count(anchors)
 
 
@@ -92,7 +92,7 @@ def _reduced(
     kinks = [kink for name, part in parts.items() for kink in _kinks(part, allowed, name[0], reach)]
     held = [end for part in parts.values() for end in (float(part[0, 0, 0]), float(part[-1, 3, 0]))]
     cuts = np.unique([start, stop, *(cut for cut in (*kinks, *held, last) if start < cut < stop)])
-    cuts = cuts[np.concatenate([[True], np.diff(cuts) > fcurves.AT])]
+    cuts = cuts[np.concatenate([[True], np.diff(cuts) > fcurves.FRAME_TOLERANCE])]
     joined = None
     for a, b in zip(cuts[:-1], cuts[1:], strict=True):
         sample = _sampler(anchor, parts, a, b)
@@ -127,7 +127,9 @@ def _sampler(
             value = part[0, 0, 1] if middle < part[0, 0, 0] else part[-1, 3, 1]
         if value is not None or part is None:
             return np.full(len(at), value), np.zeros(len(at))
-        inside = part[(part[:, 0, 0] < stop - fcurves.AT) & (part[:, 3, 0] > start + fcurves.AT)]
+        inside = part[
+            (part[:, 0, 0] < stop - fcurves.FRAME_TOLERANCE) & (part[:, 3, 0] > start + fcurves.FRAME_TOLERANCE)
+        ]
         return bezier.evaluate(inside, np.clip(at, inside[0, 0, 0], inside[-1, 3, 0]))
 
     def sample(at: np.ndarray) -> reduction.Samples:

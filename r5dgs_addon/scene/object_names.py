@@ -16,7 +16,7 @@ from ...r5dgs_core.search import object_search
 NAME_BYTES = 63  # Blender's limit; cutting here keeps multi-byte characters whole
 NOBODY = -2  # id of no object; -1 marks unassigned Gaussians
 _NUMBER = re.compile(r"\.\d{3,}$")  # suffix that Blender adds to duplicate names
-FRINGE = " fringe"  # suffix of the collection of an object's other point clouds
+OTHERS_SUFFIX = " fringe"  # suffix of the collection of an object's other point clouds
 _ANCHOR = " anchor"
 KINDS = ("COLLECTION", "ANCHOR", "CLOUD")  # data-blocks named after an object, in order of precedence
 
@@ -145,8 +145,8 @@ def rename(collection: bpy.types.Collection, object_id: int, wanted: str) -> str
             if kind == "CLOUD" and bearer.data.library is None:
                 bearer.data.name = bearer.name
     for home in collection.children_recursive:
-        if not home.r5dgs_named.given and home.name in {f"{word}{FRINGE}" for word in former}:
-            home.name = fit(name + FRINGE)
+        if not home.r5dgs_named.given and home.name in {f"{word}{OTHERS_SUFFIX}" for word in former}:
+            home.name = fit(name + OTHERS_SUFFIX)
     for obj in collection.all_objects:
         if not obj.r5dgs_named.given and obj.r5dgs.role in ("ANCHOR", "CLOUD"):
             changed = obj.name

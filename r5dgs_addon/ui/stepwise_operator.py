@@ -47,10 +47,10 @@ class Outcome:
 BLINK_S = 0.2  # time between redraws of the window (s)
 Steps = Iterator[Step]  # a generator that returns an `Outcome`
 
-_beside: list[bpy.types.Operator] = []  # operators that currently run modal
+_running_operators: list[bpy.types.Operator] = []  # operators that currently run modal
 
 
-class Running:
+class Stepwise:
     """Mixin for operators with ``steps`` and a ``filepath`` or ``directory`` property.
 
     If the user stops the operator, the generator is closed, so that its ``finally`` and ``with`` blocks can clean up.
@@ -179,17 +179,17 @@ class Running:
 
 def begin(operator: bpy.types.Operator) -> None:
     """Register a running modal operator for `stop_all`."""
-    _beside.append(operator)
+    _running_operators.append(operator)
 
 
 def end(operator: bpy.types.Operator) -> None:
     """Remove an operator that has ended."""
-    _beside[:] = [other for other in _beside if other is not operator]
+    _running_operators[:] = [other for other in _running_operators if other is not operator]
 
 
 def stop_all(context: bpy.types.Context) -> None:
     """Cancel all running modal operators, because Blender does not do so when their classes are unregistered."""
-    for operator in list(_beside):
+    for operator in list(_running_operators):
         operator.cancel(context)
 
 

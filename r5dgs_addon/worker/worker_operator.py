@@ -7,7 +7,7 @@ from ..ui import status_bar, stepwise_operator
 from . import jobs
 
 
-class Waiting:
+class WaitsForWorker:
     """Mixin for operators that submit a job and process its response.
 
     Subclasses define ``_begin(context)``, which returns the job; ``_finish(context, answer)``, which returns the

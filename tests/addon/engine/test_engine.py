@@ -386,7 +386,7 @@ def test_inverting_a_view_leaves_nothing_behind(blender, loaded):
     blender.context.scene.view_settings.exposure = 1
     assert inverse_of(blender).grid is made.grid  # an exposure is a factor
     blender.context.scene.view_settings.exposure = 0
-    assert view_module.want(blender.context.scene) is made
+    assert view_module.cached_or_requested(blender.context.scene) is made
 
 
 def test_a_view_is_inverted_without_a_window(blender, loaded, monkeypatch):
@@ -427,11 +427,11 @@ def test_the_timer_computes_requested_view_inverses_once_edits_pause(blender, lo
     monkeypatch.setattr(view_module.time, "monotonic", lambda: now[0])
     for gamma in (1.1, 1.2, 1.3):
         settings.gamma = gamma
-        assert view_module.want(blender.context.scene) is None
-        view_module.look()
+        assert view_module.cached_or_requested(blender.context.scene) is None
+        view_module.compute_due()
     assert made == []
     now[0] += 1
-    view_module.look()
+    view_module.compute_due()
     assert [one.gamma for one in made] == [settings.gamma]
 
 

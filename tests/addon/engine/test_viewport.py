@@ -53,11 +53,11 @@ def test_a_viewport_gets_a_small_picture_at_once_and_a_full_one_when_it_rests(bl
     picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     image, now = viewport.ViewportImage(), seen(20)
-    image.request(viewport.ImageRequest(now, sky=True, transparent=False, moving=4))
+    image.request(viewport.ImageRequest(now, sky=True, transparent=False, moving_reduction=4))
     assert run(viewport) == [(10, 16, 4), (40, 64, 4)]
     expected = color.scene_linear(picture.render(now)[1]["color"])
     np.testing.assert_array_equal(image._pixels, expected[::-1])
-    image.request(viewport.ImageRequest(seen(20), sky=True, transparent=False, moving=4))
+    image.request(viewport.ImageRequest(seen(20), sky=True, transparent=False, moving_reduction=4))
     assert image.next() is None  # the same picture is not rendered again
 
 
@@ -67,7 +67,7 @@ def test_the_latest_request_wins(blender, seen, viewport):
     image = viewport.ViewportImage()
     for frame in (1, 20, 40, 61):
         last = seen(frame)
-        image.request(viewport.ImageRequest(last, sky=True, transparent=False, moving=1))
+        image.request(viewport.ImageRequest(last, sky=True, transparent=False, moving_reduction=1))
         viewport.poll()
     run(viewport)
     np.testing.assert_array_equal(image._pixels, color.scene_linear(picture.render(last)[1]["color"])[::-1])
@@ -75,20 +75,20 @@ def test_the_latest_request_wins(blender, seen, viewport):
 
 def test_a_viewport_shows_render_errors_and_retries_after_a_change(blender, seen, viewport, tmp_path):
     image = viewport.ViewportImage()
-    request = viewport.ImageRequest(seen(20), sky=True, transparent=False, moving=1)
+    request = viewport.ImageRequest(seen(20), sky=True, transparent=False, moving_reduction=1)
     (tmp_path / "scene.r5dgs").rename(tmp_path / "gone.r5dgs")
     image.request(request)
     run(viewport)
     assert image._pixels is None and "scene.r5dgs" in image._message and image.next() is None
     (tmp_path / "gone.r5dgs").rename(tmp_path / "scene.r5dgs")
-    image.request(viewport.ImageRequest(seen(21), sky=True, transparent=False, moving=1))
+    image.request(viewport.ImageRequest(seen(21), sky=True, transparent=False, moving_reduction=1))
     run(viewport)
     assert image._pixels is not None and "Gaussians in" in image._message
 
 
 def test_a_closed_viewport_is_not_waited_for(blender, seen, viewport):
     image = viewport.ViewportImage()
-    image.request(viewport.ImageRequest(seen(20), sky=True, transparent=False, moving=1))
+    image.request(viewport.ImageRequest(seen(20), sky=True, transparent=False, moving_reduction=1))
     assert viewport.poll() is not None
     del image
     run(viewport)
@@ -96,7 +96,7 @@ def test_a_closed_viewport_is_not_waited_for(blender, seen, viewport):
 
 
 def test_smaller_pictures_show_the_same_view(blender, seen, viewport):
-    request = viewport.ImageRequest(seen(20), sky=True, transparent=False, moving=4)
+    request = viewport.ImageRequest(seen(20), sky=True, transparent=False, moving_reduction=4)
     camera = request.requests(4)[-1][2]["camera"]
     small = cameras.Camera(
         camera["width"], camera["height"], np.array(camera["intrinsics"]), np.array(camera["T_cam_world"])

@@ -132,7 +132,7 @@ def test_edited_physics_become_the_model_of_the_new_file(blender, scene, loaded,
     physics = importlib.import_module("r5dgs.r5dgs_addon.motion.physics")
     extrapolate = importlib.import_module("r5dgs.r5dgs_addon.motion.extrapolate")
     anchor = cloud(loaded, "red apple").parent
-    physics.show(anchor.r5dgs_motion, models.MotionModel("translation", velocity=(0.2, 0.4, 1.0)))
+    physics.set_fields(anchor.r5dgs_motion, models.MotionModel("translation", velocity=(0.2, 0.4, 1.0)))
     extrapolate.re_extrapolate([anchor])
     saved = save(blender, tmp_path / "b.r5dgs")
     model = saved.groups[2].model

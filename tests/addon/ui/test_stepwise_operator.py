@@ -45,7 +45,7 @@ def make(running, steps):
     """An operator that runs steps, a window, and the list of its reports."""
     reports = []
     members = {"steps": lambda self, context: steps, "suggest": lambda self, context: True}
-    operator = type("Operator", (running.Running,), members)()
+    operator = type("Operator", (running.Stepwise,), members)()
     operator.report = lambda kind, text: reports.append((*kind, text))
     return operator, Window(), reports
 
