@@ -66,8 +66,7 @@ def picture(scene: Scene, t: float, camera: Camera | int = 0, mode: str = "rigid
     from .render import scene_renderer
 
     view = scene.cameras[camera] if isinstance(camera, int) else camera
-    frame = Player(scene, mode).frame(t, view.center)
-    return np.clip(scene_renderer.render_frame(scene, frame, view).color, 0, 1)
+    return np.clip(scene_renderer.render(Player(scene, mode), view, t).color, 0, 1)
 
 
 def train_scene(

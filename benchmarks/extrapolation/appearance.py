@@ -54,7 +54,7 @@ VISIBLE = 0.2  # of what a Gaussian would show alone, from which on a view has s
 SHADOW_LEVEL = 3 / 255
 FEWEST_PIXELS = 30  # to which a change of colour is fitted
 
-Move = Callable[[float], scene_player.Frame]
+Move = Callable[..., scene_player.Frame]  # from a time, and an origin or none
 
 
 @dataclass(frozen=True)

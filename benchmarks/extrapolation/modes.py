@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +46,7 @@ def measure(folder: Path, split: str) -> dict[str, Any]:
     run = checkpoint.open_run(folder)
     dataset = datasets.read(run.data())
     scene = bake.bake(run, dataset)
-    ways: dict[str, Callable[[float], scene_player.Frame]]
+    ways: dict[str, evaluate.Move]
     if scene.dynamics is not None:
         ways = {mode: scene_player.Player(scene, mode).frame for mode in scene_player.modes(scene)}
     else:

@@ -24,7 +24,6 @@ TRUE_POSES = (
     "errors of the track"
 )
 _SAME = 1e-6  # tolerance for equal times
-Move = Callable[[float], scene_player.Frame]
 
 
 def measure(
@@ -52,7 +51,9 @@ def measure(
         The rows, and the reasons for missing measurements.
     """
     rows, absent = [], []
-    moves: dict[str, Move] = {mode: scene_player.Player(scene, mode).frame for mode in scene_player.modes(scene)}
+    moves: dict[str, evaluate.Move] = {
+        mode: scene_player.Player(scene, mode).frame for mode in scene_player.modes(scene)
+    }
     if len(moves) == 1:
         absent.append("images of other modes than rigid: the scene holds no dynamics of its Gaussians")
     oracle, why = true_move(scene, dataset, [view.t for split in splits for view in dataset.views(split)])
@@ -90,8 +91,8 @@ def measure(
 
 
 def _plans(
-    scene: Scene, dataset: Dataset, splits: Sequence[str], moves: dict[str, Move], absent: list[str]
-) -> dict[str, dict[str, Move]]:
+    scene: Scene, dataset: Dataset, splits: Sequence[str], moves: dict[str, evaluate.Move], absent: list[str]
+) -> dict[str, dict[str, evaluate.Move]]:
     """Return the moves to measure in each split, and append the reasons for missing ones to ``absent``."""
     plans = {}
     for split in splits:
@@ -104,7 +105,7 @@ def _plans(
     return plans
 
 
-def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[Move | None, str]:
+def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[evaluate.Move | None, str]:
     """Return a function that plays the scene with every body in its true pose past t_max.
 
     A body whose rotation the images do not determine, such as a ball without texture, keeps the scene's rotation and
@@ -116,7 +117,7 @@ def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[M
         times: Times at which frames will be requested.
 
     Returns:
-        A function from one of the times to the frame, or None and the reason.
+        A function from one of the times and an origin to the frame, or None and the reason.
     """
     if dataset.ground_truth is None:
         return None, "the data set has no true poses (ground_truth.json)"
@@ -129,10 +130,10 @@ def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[M
         return None, f"the data set has no true poses at t = {lost[0]:g}"
     player = scene_player.Player(scene)
 
-    def move(t: float) -> scene_player.Frame:
+    def move(t: float, origin: np.ndarray | None = None) -> scene_player.Frame:
         quats, displacements = (x.copy() for x in player.group_poses(t))
         if t <= scene.t_max:
-            return player.frame(t)
+            return player.frame(t, origin)
         k = int(np.abs(known - t).argmin())
         for body in bodies:
             if body.group.role == "body" and not body.turn_seen:
@@ -143,20 +144,20 @@ def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[M
         for group in scene.groups:
             if group.follows is not None and group.follow_matrix is not None:
                 displacements[group.id] = group.follow_matrix @ displacements[group.follows]
-        return scene_player.pose(scene, quats, displacements, t)
+        return scene_player.pose(scene, quats, displacements, t, origin)
 
     return move, ""
 
 
 def _times(
-    scene: Scene, views: Sequence[View], moves: dict[str, Move], rounds: int, backend: str, clock: str
+    scene: Scene, views: Sequence[View], moves: dict[str, evaluate.Move], rounds: int, backend: str, clock: str
 ) -> dict[str, dict[str, Any]]:
     """Return the columns of a `Row` that hold times per frame, of motion and of color rasterization, by mode."""
     some = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(FRAMES, len(views))).round().astype(int))]
     calls: dict[tuple[str, str], Callable[[], object]] = {}
     for mode, move in moves.items():
-        frames = [move(view.t) for view in some]
-        calls[mode, "motion"] = lambda move=move: [move(view.t) for view in some]
+        frames = [move(view.t, view.camera.center) for view in some]
+        calls[mode, "motion"] = lambda move=move: [move(view.t, view.camera.center) for view in some]
         calls[mode, "raster"] = lambda frames=frames: [
             scene_renderer.render_frame(scene, frame, view.camera, backend=backend)
             for frame, view in zip(frames, some, strict=True)

@@ -56,7 +56,7 @@ def measure(
         return [], ["raster: neither the scene nor a data set gives a camera"]
     kept = np.unique(np.linspace(0, len(shots) - 1, min(VIEWS, len(shots))).round().astype(int)).tolist()
     shots = [shots[i] for i in kept]
-    frames = [player.frame(t) for _, t in shots]
+    frames = [player.frame(t, camera.center) for camera, t in shots]
     truths = [datasets.load_image(views[i], evaluate.truth_background(scene)) for i in kept] if views else []
     if not views:
         absent.append("raster: PSNR against true images needs a data set")

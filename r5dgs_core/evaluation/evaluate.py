@@ -6,7 +6,6 @@ The result has a fixed form (docs/reference/evaluation.md) that is comparable ac
 
 from __future__ import annotations
 
-import functools
 import json
 import math
 import time
@@ -42,6 +41,7 @@ METRICS = (
     "images_later",
 )
 _SAME_TIME = 1e-9  # scene time
+Move = Callable[[float, np.ndarray], scene_player.Frame]  # from a time and an origin [3], as `Player.frame`
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def evaluate(
 def measure(
     scene: Scene,
     views: Sequence[datasets.View],
-    move: Callable[[float], scene_player.Frame],
+    move: Move,
     *,
     background: np.ndarray | None = None,
     backend: str = "auto",
@@ -130,7 +130,7 @@ def measure(
 
     Args:
         views: Cameras, times and true images.
-        move: Returns the scene's Gaussians at a time.
+        move: Returns the scene's Gaussians.
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
         measured: Called after each image.
 
@@ -165,19 +165,17 @@ def write(evaluation: dict[str, Any], path: Path) -> Path:
 
 def render(scene: Scene, camera: Camera, t: float, mode: str = "rigid", *, backend: str = "auto") -> Rendering:
     """Render color and object ids of a scene at a time; see `draw`."""
-    return draw(scene, camera, t, functools.partial(scene_player.frame, scene, mode=mode), backend=backend)
+    return draw(scene, camera, t, scene_player.Player(scene, mode).frame, backend=backend)
 
 
-def draw(
-    scene: Scene, camera: Camera, t: float, move: Callable[[float], scene_player.Frame], *, backend: str = "auto"
-) -> Rendering:
+def draw(scene: Scene, camera: Camera, t: float, move: Move, *, backend: str = "auto") -> Rendering:
     """Render color and object ids of a scene moved by a function, and measure the time in milliseconds.
 
     The id of a pixel is the classifier's prediction for the blended identities if the scene has both, else the object
     with the largest weight in the pixel.
     """
     start = time.perf_counter()
-    frame = move(t)
+    frame = move(t, camera.center)
     moved = time.perf_counter()
     classified = scene.gaussians.identities is not None and scene.classifier is not None
     output = scene_renderer.render_frame(

@@ -63,11 +63,10 @@ def find(
         At most `VIEWS` per object, the best first; an empty list for objects that no camera shows.
     """
     seen: dict[int, list[tuple[Sighting, np.ndarray]]] = {object_id: [] for object_id in object_ids}
-    places = _standpoints(scene)
+    places, player = _standpoints(scene), scene_player.Player(scene)
     for done, at in enumerate(places):
         small = viewpoints.sized(at.camera, _LOOK)
-        output = scene_renderer.render_frame(scene, scene_player.frame(scene, at.t), small, backend=backend)
-        ids = output.ids
+        ids = scene_renderer.render(player, small, at.t, backend=backend).ids
         for object_id in object_ids:
             mask = ids == object_id
             if mask.sum() >= _LEAST_PIXELS:
@@ -92,8 +91,7 @@ def crops(
     camera = _cut(sighting.camera, sighting.box, size)
     alone = highlight.isolate(scene, [object_id], camera, sighting.t, backend=backend)
     alpha = alone[..., 3:]
-    frame = scene_player.frame(scene, sighting.t)
-    whole = scene_renderer.render_frame(scene, frame, camera, backend=backend)
+    whole = scene_renderer.render(scene_player.Player(scene), camera, sighting.t, backend=backend)
     context = np.clip(whole.color, 0, 1)
     return (alone[..., :3] * alpha + _GRAY * (1 - alpha)).astype(np.float32), context
 

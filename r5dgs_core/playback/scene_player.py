@@ -268,7 +268,13 @@ def sh_rotations(group_quats: np.ndarray) -> np.ndarray:
     return np.swapaxes(rotations.quats_to_rotmats(group_quats), -1, -2)
 
 
-def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray, t: float = float("nan")) -> Frame:
+def pose(
+    scene: Scene,
+    group_quats: np.ndarray,
+    group_displacements: np.ndarray,
+    t: float = float("nan"),
+    origin: np.ndarray | None = None,
+) -> Frame:
     """The scene's Gaussians with each motion group in a given pose.
 
     Args:
@@ -276,8 +282,9 @@ def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray,
         group_quats: Rotation of each group about its pivot, unit wxyz. [G, 4]
         group_displacements: Displacement of each pivot, world. [G, 3]
         t: Time stored in the frame.
+        origin: Point of the world that the centres are relative to, or None. [3]
     """
-    poser, center = posing.Poser(scene), np.zeros(3)
+    poser, center = posing.Poser(scene), np.zeros(3) if origin is None else np.array(origin, np.float64)
     return Frame(
         t=float(t),
         means=poser.means(group_quats, group_displacements, center),

@@ -42,7 +42,7 @@ def isolate(
     Returns:
         Display-referred sRGB and straight alpha, in [0, 1]; black if alpha is 0. [H, W, 4] float32
     """
-    frame = scene_player.frame(scene, t, mode)
+    frame = scene_player.frame(scene, t, mode, origin=camera.center)
     wanted = np.isin(frame.object_ids, list(object_ids))
     alone = dataclasses.replace(
         frame, opacity_logits=np.where(wanted, frame.opacity_logits, np.float32(_ABSENT)).astype(np.float32)
@@ -70,9 +70,9 @@ def highlight(
     Returns:
         Display-referred sRGB in [0, 1]. [H, W, 3] float32
     """
-    frame = scene_player.frame(scene, t, mode)
-    wanted = np.isin(frame.object_ids, list(object_ids)).astype(np.float32)
-    output = scene_renderer.render_frame(scene, frame, camera, backend=backend, features=wanted[:, None])
+    wanted = np.isin(scene.gaussians.object_ids, list(object_ids)).astype(np.float32)
+    player = scene_player.Player(scene, mode)
+    output = scene_renderer.render(player, camera, t, backend=backend, features=wanted[:, None])
     color = np.clip(output.color, 0, 1)
     share = np.clip(output.features, 0, 1)
     dark = (DIMMED * (color @ _LUMA))[..., None]

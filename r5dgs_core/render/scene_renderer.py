@@ -8,6 +8,7 @@ the spherical harmonics `Scene.background_sh` along each pixel's ray, clamped to
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -58,6 +59,21 @@ def render_frame(
         settings=settings or RasterSettings(near_plane=scene.near_plane),
         backend=backend,
     )
+
+
+def render(player: scene_player.Player, camera: Camera, t: float, **options: Any) -> RenderOutput:
+    """Render a player's scene at a time, with centres relative to the camera, near which float32 is most precise.
+
+    Args:
+        player: The scene in a mode.
+        camera: The camera, in the scene's world.
+        t: Scene time; may exceed t_max.
+        options: Keyword arguments of `render_frame`.
+
+    Returns:
+        As `render_frame`.
+    """
+    return render_frame(player.scene, player.frame(t, camera.center), camera, **options)
 
 
 def sky(scene: Scene, camera: Camera) -> np.ndarray:

@@ -101,7 +101,7 @@ def best(
     if len(among) == 1:
         return among[0]
     player = scene_player.Player(scene, mode)
-    scores = [_score(scene, player, standpoint, object_ids, backend) for standpoint in among]
+    scores = [_score(player, standpoint, object_ids, backend) for standpoint in among]
     return among[max(range(len(among)), key=lambda k: scores[k])]
 
 
@@ -138,12 +138,10 @@ def overview(scene: Scene) -> Camera:
 
 
 def _score(
-    scene: Scene, player: scene_player.Player, standpoint: Standpoint, object_ids: Collection[int], backend: str
+    player: scene_player.Player, standpoint: Standpoint, object_ids: Collection[int], backend: str
 ) -> tuple[int, float]:
     """Number of visible objects, and sum of the square roots of their shares, halved for those at the border."""
-    frame = player.frame(standpoint.t)
-    output = scene_renderer.render_frame(scene, frame, sized(standpoint.camera, LOOK), backend=backend)
-    ids = output.ids
+    ids = scene_renderer.render(player, sized(standpoint.camera, LOOK), standpoint.t, backend=backend).ids
     border = np.concatenate([ids[0], ids[-1], ids[:, 0], ids[:, -1]])
     count, quality = 0, 0.0
     for object_id in object_ids:

@@ -17,7 +17,7 @@ LATER = 1.1
 
 
 def drawn(scene, t, background):
-    frame = scene_player.frame(scene, t)
+    frame = scene_player.frame(scene, t, origin=CAMERA.center)
     return scene_renderer.render_frame(scene, frame, CAMERA, background=background, backend=BACKEND)
 
 

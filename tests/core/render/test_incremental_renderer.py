@@ -224,7 +224,7 @@ def test_without_any_scene_the_picture_is_black():
         (Instance(0, 5, np.eye(4), scene=2), "scene below 2, got 2"),
         (Instance(450, 5, np.eye(4), scene=1), "leave the scene's 400"),
         (Instance(0, 5, np.eye(4), tint=(1.0, -1.0, 1.0)), "tint"),
-        (Instance(0, 5, np.eye(4), world=np.zeros((4, 4))), "flattens"),
+        (Instance(0, 5, np.eye(4), world=np.zeros((4, 4))), "singular"),
     ],
 )
 def test_impossible_instances_of_several_scenes_are_refused(pair, instance, message):
