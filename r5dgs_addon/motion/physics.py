@@ -105,8 +105,8 @@ def too_fast(anchors: Iterable[bpy.types.Object]) -> str:
     if not names:
         return ""
     return (
-        f"Too fast for keys, which are exact only at frames: {plural.names(names)}; lower the rates under Motion, "
-        "or train with more frames per unit of time"
+        f"Keys are exact only at frames, because the motion is too fast: {plural.names(names)}; lower the rates under "
+        "Motion, or train with more frames per unit of time"
     )
 
 

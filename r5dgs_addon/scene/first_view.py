@@ -8,7 +8,7 @@ from ...r5dgs_core.scene import cameras
 from ...r5dgs_core.scene.scene import Scene
 from . import loaded_scenes
 
-SAMPLE = 2000  # Gaussians that the best camera is chosen by
+SAMPLE = 2000  # number of Gaussians by which the best camera is chosen
 NEAREST, FARTHEST = 1e-3, 100.0  # clip range as factors of the distance to the objects
 DEFAULT_CLIP = (0.01, 1000.0)  # Blender's own, which is only widened
 VIEW_SENSOR_MM = 72.0  # width that the focal length of a 3D view refers to, on the longer side of its region
@@ -38,7 +38,7 @@ def distance(scene: Scene, camera: cameras.Camera) -> float:
 
 
 def clip_range(distance: float) -> tuple[float, float]:
-    """Clip range for objects at a distance, at least Blender's own."""
+    """Return a clip range for objects at a distance, which includes Blender's default range."""
     start = min(max(NEAREST * distance, 1e-6), DEFAULT_CLIP[0])
     return start, max(FARTHEST * distance, DEFAULT_CLIP[1])
 

@@ -561,7 +561,7 @@ def test_a_spin_too_fast_for_keys_is_keyed_at_every_frame_and_named(blender, loa
     state = mug.r5dgs_motion
     state.kind, state.angular_velocity = "ballistic_spin", (0.0, 300.0, per_second(blender, 1e4))
     assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
-    assert "Too fast for keys, which are exact only at frames: mug anchor" in capfd.readouterr().out
+    assert "Keys are exact only at frames, because the motion is too fast: mug anchor" in capfd.readouterr().out
     panel = blender.types.R5DGS_PT_motion
     assert state.too_fast and "Too fast for keys: exact only at frames" in layouts.draw(blender, panel)
     curves = [curve for name, curve in motions.curves(mug).items() if name[0] == "rotation_quaternion"]
