@@ -2,7 +2,7 @@
 
 
 def register():
-    """Register the add-on's services, then the operators."""
+    """Register the extension's services, then the operators."""
     from . import operators, r5dgs_addon
 
     r5dgs_addon.register()

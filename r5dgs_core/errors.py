@@ -2,7 +2,7 @@
 
 
 class R5dgsError(Exception):
-    """Base class of errors that the command line and the add-on report without a traceback.
+    """Base class of errors that the command line and the extension report without a traceback.
 
     Attributes:
         code: Code of the fault in the table of `r5dgs check`, "" if it has none.

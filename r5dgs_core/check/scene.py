@@ -15,7 +15,7 @@ from ..terminal import printable
 from .codes import CODES
 
 LAST_FRAME = 1_048_574  # Blender's last frame
-_AHEAD = 1 / 3  # extrapolated share of the observed span; Blender's default in the add-on
+_AHEAD = 1 / 3  # extrapolated share of the observed span; Blender's default in the extension
 _SEEN = 1 / 255  # minimum opacity that is drawn
 _FEW_SEEN = 0.05  # share of visible Gaussians below which S16 is reported
 _MOST_STEPS = 1 << 16  # maximum number of integration steps per motion

@@ -1,1 +1,1 @@
-"""The worker process of the Blender add-on: JSON requests in, pixels and arrays out."""
+"""The worker process of the Blender extension: JSON requests in, pixels and arrays out."""

@@ -1,4 +1,4 @@
-"""Worker process of the Blender add-on: ``python -m r5dgs_core.worker.server``.
+"""Worker process of the Blender extension: ``python -m r5dgs_core.worker.server``.
 
 Requests are JSON lines on standard input. Each response is one JSON line on standard output, followed by the raw bytes
 of the arrays that the line announces, in order:
