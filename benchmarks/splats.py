@@ -3,21 +3,27 @@
     xvfb-run -a -s "-screen 0 1280x800x24 +extension GLX" \\
         blender --factory-startup --window-geometry 0 0 1280 800 --python benchmarks/splats.py -- [GAUSSIANS ...]
 
-Loads a synthetic scene of twelve moving bodies per size, by default 12,000, 40,000, 300,000 and 1,000,000 Gaussians.
-``load`` is the time of the operator in seconds. ``orbit`` and ``play`` are the processor milliseconds of the main
-thread per view and per frame for sorting and uploading, which do not depend on the graphics card; medians of twelve.
-``f12`` is the time of the second render at 512 x 512 in seconds, when the worker holds the scene; `R5DGS_PYTHON` sets
-the worker's Python. ``mb`` is the largest memory of Blender so far. Results: docs/results/blender.md.
+Loads a synthetic scene of twelve moving bodies per size, by default 12,000, 40,000, 300,000 and 1,000,000 Gaussians,
+each in a Blender of its own. ``load`` is the time of the operator in seconds. ``orbit``, ``play`` and ``bend`` are
+processor milliseconds of the main thread per drawn view: everything that the draw handler does but the commands to the
+graphics card, which a software driver executes itself. They contain the search for visible clouds, reading changed
+points, sorting and uploading; medians of twelve, in a scene whose two bending bodies have a sixth of the Gaussians for
+``bend``. ``exact`` is the time of the handler that moves those points, ``depth`` that of reading the depth buffer
+beside a mesh. ``first`` and ``f12`` are the times of the first and second render at 512 x 512 in seconds;
+`R5DGS_PYTHON` sets the worker's Python. ``mb`` and ``worker`` are the largest memory of Blender and of the worker.
+Results: docs/results/blender.md.
 """
 
 import resource
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
 import bpy
+import numpy as np
 from mathutils import Euler
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -26,34 +32,41 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blender")]
 import window as w  # noqa: E402  (the line before finds it)
 
 SIZES = (12_000, 40_000, 300_000, 1_000_000)
-COLUMNS = ("gaussians", "load", "orbit", "play", "f12", "mb")
+COLUMNS = ("gaussians", "load", "orbit", "play", "bend", "exact", "depth", "first", "f12", "mb", "worker")
 VIEWS = 12
 
 
 class Stopwatch:
-    """Adds up the processor time that the main thread spends in functions."""
+    """Adds up the processor time that the main thread spends in functions, without that of others inside them."""
 
     def __init__(self):
-        self.seconds = 0.0
+        self.seconds: dict[str, float] = {}
 
-    def wrap(self, owner, name: str) -> None:
-        """Replace a function by one that is measured."""
-        function = getattr(owner, name)
+    def wrap(self, owner, function_name: str, name: str) -> None:
+        """Replace a function by one that is measured under a name."""
+        function = getattr(owner, function_name)
 
         def measured(*arguments, **named):
-            started = time.thread_time()
+            started, before = time.thread_time(), sum(self.seconds.values())
             try:
                 return function(*arguments, **named)
             finally:
-                self.seconds += time.thread_time() - started
+                inside = sum(self.seconds.values()) - before
+                self.seconds[name] = self.seconds.get(name, 0.0) + time.thread_time() - started - inside
 
-        setattr(owner, name, measured)
+        setattr(owner, function_name, measured)
 
-    def milliseconds(self, action) -> float:
-        """Milliseconds of the measured functions during an action."""
-        self.seconds = 0.0
+    def milliseconds(self, action) -> dict[str, float]:
+        """Milliseconds by name during an action."""
+        self.seconds.clear()
         action()
-        return 1e3 * self.seconds
+        return {name: 1e3 * seconds for name, seconds in self.seconds.items()}
+
+
+def medians(stopwatch: Stopwatch, action) -> dict[str, float]:
+    """Medians of the milliseconds of an action with the numbers of `VIEWS` steps."""
+    found = [stopwatch.milliseconds(lambda step=step: action(step)) for step in range(VIEWS)]
+    return {name: statistics.median(one.get(name, 0.0) for one in found) for name in {n for one in found for n in one}}
 
 
 def redraw() -> None:
@@ -75,19 +88,24 @@ def measure(path: Path, stopwatch: Stopwatch) -> dict[str, float]:
         view.view_rotation = Euler((1.1, 0, 0.5 * step)).to_quaternion()
         redraw()
 
-    row["orbit"] = statistics.median(stopwatch.milliseconds(lambda step=step: orbit(step)) for step in range(VIEWS))
+    row["orbit"] = medians(stopwatch, orbit)["draw"]
 
     def play(step):
         scene.frame_set(scene.frame_start + 3 * step)
         redraw()
 
-    row["play"] = statistics.median(stopwatch.milliseconds(lambda step=step: play(step)) for step in range(VIEWS))
+    row["play"] = medians(stopwatch, play)["draw"]
+    bpy.ops.mesh.primitive_cube_add(location=(0, 0, 100))
+    row["depth"] = medians(stopwatch, orbit)["depth"]
+    bpy.data.objects.remove(bpy.context.object)
     scene.render.engine = "R5DGS"
     scene.render.resolution_x = scene.render.resolution_y = 512
-    for _ in range(2):
+    for name in ("first", "f12"):
         started = time.perf_counter()
         bpy.ops.render.render()
-        row["f12"] = time.perf_counter() - started
+        row[name] = time.perf_counter() - started
+    status = Path(f"/proc/{w.service('worker.jobs')._worker.pid}/status").read_text()
+    row["worker"] = int(status.split("VmHWM:")[1].split()[0]) / 1e3
     row["mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     for collection in [one for one in bpy.data.collections if one.r5dgs.is_scene]:
         bpy.data.batch_remove([*collection.all_objects, *collection.children_recursive, collection])
@@ -95,24 +113,72 @@ def measure(path: Path, stopwatch: Stopwatch) -> dict[str, float]:
     return row
 
 
-def checks(sizes):
-    """Measure all sizes and print a table. Yields the seconds to wait after each step."""
+def measure_bending(path: Path, stopwatch: Stopwatch) -> dict[str, float]:
+    """Measure playing a scene with two bodies that bend."""
+    scene = w.main_window().scene
+    with w.inside():
+        bpy.ops.r5dgs.load_scene(filepath=str(path))
+    redraw()
+
+    def play(step):
+        scene.frame_set(scene.frame_start + step)
+        redraw()
+
+    found = medians(stopwatch, play)
+    return {"bend": found["draw"], "exact": found["exact"]}
+
+
+def bending(path: Path) -> Path:
+    """A scene file whose first two bodies bend, beside another."""
+    from r5dgs_core.scene import scene_file
+
+    scene = scene_file.read(path)
+    rows = np.flatnonzero(np.isin(scene.gaussians.object_ids, (1, 2))).astype(np.int32)
+    shape, draw = (len(rows), len(scene.tracks.times)), np.random.default_rng(0)
+    offsets = draw.normal(scale=0.01, size=(*shape, 3)).astype(np.float32)
+    offsets[:, -1] = 0
+    bent = scene.with_arrays(
+        residual_rows=rows,
+        residual_offsets=offsets,
+        residual_quats=np.tile(np.float32([1, 0, 0, 0]), (*shape, 1)),
+        residual_log_scales=np.zeros((*shape, 3), np.float32),
+    )
+    return scene_file.write(bent, path.with_name("bending.r5dgs"))
+
+
+def checks(count: int):
+    """Measure a size and print its row. Yields the seconds to wait after each step."""
     from tests.blender import run
 
     bpy.data.batch_remove([obj for obj in bpy.data.objects if obj.type != "CAMERA"])
     stopwatch = Stopwatch()
-    renderer = w.service("splats.splat_renderer")
-    stopwatch.wrap(renderer.SplatBuffer, "_sorted")
-    stopwatch.wrap(renderer, "_poses")
+    viewport, renderer, paste = (w.service(f"splats.{name}") for name in ("viewport_splats", "splat_renderer", "paste"))
+    stopwatch.wrap(viewport, "_draw_viewport", "draw")
+    stopwatch.wrap(viewport, "depth", "depth")
+    stopwatch.wrap(renderer.SplatBuffer, "_draw", "card")
+    stopwatch.wrap(paste, "paste", "card")
+    exact = w.service("motion.exact_mode")
+    stopwatch.wrap(exact, "_try", "exact")
     yield 1.0
-    print("".join(f"{name:>12}" for name in COLUMNS), flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        for count in sizes:
-            row = {"gaussians": count, **measure(run.synthetic(count, Path(folder)), stopwatch)}
-            print(f"{count:>12}" + "".join(f"{row[name]:>12.2f}" for name in COLUMNS[1:]), flush=True)
-            yield 0.5
+        path = run.synthetic(count, Path(folder))
+        row = {"gaussians": count, **measure(path, stopwatch)}
+        yield 0.5
+        row |= measure_bending(bending(path), stopwatch)
+    print(f"{count:>12}" + "".join(f"{row[name]:>10.2f}" for name in COLUMNS[1:]), flush=True)
+
+
+def main(arguments: list[str]) -> None:
+    """Measure one size in this Blender, or several in others."""
+    sizes = [int(text) for text in arguments] or SIZES
+    if len(sizes) == 1:
+        w.run(checks, *sizes)
+        return
+    print(f"{COLUMNS[0]:>12}" + "".join(f"{name:>10}" for name in COLUMNS[1:]), flush=True)
+    options = ["--factory-startup", "--window-geometry", "0", "0", "1280", "800", "--python", __file__]
+    codes = [subprocess.run([bpy.app.binary_path, *options, "--", str(size)]).returncode for size in sizes]
+    raise SystemExit(any(codes))
 
 
 if __name__ == "__main__":
-    given = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else []
-    w.run(checks, [int(text) for text in given] or SIZES)
+    main(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else [])

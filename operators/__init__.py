@@ -27,11 +27,22 @@ def _menu_export(menu, context):
     menu.layout.operator("r5dgs.capture_dataset", text="R5DGS Training Data Set")
 
 
-MENUS = ((bpy.types.TOPBAR_MT_file_import, _menu_import), (bpy.types.TOPBAR_MT_file_export, _menu_export))
+def _menu_view(menu, context):
+    menu.layout.separator()
+    still, whole = "Viewport Render with Splats", "Viewport Render Animation with Splats"
+    menu.layout.operator("r5dgs.viewport_render", text=still, icon="RENDER_STILL").animation = False
+    menu.layout.operator("r5dgs.viewport_render", text=whole, icon="RENDER_ANIMATION").animation = True
+
+
+MENUS = (
+    (bpy.types.TOPBAR_MT_file_import, _menu_import),
+    (bpy.types.TOPBAR_MT_file_export, _menu_export),
+    (bpy.types.VIEW3D_MT_view, _menu_view),
+)
 
 
 def register():
-    """Register the classes of all modules, their tools, and the entries of File > Import and File > Export."""
+    """Register the classes of all modules, their tools, and the entries of the menus."""
     for module in modules():
         for cls in module.CLASSES:
             bpy.utils.register_class(cls)

@@ -1,22 +1,25 @@
-"""Selected Gaussians and the current stroke, drawn over 3D views."""
+"""Selected Gaussians, corners of selected objects and the current stroke, drawn over 3D views."""
 
 import bpy
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..scene import loaded_scenes, point_clouds
+from ..scene import loaded_scenes, point_clouds, viewport_display
 from . import selected_points
 
 COLOR = (1.0, 0.45, 0.05, 0.9)
 POINT_SIZE = 4.0  # pixels
+CORNER = 0.15  # length of the lines at a corner, as a fraction of the edge
+_EDGES = tuple((a, a ^ bit) for a in range(8) for bit in (1, 2, 4))  # corners of a box, x in the lowest bit
 _handles: list[object] = []
 _batches: dict[int, tuple[str, object]] = {}  # points on the graphics card and their fingerprint, by session_uid
 
 
 def _draw() -> None:
-    """Draw the selected points of all visible clouds; Blender calls this for each 3D view."""
+    """Draw the selected objects and points of all visible clouds; Blender calls this for each 3D view."""
     context = bpy.context
+    _draw_corners(context)
     shown = [
         cloud
         for collection in loaded_scenes.scene_collections()
@@ -40,6 +43,34 @@ def _draw() -> None:
             _batch(cloud.data, shader).draw(shader)
     gpu.state.blend_set("NONE")
     gpu.state.point_size_set(1.0)
+
+
+def _draw_corners(context: bpy.types.Context) -> None:
+    """Mark the selected objects shown as splats by the corners of their boxes; splats cover Blender's own outlines."""
+    if context.mode != "OBJECT" or not context.space_data.overlay.show_overlays:
+        return
+    theme, active = context.preferences.themes[0].view_3d, context.view_layer.objects.active
+    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+    for obj in context.selected_objects:
+        clouds = [one for one in (obj, *obj.children) if one.r5dgs.role == "CLOUD"]
+        for cloud in clouds if obj.r5dgs.role in ("CLOUD", "ANCHOR") else ():
+            if viewport_display.draws_splats(cloud) and cloud.visible_get(viewport=context.space_data):
+                lines = batch_for_shader(shader, "LINES", {"pos": _corners(cloud)})
+                gpu.state.depth_test_set("NONE")
+                shader.bind()
+                shader.uniform_float("color", (*(theme.object_active if obj == active else theme.object_selected), 1.0))
+                lines.draw(shader)
+
+
+def _corners(cloud: bpy.types.Object) -> list[tuple[float, ...]]:
+    """Ends of short lines along the edges of a cloud's box, in the world."""
+    box = np.array(cloud.bound_box, np.float64)
+    low, high = box.min(0), box.max(0)
+    places = np.array([[(high if corner >> axis & 1 else low)[axis] for axis in range(3)] for corner in range(8)])
+    matrix = np.array(cloud.matrix_world, np.float64)
+    places = places @ matrix[:3, :3].T + matrix[:3, 3]
+    ends = [(places[a], places[a] + CORNER * (places[b] - places[a])) for a, b in _EDGES]
+    return [tuple(end) for line in ends for end in line]
 
 
 def _batch(data: bpy.types.PointCloud, shader):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,23 +84,26 @@ class DepthOrder:
     def __init__(self, positions: np.ndarray, starts: Sequence[int]):
         self._positions, self._starts = positions, starts
         self._view: tuple[float, bool] | None = None
-        self._planes: dict[int, bytes] = {}
+        self._planes: dict[int, tuple[bytes, int]] = {}
         self._still: _Sorted | None = None
 
-    def update(self, planes: dict[int, np.ndarray], near: float, parallel: bool) -> np.ndarray:
+    def update(
+        self, planes: dict[int, np.ndarray], near: float, parallel: bool, versions: Mapping[int, int] = {}
+    ) -> np.ndarray:
         """Sort the Gaussians of the visible groups.
 
         Args:
             planes: Visible groups; depth of a point (x, y, z) is plane . (x, y, z, 1). [4] each
             near: Depth at which a perspective view begins.
             parallel: True for orthographic views.
+            versions: Number of each group that increases if its positions change; by default they never do.
 
         Returns:
             Rows of the Gaussians, from far to near. [n] int64
         """
         if self._view != (near, parallel):  # keys of the other depths may be missing
             self._view, self._planes, self._still = (near, parallel), {}, None
-        now = {group: plane.tobytes() for group, plane in planes.items()}
+        now = {group: (plane.tobytes(), versions.get(group, 0)) for group, plane in planes.items()}
         unmoved = frozenset(group for group, plane in now.items() if self._planes.get(group) == plane)
         self._planes = now
         moved = now.keys() - unmoved

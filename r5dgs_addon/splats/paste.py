@@ -8,7 +8,6 @@ import bpy
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
-from mathutils import Matrix
 
 from ...r5dgs_core.color import srgb
 from ...r5dgs_core.scene import spherical_harmonics
@@ -46,7 +45,7 @@ def paste(
     view: renderer.ViewMatrices,
     sky: np.ndarray | None,
     world: np.ndarray,
-    behind: tuple[float, float, float],
+    behind: tuple[float, float, float] | None,
 ) -> None:
     """Blend a picture into the active framebuffer.
 
@@ -56,15 +55,16 @@ def paste(
         view: View of the picture.
         sky: Coefficients of the sky, [K, 3] float32, or None.
         world: Map from the world of the sky to Blender's. [4, 4]
-        behind: Display-referred color of the viewport's background.
+        behind: Display-referred color of the viewport's background; None if the framebuffer is display-referred itself.
     """
     shader, screen = _screen()
     terms = renderer.nothing() if sky is None else _sky_texture(sky.tobytes())
     gpu.state.depth_test_set("NONE")
     gpu.state.blend_set("ALPHA_PREMULT")
     shader.bind()
-    shader.uniform_float("to_world", Matrix(_rays(view, world).tolist()))
-    shader.uniform_float("behind", behind)
+    shader.uniform_float("to_world", renderer.matrix(_rays(view, world)))
+    shader.uniform_float("behind", UNKNOWN if behind is None else behind)
+    shader.uniform_int("overlay", int(behind is not None))
     shader.uniform_int("sky_degree", -1 if sky is None else spherical_harmonics.degree_of(len(sky)))
     shader.uniform_int("meshes_drawn", int(meshes is not None))
     shader.uniform_sampler("splats", buffer.texture)

@@ -7,11 +7,12 @@ import functools
 import gpu
 
 from ...r5dgs_core import errors
+from . import gaussian_table
 
 WIDEST = 16384  # texels of a row of a texture, at most
 # Texels of each group: three rows of its matrix to the camera; tint (the color itself if the fourth component is 1);
-# change of the light; viewpoint.
-POSE_TEXELS = 6
+# change of the light; viewpoint; the light.
+POSE_TEXELS = 7
 
 
 class CompileError(errors.R5dgsError):
@@ -59,15 +60,25 @@ vec3 harmonics(ivec2 at, vec3 d, int degree)
 _SPLAT_VERTEX = (
     _HARMONICS
     + """
+mat3 rotation(vec4 q)  /* wxyz of any length */
+{
+  float w = q.x;
+  vec3 v = q.yzw;
+  float s = 2.0 / dot(q, q);
+  return mat3(1.0 - s * (v.y * v.y + v.z * v.z), s * (v.x * v.y + w * v.z), s * (v.x * v.z - w * v.y),
+              s * (v.x * v.y - w * v.z), 1.0 - s * (v.x * v.x + v.z * v.z), s * (v.y * v.z + w * v.x),
+              s * (v.x * v.z + w * v.y), s * (v.y * v.z - w * v.x), 1.0 - s * (v.x * v.x + v.y * v.y));
+}
 void main()
 {
   int place_of = gl_InstanceID;
   int id = int(texelFetch(order, ivec2(place_of % WIDTH, place_of / WIDTH), 0).r);
-  ivec2 first = ivec2((id % (WIDTH / TEXELS)) * TEXELS, id / (WIDTH / TEXELS));
-  vec4 place = texelFetch(table, first, 0);
-  vec4 s0 = texelFetch(table, first + ivec2(1, 0), 0);
-  vec4 s1 = texelFetch(table, first + ivec2(2, 0), 0);
-  vec4 base = texelFetch(table, first + ivec2(3, 0), 0);
+  ivec2 at = ivec2((id % (WIDTH / GEOMETRY)) * GEOMETRY, id / (WIDTH / GEOMETRY));
+  vec4 place = texelFetch(geometry, at, 0);
+  vec4 turn = texelFetch(geometry, at + ivec2(1, 0), 0);  /* wxyz */
+  vec3 size = texelFetch(geometry, at + ivec2(2, 0), 0).xyz;
+  ivec2 first = ivec2((id % (WIDTH / LOOK)) * LOOK, id / (WIDTH / LOOK));
+  vec4 base = texelFetch(looks, first, 0);
   int number = int(place.w);
   ivec2 pose = ivec2((number % (WIDTH / POSE_TEXELS)) * POSE_TEXELS, number / (WIDTH / POSE_TEXELS));
   vec4 r0 = texelFetch(poses, pose, 0);
@@ -82,10 +93,10 @@ void main()
   paint = vec4(0.0);
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  /* outside: the quad is clipped */
   bool parallel = projection[3][3] > 0.5;
-  if ((!parallel && -p.z < view.z) || base.a * 255.0 < 1.0) { return; }
-  mat3 A = transpose(mat3(r0.xyz, r1.xyz, r2.xyz));
-  mat3 S = mat3(s0.x, s0.y, s0.z, s0.y, s0.w, s1.x, s0.z, s1.x, s1.y);
-  mat3 C = A * S * transpose(A);
+  if ((!parallel && -p.z < view.z) || base.a * 255.0 < 1.0 || dot(turn, turn) <= 0.0) { return; }
+  mat3 R = rotation(turn);
+  mat3 M = transpose(mat3(r0.xyz, r1.xyz, r2.xyz)) * mat3(size.x * R[0], size.y * R[1], size.z * R[2]);
+  mat3 C = M * transpose(M);
   vec2 f = vec2(projection[0][0], projection[1][1]) * 0.5 * view.xy;
   vec3 jx, jy;
   if (parallel) { jx = vec3(f.x, 0.0, 0.0); jy = vec3(0.0, f.y, 0.0); }
@@ -98,22 +109,34 @@ void main()
   vec3 cx = C * jx;
   float a = dot(jx, cx) + 0.3, b = dot(jy, cx), c = dot(jy, C * jy) + 0.3;
   float det = a * c - b * b;
-  if (det <= 0.0) { return; }
+  if (!(det > 0.0)) { return; }  /* also if it is not a number */
   conic = vec3(c, -b, a) / det;
   /* Depth at which the Gaussian is densest along the ray of a pixel: linear in the offset from its centre. */
   vec2 along = -vec2(cx.z, (C * jy).z);
   depths = vec3(-p.z, conic.x * along.x + conic.y * along.y, conic.y * along.x + conic.z * along.y);
   vec3 color = 0.5 + 0.28209479177387814 * base.rgb;
+#if TURNED > 0
+  vec4 bound = texelFetch(looks, first + ivec2(1 + SHADED, 0), 0);
+  mat3 back = dot(bound, bound) > 0.0 ? rotation(bound) * transpose(R) : mat3(1.0);  /* to the bind state */
+#endif
 #if DEGREE > 0
   vec4 eye = texelFetch(poses, pose + ivec2(5, 0), 0);  /* viewpoint, or with w = 0 the line of sight */
   vec3 sight = eye.w * place.xyz - eye.xyz;
+#if TURNED > 0
+  sight = back * sight;
+#endif
   float far_off = length(sight);
-  if (far_off > 0.0) { color += harmonics(first + ivec2(TEXELS - REST, 0), sight / far_off, DEGREE); }
+  if (far_off > 0.0) { color += harmonics(first + ivec2(1 + SHADED + TURNED, 0), sight / far_off, DEGREE); }
 #endif
   color = max(color, 0.0);
 #if SHADED > 0
-  vec4 light = texelFetch(table, first + ivec2(4, 0), 0);
-  color *= max(light.w + dot(light.xyz, texelFetch(poses, pose + ivec2(4, 0), 0).xyz), 0.0);
+  vec4 light = texelFetch(looks, first + ivec2(1, 0), 0);
+  vec3 change = texelFetch(poses, pose + ivec2(4, 0), 0).xyz;
+#if TURNED > 0
+  vec3 source = texelFetch(poses, pose + ivec2(6, 0), 0).xyz;
+  change = back * (change + source) - source;
+#endif
+  color *= max(light.w + dot(light.xyz, change), 0.0);
 #endif
   vec4 tint = texelFetch(poses, pose + ivec2(3, 0), 0);
   paint = vec4(tint.a > 0.5 ? tint.rgb : color * tint.rgb, base.a);
@@ -142,8 +165,8 @@ void main()
 """
 
 _PASTE_VERTEX = "void main() { uv = corner; gl_Position = vec4(corner, 0.0, 1.0); }"
-# Blender merges its overlay with the scene by this gamma, not by the sRGB curve. Over a known background color,
-# the result is exact; over meshes, soft edges are blended in that gamma.
+# A viewport's framebuffer is that of Blender's overlay, which is merged with the scene by this gamma, not by the sRGB
+# curve. Over a known background color, the result is exact; over meshes, soft edges are blended in that gamma.
 _PASTE_FRAGMENT = (
     _HARMONICS
     + """
@@ -164,6 +187,7 @@ void main()
   }
   if (cover <= 1e-6) { discard; }
   vec3 s = clamp(c.rgb / cover, 0.0, 1.0);
+  if (overlay < 1) { picture = vec4(s * cover, cover); return; }
   vec3 below = open ? behind : vec3(0.5);
   vec3 b = pow(below, vec3(2.2)) * (1.0 - cover);
   picture = vec4(max(pow(s * cover + below * (1.0 - cover), vec3(2.2)) - b, vec3(0.0)), cover);
@@ -172,18 +196,19 @@ void main()
 )
 
 
-def splats(degree: int, shaded: bool, texels: int) -> gpu.types.GPUShader:
+def splats(degree: int, shaded: bool, turned: bool, texels: int) -> gpu.types.GPUShader:
     """Compile the shader that draws Gaussians.
 
     Args:
         degree: Degree of the harmonics in the table.
         shaded: True if the table has shading.
-        texels: Texels of each Gaussian.
+        turned: True if it has bind states.
+        texels: Texels of the look of each Gaussian.
 
     Raises:
         CompileError: The graphics card's driver refuses it.
     """
-    info = _info(_SPLAT_VERTEX, _SPLAT_FRAGMENT, ("table", "poses", "order", "meshes"))
+    info = _info(_SPLAT_VERTEX, _SPLAT_FRAGMENT, ("geometry", "looks", "poses", "order", "meshes"))
     for kind, name in (("MAT4", "projection"), ("VEC4", "view"), ("VEC4", "slopes")):
         info.push_constant(kind, name)
     between = gpu.types.GPUStageInterfaceInfo("r5dgs_splat")
@@ -192,8 +217,14 @@ def splats(degree: int, shaded: bool, texels: int) -> gpu.types.GPUShader:
     between.flat("VEC4", "paint")
     between.flat("VEC3", "depths")
     info.vertex_out(between)
-    info.define("COEFFICIENTS", "table")
-    defines = {"DEGREE": degree, "SHADED": int(shaded), "TEXELS": texels, "REST": texels - 4 - shaded}
+    info.define("COEFFICIENTS", "looks")
+    defines = {
+        "DEGREE": degree,
+        "SHADED": int(shaded),
+        "TURNED": int(turned),
+        "GEOMETRY": gaussian_table.GEOMETRY,
+        "LOOK": texels,
+    }
     for name, value in {**defines, "WIDTH": width(), "POSE_TEXELS": POSE_TEXELS}.items():
         info.define(name, str(value))
     return _compile(info)
@@ -208,12 +239,27 @@ def paste() -> gpu.types.GPUShader:
     info = _info(_PASTE_VERTEX, _PASTE_FRAGMENT, ("splats", "holes", "meshes", "sky_terms"))
     for kind, name in (("MAT4", "to_world"), ("VEC3", "behind")):
         info.push_constant(kind, name)
-    for name in ("sky_degree", "meshes_drawn", "has_holes"):
+    for name in ("sky_degree", "meshes_drawn", "has_holes", "overlay"):
         info.push_constant("INT", name)
     between = gpu.types.GPUStageInterfaceInfo("r5dgs_paste")
     between.smooth("VEC2", "uv")
     info.vertex_out(between)
     info.define("COEFFICIENTS", "sky_terms")
+    return _compile(info)
+
+
+def depth() -> gpu.types.GPUShader:
+    """Compile the shader that draws the depth of triangles.
+
+    Raises:
+        CompileError: The graphics card's driver refuses it.
+    """
+    info = gpu.types.GPUShaderCreateInfo()
+    info.vertex_in(0, "VEC3", "place")
+    info.push_constant("MAT4", "to_clip")
+    info.fragment_out(0, "VEC4", "picture")
+    info.vertex_source("void main() { gl_Position = to_clip * vec4(place, 1.0); }")
+    info.fragment_source("void main() { picture = vec4(gl_FragCoord.z); }")
     return _compile(info)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ class Group:
         matrix: Affine map from the group's frame to Blender's world. [4, 4]
         tint: Factors on the color.
         light_change: Change of the light's direction as seen from the group. [3]
+        light: Direction of the light. [3]
         holdout: True if the group cuts a hole into everything behind it.
     """
 
@@ -39,6 +41,7 @@ class Group:
     matrix: np.ndarray
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     light_change: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    light: tuple[float, float, float] = (0.0, 0.0, 0.0)
     holdout: bool = False
 
 
@@ -70,12 +73,19 @@ class ViewMatrices:
         return 0.0 if self.parallel else float(p[2, 3] / (p[2, 2] - 1))
 
 
+def matrix(values: np.ndarray) -> Matrix:
+    """Matrix of Blender. [4, 4]"""
+    return Matrix(values.tolist())
+
+
 def texture(values: np.ndarray, width: int, format: str) -> gpu.types.GPUTexture:
     """Create a texture with rows of ``width`` texels; the last row is padded with zeros. [n] or [n, 4]"""
     channels = values.shape[1] if values.ndim > 1 else 1
     height = max(-(-len(values) // width), 1)
-    flat = np.zeros(width * height * channels, np.float32)
-    flat[: values.size] = values.ravel()
+    flat = values.ravel()
+    if flat.dtype != np.float32 or len(flat) != width * height * channels:
+        flat = np.zeros(width * height * channels, np.float32)
+        flat[: values.size] = values.ravel()
     return gpu.types.GPUTexture((width, height), format=format, data=gpu.types.Buffer("FLOAT", len(flat), flat))
 
 
@@ -90,18 +100,38 @@ class SplatTable:
     """
 
     def __init__(self, table: gaussian_table.Table):
-        self.positions, self.starts = table.positions, table.starts
-        count, texels = table.texels.shape[:2]
+        self.starts, self.positions = table.starts, table.positions
+        self.versions = [0] * (len(table.starts) - 1)  # how often each group was moved
+        count, texels = table.looks.shape[:2]
         width = shaders.width()
-        holds = min(width // texels * width, EXACT)
+        holds = min(width // max(texels, gaussian_table.GEOMETRY) * width, EXACT)
         if count > holds or len(self.starts) > width // shaders.POSE_TEXELS * width:
             raise errors.ConfigError(
                 f"{count} Gaussians in {len(self.starts) - 1} clouds: expected at most {holds} as splats, which the "
                 "textures of this graphics card hold; hide objects, or show a scene as points"
             )
-        self.shader = _shader(table.degree, table.shaded, texels)
+        self.shader = _shader(table.degree, table.shaded, table.turned, texels)
         self.quads = batch_for_shader(self.shader, "TRI_STRIP", CORNERS)
-        self.texture = texture(table.texels.reshape(-1, 4), width // texels * texels, "RGBA32F")
+        self.looks = texture(table.looks.reshape(-1, 4), width // texels * texels, "RGBA32F")
+        wide = width // gaussian_table.GEOMETRY
+        padded = np.zeros((max(-(-count // wide), 1) * wide, gaussian_table.GEOMETRY, 4), np.float32)
+        padded[:count] = table.geometry
+        self._table = dataclasses.replace(table, geometry=padded, looks=table.looks[:0])
+        self._geometry: gpu.types.GPUTexture | None = None
+
+    def move(self, group: int, geometry: gaussian_table.Geometry) -> None:
+        """Change the geometry of a group; the number of its Gaussians stays the same."""
+        self._table.move(group, geometry)
+        self.versions[group] += 1
+        self._geometry = None
+
+    @property
+    def geometry(self) -> gpu.types.GPUTexture:
+        """Texture of the geometry; textures cannot be changed, so that it is a new one after `move`."""
+        if self._geometry is None:
+            width = shaders.width() // gaussian_table.GEOMETRY * gaussian_table.GEOMETRY
+            self._geometry = texture(self._table.geometry.reshape(-1, 4), width, "RGBA32F")
+        return self._geometry
 
 
 class SplatBuffer:
@@ -139,11 +169,11 @@ class SplatBuffer:
         """
         groups = [group for group in groups if _is_drawable(group, view)]
         rows = self._sorted(table, groups, view)
-        self._picture = _target(self._picture, view)
+        self._picture = target(self._picture, view)
         self._poses = [_poses(groups, len(table.starts) - 1, view)]
         self._draw(self._picture, self._poses[0], table, view, meshes, len(rows))
         if any(group.holdout for group in groups):
-            self._holes = _target(self._holes, view)
+            self._holes = target(self._holes, view)
             self._poses.append(_poses(groups, len(table.starts) - 1, view, holes=True))
             self._draw(self._holes, self._poses[1], table, view, meshes, len(rows))
         else:
@@ -154,7 +184,8 @@ class SplatBuffer:
         if self._table is not table or self._order is None:
             self._table, self._order, self._rows = table, DepthOrder(table.positions, table.starts), None
         planes = {group.number: -(view.view_matrix @ group.matrix)[2] for group in groups}
-        rows = self._order.update(planes, view.near, view.parallel)
+        versions = {group.number: table.versions[group.number] for group in groups}
+        rows = self._order.update(planes, view.near, view.parallel, versions)
         if rows is not self._rows:
             self._rows = rows
             self._rows_texture = texture(rows.astype(np.float32), shaders.width(), "R32F")
@@ -162,14 +193,14 @@ class SplatBuffer:
 
     def _draw(
         self,
-        target: gpu.types.GPUOffScreen,
+        picture: gpu.types.GPUOffScreen,
         poses: gpu.types.GPUTexture,
         table: SplatTable,
         view: ViewMatrices,
         meshes: gpu.types.GPUTexture | None,
         count: int,
     ) -> None:
-        with target.bind():
+        with picture.bind():
             gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
             if not count:
                 return
@@ -178,10 +209,11 @@ class SplatBuffer:
             gpu.state.depth_mask_set(False)
             gpu.state.blend_set("ALPHA_PREMULT")
             shader.bind()
-            shader.uniform_float("projection", Matrix(view.projection.tolist()))
+            shader.uniform_float("projection", matrix(view.projection))
             shader.uniform_float("view", (view.width, view.height, view.near, float(meshes is not None)))
             shader.uniform_float("slopes", _slopes(view.projection))
-            shader.uniform_sampler("table", table.texture)
+            shader.uniform_sampler("geometry", table.geometry)
+            shader.uniform_sampler("looks", table.looks)
             shader.uniform_sampler("poses", poses)
             shader.uniform_sampler("order", self._rows_texture)
             shader.uniform_sampler("meshes", meshes or nothing())
@@ -189,8 +221,8 @@ class SplatBuffer:
             gpu.state.blend_set("NONE")
 
 
-def _target(known: gpu.types.GPUOffScreen | None, view: ViewMatrices) -> gpu.types.GPUOffScreen:
-    """Buffer of the size of a view, the known one if possible."""
+def target(known: gpu.types.GPUOffScreen | None, view: ViewMatrices) -> gpu.types.GPUOffScreen:
+    """Return a buffer of the size of a view, the known one if possible."""
     size = (view.width, view.height)
     if known is not None and (known.width, known.height) == size:
         return known
@@ -237,7 +269,7 @@ def _poses(groups: Sequence[Group], count: int, view: ViewMatrices, holes: bool 
         row[3] = (*group.tint, 0.0)
         if holes or group.holdout:
             row[3] = (*[float(holes and group.holdout)] * 3, 1.0)
-        row[4, :3] = group.light_change
+        row[4, :3], row[6, :3] = group.light_change, group.light
         to_group = np.linalg.inv(group.matrix)
         if view.parallel:
             row[5, :3] = to_group[:3, :3] @ to_world[:3, 2]  # towards the viewer; the line of sight is its negative

@@ -1,7 +1,7 @@
 """Splats in every 3D viewport: a draw handler that pastes the picture of each view and draws it again if it changed.
 
 Blender calls the handler for every anti-aliasing sample, so pictures are kept. A picture depends on the view, on the
-poses, tints and points of the visible groups and, if anything solid is visible, on the viewport's depth buffer.
+poses, tints and points of the visible groups and, if anything else is visible, on the viewport's depth buffer.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from ...r5dgs_core import errors
 from ..engine import engine
 from ..scene import loaded_scenes, render_settings, viewport_display
 from ..ui import status_bar
-from . import paste, shaders, visible_splats
+from . import mesh_depth, paste, shaders, visible_splats
 from . import splat_renderer as renderer
 
 SOLID = {"MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "CURVES", "POINTCLOUD", "GPENCIL", "GREASEPENCIL"}
+LINES = {"EMPTY", "CAMERA", "LIGHT", "SPEAKER", "LIGHT_PROBE", "LATTICE", "ARMATURE"}  # drawn by overlays
 
 
 class _Picture:
@@ -28,8 +29,9 @@ class _Picture:
 
     def __init__(self):
         self.buffer, self.key = renderer.SplatBuffer(), None
-        self.depth: np.ndarray | None = None  # of the solid geometry
-        self.meshes: gpu.types.GPUTexture | None = None  # the same
+        self.depth: np.ndarray | tuple | None = None  # of the solid geometry, or what it depends on
+        self.meshes: gpu.types.GPUTexture | None = None  # the depth
+        self.drawn = mesh_depth.MeshDepth()
 
 
 class _State:
@@ -48,6 +50,7 @@ class _State:
         self.pictures.clear()
         visible_splats.forget()
         paste.forget()
+        mesh_depth.forget()
         renderer.forget()
 
 
@@ -72,7 +75,7 @@ def _draw_viewport(context: bpy.types.Context) -> None:
         if any(_falls_back(one) for one in loaded) and not bpy.app.timers.is_registered(_show_points):
             bpy.app.timers.register(_show_points, first_interval=0.0)
         return
-    visible_splats.catch_up()
+    catch_up()
     said, drawn = "", False
     try:
         if loaded and not _is_drawn_by_engine(context):
@@ -98,6 +101,13 @@ def _draw_viewport(context: bpy.types.Context) -> None:
         status_bar.redraw("VIEW_3D")
 
 
+def catch_up() -> None:
+    """Apply the changes that handlers have queued."""
+    changed = visible_splats.catch_up()
+    if changed is None or changed:
+        mesh_depth.drop(changed)
+
+
 def _is_drawn_by_engine(context: bpy.types.Context) -> bool:
     return context.space_data.shading.type == "RENDERED" and context.scene.render.engine == engine.ENGINE
 
@@ -115,11 +125,22 @@ def _draw_in_region(context: bpy.types.Context, found: visible_splats.VisibleSpl
         (view.view_matrix.tobytes(), view.projection.tobytes(), view.width, view.height),
         tuple((one.number, one.matrix.tobytes(), one.tint, one.light_change, one.holdout) for one in found.groups),
         id(found.table),  # kept by the picture's buffer, so no other table has this id
+        tuple(found.table.versions),
     )
-    depth = _depth(region.width, region.height) if _is_anything_solid(context) else None
-    if picture.key != key or not _is_equal(picture.depth, depth):
+    solid = None
+    if is_anything_else_drawn(context):
+        if mesh_depth.is_needed(space):
+            solid = picture.drawn.find(context.evaluated_depsgraph_get(), space)
+        else:
+            solid = depth(region.width, region.height)
+    if picture.key != key or not _is_equal(picture.depth, solid):
         _drop_closed(context)
-        picture.depth, picture.meshes = depth, None if depth is None else renderer.texture(depth, region.width, "R32F")
+        picture.depth, picture.meshes = solid, None
+        if isinstance(solid, tuple):
+            picture.drawn.draw(view)
+            picture.meshes = picture.drawn.texture
+        elif solid is not None:
+            picture.meshes = renderer.texture(solid, region.width, "R32F")
         picture.buffer.draw(found.table, found.groups, view, picture.meshes)
         picture.key = key
     wired = space.shading.type == "WIREFRAME"
@@ -135,8 +156,8 @@ def _drop_closed(context: bpy.types.Context) -> None:
         del _state.pictures[key]
 
 
-def _depth(width: int, height: int) -> np.ndarray:
-    """Depth buffer of the viewport; reading it waits for the graphics card. [H * W] float32
+def depth(width: int, height: int) -> np.ndarray:
+    """Depth of the active framebuffer, in handlers the viewport's; waits for the graphics card. [H * W] float32
 
     Blender keeps the depth of the first anti-aliasing sample, so that a view at rest has the same at every sample.
     """
@@ -145,18 +166,23 @@ def _depth(width: int, height: int) -> np.ndarray:
     return np.array(buffer, np.float32)
 
 
-def _is_equal(one: np.ndarray | None, other: np.ndarray | None) -> bool:
-    return one is other or (one is not None and other is not None and np.array_equal(one, other))
+def _is_equal(one: np.ndarray | tuple | None, other: np.ndarray | tuple | None) -> bool:
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return np.array_equal(one, other)
+    return type(one) is type(other) and one == other
 
 
-def _is_anything_solid(context: bpy.types.Context) -> bool:
-    """Return True if the viewport may show anything solid but the splats."""
-    return any(_is_solid(obj, context) for obj in context.evaluated_depsgraph_get().objects)
+def is_anything_else_drawn(context: bpy.types.Context) -> bool:
+    """Return True if the viewport may show anything but splats that has depth: solids, or lines of overlays."""
+    return any(_has_depth(obj, context) for obj in context.evaluated_depsgraph_get().objects)
 
 
-def _is_solid(obj: bpy.types.Object, context: bpy.types.Context) -> bool:
+def _has_depth(obj: bpy.types.Object, context: bpy.types.Context) -> bool:
     if obj.instance_type == "COLLECTION" and obj.instance_collection is not None:
         return True
+    if obj.type in LINES:
+        lines = context.space_data.overlay.show_overlays and not obj.show_in_front and obj.original.r5dgs.role == "NONE"
+        return lines and obj.original.visible_get(viewport=context.space_data)
     if obj.type not in SOLID or not obj.original.visible_get(viewport=context.space_data):
         return False
     return obj.type != "POINTCLOUD" or not viewport_display.draws_splats(obj.original)

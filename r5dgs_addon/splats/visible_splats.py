@@ -43,17 +43,36 @@ class VisibleSplats:
 
 @dataclass
 class _Layer:
-    """Gaussians that a view layer shows: points by `session_uid` of the object, and the table with its slots."""
+    """Gaussians that a view layer shows: points by `session_uid` of the object, and the table with its slots.
+
+    Points of one view layer may differ from those of another. Those of ``changed`` objects have to be read again.
+    """
 
     clouds: dict[int, gaussian_table.CloudData] = field(default_factory=dict)
     table: tuple[tuple[Slot, ...], renderer.SplatTable] | None = None
+    changed: set[int] = field(default_factory=set)
 
     def drop(self, uids: set[int]) -> None:
-        """Read the points of objects again. Points of one view layer may differ from those of another."""
+        """Forget the points of objects."""
         if self.table is not None and any(slot[0] in uids for slot in self.table[0]):
             self.table = None
         for uid in uids & self.clouds.keys():
             del self.clouds[uid]
+        self.changed -= uids
+
+    def update(self, uid: int, found: gaussian_table.CloudData) -> None:
+        """Store the points of an object. If only their geometry changed, the table is kept."""
+        known = self.clouds.get(uid)
+        self.clouds[uid] = found
+        self.changed.discard(uid)
+        if self.table is None or known is None:
+            return
+        slots, table = self.table
+        if found.look is known.look and len(found.geometry.positions) == len(known.geometry.positions):
+            for number in (number for number, slot in enumerate(slots) if slot[0] == uid):
+                table.move(number, found.geometry)
+        else:
+            self.table = None
 
 
 _layers: dict[LayerKey, _Layer] = {}
@@ -70,19 +89,22 @@ def queue_reload() -> None:
     _changes.append(None)
 
 
-def catch_up() -> None:
-    """Apply the queued changes, and drop the data of unused view layers and deleted objects."""
+def catch_up() -> set[int] | None:
+    """Apply the queued changes, and drop the data of unused view layers and deleted objects.
+
+    Returns:
+        The queued objects and data, by `session_uid`; None if everything may have changed.
+    """
     if not _changes:
-        return
+        return set()
     changed: set[int] = set()
-    if len(_changes) == _changes.maxlen:
-        _layers.clear()
+    everything = len(_changes) == _changes.maxlen
     while _changes:
         uids = _changes.popleft()
-        if uids is None:
-            _layers.clear()
-        else:
-            changed |= uids
+        everything |= uids is None
+        changed |= uids or set()
+    if everything:
+        _layers.clear()
     windows = bpy.context.window_manager.windows
     current = {layer_key(window.scene, window.view_layer) for window in windows}
     alive = {obj.session_uid for obj in bpy.data.objects}
@@ -90,7 +112,9 @@ def catch_up() -> None:
         if current and key not in current:
             del _layers[key]
         else:
-            _layers[key].drop(changed | (_layers[key].clouds.keys() - alive))
+            _layers[key].drop(_layers[key].clouds.keys() - alive)
+            _layers[key].changed |= changed & _layers[key].clouds.keys()
+    return None if everything else changed
 
 
 def forget() -> None:
@@ -120,10 +144,10 @@ def shown(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = 
     clouds = [one for one in clouds if one.seen and one.collection.r5dgs.display == viewport_display.SPLATS]
     clouds = [one for one in clouds if not compat.is_gaussian_splat(one.object.data)]
     layer = _layers.setdefault(layer_key(depsgraph.scene, depsgraph.view_layer), _Layer())
-    for one in clouds:
-        if one.object.session_uid not in layer.clouds:
-            evaluated = evaluated_points.evaluated(one.object, depsgraph)
-            layer.clouds[one.object.session_uid] = gaussian_table.read(evaluated, one.object.color)
+    for uid, obj in {one.object.session_uid: one.object for one in clouds}.items():
+        if uid not in layer.clouds or uid in layer.changed:
+            evaluated = evaluated_points.evaluated(obj, depsgraph)
+            layer.update(uid, gaussian_table.read(evaluated, obj.color, layer.clouds.get(uid)))
     if not clouds:
         return None
     slots = _slots(clouds)
@@ -153,7 +177,8 @@ def _group(number: int, cloud: visible_clouds.VisibleCloud) -> renderer.Group:
         turn = affine_transform.nearest_rotation(cloud.matrix[:3, :3])
         turn = affine_transform.nearest_rotation(cloud.world[:3, :3]).T @ turn
         change = tuple(posing.light_change(light, turn))
-    return renderer.Group(number, cloud.matrix, cloud.tint, change, cloud.holdout)
+    source = (0.0, 0.0, 0.0) if light is None else tuple(light)
+    return renderer.Group(number, cloud.matrix, cloud.tint, change, source, cloud.holdout)
 
 
 def _sky(collection: bpy.types.Collection) -> np.ndarray | None:

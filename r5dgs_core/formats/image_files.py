@@ -21,20 +21,22 @@ _LONG_NAMES = 1 << 10
 
 
 def write_png(path: str | Path, pixels: np.ndarray) -> Path:
-    """Write integers as a greyscale PNG, atomically, and return the path.
+    """Write integers as a greyscale or RGB PNG, atomically, and return the path.
 
     Args:
         path: Target file.
-        pixels: Top row first. [H, W] uint8 or uint16
+        pixels: Top row first. [H, W] or [H, W, 3] uint8 or uint16
     """
-    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16) or pixels.size == 0:
-        raise ValueError(f"pixels: expected [H, W] of uint8 or uint16, got {pixels.shape} of {pixels.dtype}")
-    height, width = pixels.shape
+    if pixels.shape[2:] not in ((), (3,)) or pixels.dtype not in (np.uint8, np.uint16) or pixels.size == 0:
+        raise ValueError(
+            f"pixels: expected [H, W] or [H, W, 3] of uint8 or uint16, got {pixels.shape} of {pixels.dtype}"
+        )
+    height, width = pixels.shape[:2]
     depth = 8 * pixels.dtype.itemsize
     lines = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder(">")).view(np.uint8).reshape(height, -1)
     filtered = np.concatenate([np.zeros((height, 1), np.uint8), lines], axis=1)  # filter "none" before each line
     content = b"\x89PNG\r\n\x1a\n"
-    content += _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, 0, 0, 0, 0))
+    content += _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, 2 * (pixels.ndim == 3), 0, 0, 0))
     content += _chunk(b"IDAT", zlib.compress(filtered.tobytes(), 6)) + _chunk(b"IEND", b"")
     atomic_files.write(path, content)
     return Path(path)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Euler, Vector
+from mathutils import Euler, Matrix, Vector
 
 sys.path.insert(0, str(Path(__file__).parent))
 from window import area_of, inside, main_window, region_of, run, service  # noqa: E402
@@ -52,8 +52,8 @@ def shown_region(picture: np.ndarray) -> tuple[np.ndarray, tuple[slice, slice]]:
     return picture[y0 : y0 + region.height, x0 : x0 + region.width][inner], inner
 
 
-def expected() -> np.ndarray:
-    """The worker's picture of the 3D view. [H, W, 3]"""
+def expected(sky: bool = True) -> np.ndarray:
+    """The worker's picture of the 3D view, over black without sky. [H, W, 3]"""
     request, cameras = service("engine.render_request"), service("engine.view_cameras")
     with inside():
         region, view_3d = bpy.context.region, bpy.context.region_data
@@ -62,7 +62,7 @@ def expected() -> np.ndarray:
             lambda points: cameras.of_region(region, view_3d, points),
             bpy.context.space_data,
         )
-        return np.clip(request.render(seen)[1]["color"], 0, 1)
+        return np.clip(request.render(seen, sky=sky)[1]["color"], 0, 1)
 
 
 def worker_depth() -> tuple[np.ndarray, np.ndarray]:
@@ -77,31 +77,51 @@ def worker_depth() -> tuple[np.ndarray, np.ndarray]:
     return arrays["depth"], arrays["alpha"]
 
 
+def largest_object() -> tuple[Vector, float]:
+    """Median place and radius of the largest object."""
+    clouds = [obj for obj in main_window().scene.objects if obj.r5dgs.role == "CLOUD" and obj.r5dgs.object_id > 0]
+    cloud = max(clouds, key=lambda one: one.r5dgs.count)
+    places = np.empty(3 * len(cloud.data.points), np.float32)
+    cloud.data.attributes["position"].data.foreach_get("vector", places)
+    places = places.reshape(-1, 3)
+    middle = np.median(places, axis=0)
+    radius = float(np.quantile(np.linalg.norm(places - middle, axis=1), 0.8)) * max(cloud.matrix_world.to_scale())
+    return cloud.matrix_world @ Vector(middle), radius
+
+
 def check_meshes(out: Path, size: float):
-    """A plane that cuts the scene, and a ball in it: the nearer of mesh and Gaussians is visible."""
+    """A plane that cuts an object, and a ball half behind it: the nearer of mesh and Gaussians is visible."""
     space = area_of("VIEW_3D").spaces[0]
     space.shading.light, space.shading.color_type, space.shading.single_color = "FLAT", "SINGLE", (0.0, 1.0, 0.0)
     view_3d = space.region_3d
-    bpy.ops.mesh.primitive_uv_sphere_add(radius=0.08 * size, location=(0, 0, 0), segments=64, ring_count=32)
+    middle, radius = largest_object()
+    view_3d.view_rotation, view_3d.view_location = VIEWS[0].to_quaternion(), middle
+    view_3d.view_distance = 6 * radius
+    right, back = (view_3d.view_rotation @ Vector(axis) for axis in ((1, 0, 0), (0, 0, 1)))
+    ball_place = middle + 1.2 * radius * right - 0.6 * radius * back
+    bpy.ops.mesh.primitive_uv_sphere_add(radius=radius, location=ball_place, segments=64, ring_count=32)
     ball = bpy.context.object
-    bpy.ops.mesh.primitive_plane_add(size=0.3 * size, location=(0.1 * size, 0, 0), rotation=(0, 1.3, 0.4))
+    bpy.ops.mesh.primitive_plane_add(size=4 * radius, location=middle)
     plane = bpy.context.object
+    plane.matrix_world = Matrix.LocRotScale(middle, VIEWS[0].to_quaternion() @ Euler((0.9, 0, 0)).to_quaternion(), None)
     for obj in (ball, plane):
         obj.select_set(False)
-    view_3d.view_rotation = VIEWS[0].to_quaternion()
-    yield 0.5
-    redraw()
-    picture, inner = shown_region(screenshot(out / "meshes.png"))
-    green = np.abs(picture - (0, 1, 0)).sum(-1) < np.abs(picture - expected()[inner]).sum(-1)
-    depth, alpha = (values[inner] for values in worker_depth())
-    nearest = mesh_depth((ball, plane))[inner]
-    both = (alpha > 0.95) & np.isfinite(nearest) & (np.abs(depth - nearest) > 0.01 * size)
-    both &= local_range(depth) < 0.05 * size  # at soft silhouettes, the mean depth lies between two surfaces
-    right = green == (nearest < depth)
-    share = right[both].mean()
-    print(f"meshes: {both.sum()} pixels covered by both, right in {100 * share:.1f} %", flush=True)
-    np.savez(out / "meshes.npz", green=green, depth=depth, nearest=nearest, alpha=alpha, both=both)
-    assert both.sum() >= 2000 and share >= 0.99
+    for name, mesh, other in (("plane", plane, ball), ("ball", ball, plane)):
+        mesh.hide_viewport, other.hide_viewport = False, True
+        yield 0.5
+        redraw()
+        picture, inner = shown_region(screenshot(out / f"{name}.png"))
+        green = np.abs(picture - (0, 1, 0)).sum(-1) < np.abs(picture - expected()[inner]).sum(-1)
+        depth, alpha = (values[inner] for values in worker_depth())
+        nearest = mesh_depth((mesh,))[inner]
+        both = (alpha > 0.95) & np.isfinite(nearest) & (np.abs(depth - nearest) > 0.03 * radius)
+        both &= local_range(depth) < 0.3 * radius  # at soft silhouettes, the mean depth lies between two surfaces
+        before, correct = nearest < depth, green == (nearest < depth)
+        ends = f"the mesh is nearer in {(both & before).sum()}, the Gaussians in {(both & ~before).sum()}"
+        print(f"{name}: {both.sum()} pixels covered by both ({ends}), right in {correct[both].mean():.2%}", flush=True)
+        np.savez(out / f"{name}.npz", green=green, depth=depth, nearest=nearest, alpha=alpha, both=both)
+        assert both.sum() >= 2000 and correct[both].mean() >= 0.99
+        assert min((both & before).sum(), (both & ~before).sum()) > 300, "one of them is always nearer"
     for obj in (ball, plane):
         bpy.data.objects.remove(obj)
 
@@ -166,6 +186,7 @@ def checks(path: str, folder: str = ""):
     boxes = [obj.bound_box for obj in scene.objects if obj.type == "POINTCLOUD"]
     size = max((Vector(box[6]) - Vector(box[0])).length for box in boxes)
     view_3d.view_distance, space.clip_start, space.clip_end = 0.5 * size, 0.01, 1000
+    scene.view_settings.view_transform = "Standard"
     worst = 1e9
     for number, rotation in enumerate(VIEWS):
         view_3d.view_rotation = rotation.to_quaternion()
@@ -181,13 +202,24 @@ def checks(path: str, folder: str = ""):
             print(f"view {number}, t = {time:g}: {value:.1f} dB", flush=True)
             if number == 0 and time == 0.3:
                 np.savez(out / "compare.npz", found=found, wanted=wanted)
-    yield from check_meshes(out, size)
-    for kind in ("MATERIAL", "RENDERED"):
+    for kind in ("MATERIAL", "RENDERED", "SOLID"):
         space.shading.type = kind
         yield 2.0
         redraw()
         found, inner = shown_region(screenshot(out / f"{kind.lower()}.png"))
-        print(f"{kind}: {psnr(found, expected()[inner]):.1f} dB", flush=True)
+        value = psnr(found, expected()[inner])
+        worst = min(worst, value)
+        print(f"{kind}: {value:.1f} dB", flush=True)
+    scene.r5dgs_render.sky = False
+    space.shading.background_type, space.shading.background_color = "VIEWPORT", (0, 0, 0)
+    yield 0.5
+    redraw()
+    found, inner = shown_region(screenshot(out / "without_sky.png"))
+    value = psnr(found, expected(sky=False)[inner])
+    worst = min(worst, value)
+    print(f"without sky over black: {value:.1f} dB", flush=True)
+    scene.r5dgs_render.sky = True
+    yield from check_meshes(out, size)
     print("message:", service("splats.viewport_splats").message(bpy.context), flush=True)
     assert worst > LEAST_DB
 

@@ -55,6 +55,16 @@ def test_a_view_that_stands_still_keeps_its_order(module):
     assert order.update(planes, 0.01, False) is order.update(dict(planes), 0.01, False)
 
 
+def test_groups_whose_positions_change_are_sorted_again(module):
+    draw = np.random.default_rng(2)
+    positions, starts = draw.normal(size=(400, 3)).astype(np.float32), [0, 100, 400]
+    order, planes = module.DepthOrder(positions, starts), dict.fromkeys((0, 1), np.array([0, 0, 1.0, 5.0]))
+    for version in range(4):
+        positions[:100] = draw.normal(size=(100, 3))
+        rows = order.update(planes, 0.01, False, {0: version, 1: 0})
+        assert_sorted(rows, depths_of(positions, starts, planes), False)
+
+
 def test_far_outliers_do_not_coarsen_the_order(module):
     depths = np.append(np.linspace(1, 2, 500), 1e6).astype(np.float32)
     positions = np.stack([0 * depths, 0 * depths, depths], 1)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core import api, errors
+from r5dgs_core.motion import rotations
 from r5dgs_core.scene import scene_file
 from tests.support import motions, scenes
 
@@ -112,6 +113,63 @@ def test_pictures_equal_the_cores_at_any_time(blender, drawn, tmp_path, degree, 
         found = drawn()
         assert found[..., 3].max() > 0.5
         assert psnr(np.clip(found[..., :3], 0, 1), expected(blender, stored, t)) > AT_LEAST_DB
+
+
+@pytest.fixture
+def bending(blender, tmp_path):
+    """A loaded scene with an object that bends, and its content."""
+    scene = scenes.make_scene(n=400, objects=3, sh_degree=1)
+    rows, times = np.flatnonzero(scene.gaussians.object_ids == 1), scene.tracks.times
+    shape, draw = (len(rows), len(times)), np.random.default_rng(0)
+    quats = draw.normal(scale=0.2, size=(*shape, 4)) + [1.0, 0, 0, 0]
+    offsets, growths = draw.normal(scale=0.1, size=(*shape, 3)), draw.normal(scale=0.2, size=(*shape, 3))
+    quats[:, -1], offsets[:, -1], growths[:, -1] = (1, 0, 0, 0), 0, 0
+    scene = scene.with_arrays(
+        residual_rows=rows.astype(np.int32),
+        residual_offsets=offsets.astype(np.float32),
+        residual_quats=rotations.normalize(quats).astype(np.float32),
+        residual_log_scales=growths.astype(np.float32),
+    )
+    path = scene_file.write(scene, tmp_path / "bending.r5dgs")
+    collection = motions.load(blender, path)
+    assert collection.r5dgs_exact.enabled
+    return collection, scene_file.read(path)
+
+
+def test_what_bends_is_drawn_as_the_core_draws_it(blender, drawn, bending):
+    collection, stored = bending
+    for t in (0.2, 0.35, scenes.T_MAX, 0.9):
+        motions.go_to(blender, collection, t)
+        assert psnr(np.clip(drawn()[..., :3], 0, 1), expected(blender, stored, t)) > AT_LEAST_DB
+
+
+def test_a_table_follows_what_bends_without_being_made_again(blender, on_card, bending):
+    visible, table_module = motions.addon("splats.visible_splats"), motions.addon("splats.gaussian_table")
+    collection, _ = bending
+
+    def read(t, known=None):
+        motions.go_to(blender, collection, t)
+        evaluated = bent.evaluated_get(blender.context.evaluated_depsgraph_get())
+        return table_module.read(evaluated.data, bent.color, known)
+
+    bent = next(cloud for cloud in motions.clouds(collection) if "r5dgs_exact_written" in cloud.data)
+    first = read(0.2)
+    assert read(0.35, first).look is first.look
+
+    def follow(depsgraph):
+        pictures = [picture_of(depsgraph)]
+        (layer,) = visible._layers.values()
+        table, look = layer.table, layer.clouds[bent.session_uid].look
+        layer.update(bent.session_uid, table_module.CloudData(first.geometry, look))
+        assert layer.table is table and max(table[1].versions) == 1
+        pictures.append(picture_of(depsgraph))
+        layer.update(bent.session_uid, first)  # with another look
+        assert layer.table is None
+        return [*pictures, picture_of(depsgraph)]
+
+    before, found, made_again = on_card(follow)
+    assert psnr(before, found) < 50
+    np.testing.assert_allclose(found, made_again, atol=1e-6)
 
 
 def moved(bpy, mug):
@@ -230,7 +288,7 @@ def test_one_shader_draws_tables_of_any_length(blender, on_card, tmp_path, monke
     monkeypatch.setattr(shaders, "width", lambda: 128)  # several rows of every texture
     np.testing.assert_array_equal(on_card(picture_of), wanted)
     monkeypatch.setattr(shaders, "width", lambda: 16)
-    with pytest.raises(errors.ConfigError, match="400 Gaussians .* expected at most 16 as splats"):
+    with pytest.raises(errors.ConfigError, match="400 Gaussians .* expected at most 32 as splats"):
         on_card(picture_of)
 
 
@@ -239,6 +297,53 @@ def test_nearer_than_the_clip_start_of_the_camera_is_nothing(blender, drawn, tmp
     assert drawn().any()
     blender.context.scene.camera.data.clip_start = 900
     assert not drawn().any()
+
+
+@pytest.mark.parametrize("kind", ["mesh", "curve", "instance", "modified"])
+def test_the_depth_of_surfaces_is_that_of_a_ray(blender, on_card, kind):
+    mesh_depth, renderer = motions.addon("splats.mesh_depth"), motions.addon("splats.splat_renderer")
+    scene, cube = blender.context.scene, blender.data.objects["Cube"]
+    if kind == "curve":
+        blender.data.objects.remove(cube)
+        blender.ops.curve.primitive_bezier_circle_add()
+        blender.context.object.data.dimensions, blender.context.object.data.fill_mode = "2D", "BOTH"
+    elif kind == "instance":
+        held = blender.data.collections.new("held")
+        for home in cube.users_collection:
+            home.objects.unlink(cube)
+        held.objects.link(cube)
+        instancer = blender.data.objects.new("instancer", None)
+        instancer.instance_type, instancer.instance_collection = "COLLECTION", held
+        instancer.location = (0.3, 0.2, 0.1)
+        scene.collection.objects.link(instancer)
+    elif kind == "modified":
+        cube.modifiers.new("round", "SUBSURF").levels = cube.modifiers["round"].render_levels = 2
+    blender.context.view_layer.update()
+
+    def draw(depsgraph):
+        camera, drawn = depsgraph.scene.camera.evaluated_get(depsgraph), mesh_depth.MeshDepth()
+        view = renderer.ViewMatrices(
+            np.linalg.inv(np.array(camera.matrix_world, np.float64)),
+            np.array(camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), np.float64),
+            *SIZE,
+        )
+        found = drawn.find(depsgraph, None)
+        assert found == drawn.find(depsgraph, None) and found
+        drawn.draw(view)
+        values, p = pixels(drawn._picture)[..., 0], view.projection
+        mesh_depth.forget()
+        return np.where(values < 1, p[2, 3] / (2 * values - 1 + p[2, 2]), np.inf)
+
+    depth, camera = on_card(draw), scene.camera.matrix_world
+    for row, column in ((60, 80), (50, 84), (66, 75), (5, 5)):
+        frame = [camera @ corner for corner in scene.camera.data.view_frame(scene=scene)]  # right top first
+        x, y = (column + 0.5) / SIZE[0], (row + 0.5) / SIZE[1]
+        target = frame[3] + (frame[0] - frame[3]) * x + (frame[2] - frame[3]) * y
+        origin, ahead = camera.translation, camera.to_3x3() @ frame[0].__class__((0, 0, -1))
+        graph = blender.context.evaluated_depsgraph_get()
+        hit, place, *_ = scene.ray_cast(graph, origin, (target - origin).normalized())
+        wanted = (place - origin).dot(ahead) if hit else np.inf
+        assert depth[row, column] == pytest.approx(wanted, rel=2e-3)
 
 
 def nodes_without_attributes(bpy, mug):

@@ -67,7 +67,7 @@ def test_a_thread_changes_nothing_until_a_viewport_is_drawn(blender, splats, vis
         thread.join()
         assert layer.table is table and set(layer.clouds) == set(uids)
     visible.catch_up()
-    assert layer.table is None and set(layer.clouds) == set(uids) - {cloud.session_uid}
+    assert layer.changed == {cloud.session_uid} and layer.table is table and set(layer.clouds) == set(uids)
 
 
 def test_rendering_an_animation_does_not_disturb_the_viewports(blender, splats, visible, collection, tmp_path):

@@ -17,6 +17,12 @@ def test_png_holds_the_integers(tmp_path, dtype, shape):
     np.testing.assert_array_equal(read[..., 0], pixels)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_png_holds_colors(tmp_path, dtype):
+    pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max + 1, (7, 5, 3)).astype(dtype)
+    np.testing.assert_array_equal(images.read_png(image_files.write_png(tmp_path / "a.png", pixels)), pixels)
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (16, 4), (37, 21), (64, 64)])
 @pytest.mark.parametrize("names", [("Y",), ("B", "G", "R"), ("ViewLayer.Depth.Z", "ViewLayer.Object Index of All.X")])
 def test_exr_holds_the_channels(tmp_path, shape, names):
