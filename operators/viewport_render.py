@@ -15,7 +15,7 @@ from ..r5dgs_core.formats import image_files
 IMAGE = "R5DGS Viewport"
 
 
-class R5DGS_OT_viewport_render(stepwise_operator.Running, polls.NeedsScene, bpy.types.Operator):
+class R5DGS_OT_viewport_render(stepwise_operator.Stepwise, polls.NeedsScene, bpy.types.Operator):
     """Draw this 3D view with its splats in the resolution of the scene"""
 
     bl_idname = "r5dgs.viewport_render"

@@ -30,7 +30,7 @@ def show() -> None:
 def _switch(obj: bpy.types.Object, on: bool) -> None:
     modifier = obj.modifiers.get(viewport_display.SPLATS_MODIFIER)
     if modifier is not None and modifier.show_viewport != on:
-        modifier.show_viewport = on
+        modifier.show_viewport = obj.show_in_front = on
 
 
 @persistent

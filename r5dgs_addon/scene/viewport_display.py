@@ -3,8 +3,8 @@
 Splats are drawn by the extension. Points are fast for any number of Gaussians. Ellipsoids show size, orientation and
 opacity, but are slower. They are instances created by a modifier. Splats and ellipsoids have a modifier that passes the
 points on with radius 0, so that Blender does not draw them and the evaluated point cloud keeps them. Point clouds that
-Blender itself draws as Gaussian splats are left to it. Under splats, anchors and roots are drawn in front, which keeps
-their lines out of the depth buffer: splats cover them, whether meshes are visible or not.
+Blender itself draws as Gaussian splats are left to it. Under splats, the objects of a scene are drawn in front, which
+keeps their lines out of the depth buffer: splats cover them, whether meshes are visible or not.
 """
 
 import bpy
@@ -54,7 +54,7 @@ def show(collection: bpy.types.Collection, display: str) -> None:
         for old in used - {tree}:
             _forget(old)
     for obj in collection.all_objects:
-        if obj.r5dgs.role in ("ROOT", "ANCHOR") and obj.library is None:
+        if obj.r5dgs.role in ("ROOT", "ANCHOR", "CLOUD") and obj.library is None:
             obj.show_in_front = display == SPLATS
     collection.r5dgs.display = display
 

@@ -44,7 +44,6 @@ OPERATORS = {  # call of each; None if another module tests it
     "unisolate": lambda ops: ops.unisolate(),
     "use_engine": lambda ops: ops.use_engine(),
     "view_as_trained": lambda ops: ops.view_as_trained(),
-    "viewport_render": None,  # needs a window: tests/blender/check_splat_viewports.py
 }
 
 

@@ -79,12 +79,12 @@ def test_splats_hide_their_points_in_viewports_only(blender, scene_path):
     assert min(point.radius for point in cloud.data.points) > 0 and not cloud.modifiers[0].show_render
 
 
-def test_splats_cover_the_lines_of_anchors(blender, scene_path):
+def test_splats_cover_the_lines_of_their_objects(blender, scene_path):
     blender.ops.r5dgs.load_scene(filepath=str(scene_path))
-    anchors = [obj for obj in blender.data.objects if obj.r5dgs.role in ("ROOT", "ANCHOR")]
-    assert anchors and all(anchor.show_in_front for anchor in anchors)
+    parts = [obj for obj in blender.data.objects if obj.r5dgs.role != "NONE"]
+    assert parts and all(part.show_in_front for part in parts)
     blender.ops.r5dgs.set_display(display="POINTS")
-    assert not any(anchor.show_in_front for anchor in anchors)
+    assert not any(part.show_in_front for part in parts)
 
 
 def test_what_blender_draws_as_splats_is_left_to_it(blender, scene_path, monkeypatch):
