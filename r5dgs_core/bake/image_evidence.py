@@ -43,9 +43,9 @@ class Support:
     """Statistics of the change of the images by a simplification of a group's motion.
 
     Attributes:
-        sigmas: Distance of the simpler motion from the best fit to the images, in standard deviations; negative if it
-            fits better than the trained motion.
-        clusters: Number of independent parts in the estimate of the deviation.
+        sigmas: Distance (1 - l) of the simpler motion from the best fit to the images, in standard deviations; negative
+            if the best fit lies beyond the simpler motion.
+        clusters: Number of clusters or of patches, whichever is smaller, that the standard deviation is estimated from.
         level: Root mean square change of the pixels that show the group, colours in [0, 1].
         shape: Share of shape and texture in the change of the images; the rest is due to colours that turn with the
             group.
@@ -78,7 +78,7 @@ class ImageEvidence:
         self.psnr = self._psnr(self._scene)
 
     def loss(self, poses: np.ndarray) -> float:
-        """Return the loss of mean PSNR on the sampled views with other poses [G, S, 7] of the groups, dB."""
+        """Return the decrease of the mean PSNR on the sampled views, dB, if the groups take other poses [G, S, 7]."""
         return self.psnr - self._psnr(self._with(poses))
 
     def support(
@@ -163,7 +163,8 @@ class ImageEvidence:
 def _support(scores: np.ndarray, information: np.ndarray, pixels: int, changed: float) -> Support:
     """Return the support from the scores and the information of each cluster and patch. [C, PATCHES + 1] each
 
-    The variance is the sum of those over clusters and over patches, less their intersection, which both contain.
+    The variance is the sum of the variances over clusters and over patches, minus that over their intersections, which
+    both contain.
     """
     total = float(information.sum())
     if total <= 0:
@@ -182,9 +183,9 @@ def _support(scores: np.ndarray, information: np.ndarray, pixels: int, changed: 
 
 
 def gather(scene: Scene, dataset: datasets.Dataset, config: Config) -> ImageEvidence | None:
-    """Return the evidence of the training images on a scene's motion; None if nothing moves or an image is missing.
+    """Return the evidence of the training images on a scene's motion.
 
-    A missing image is logged as a warning.
+    The result is None if nothing moves, or if an image is missing, which is logged as a warning.
     """
     if not np.any(scene.tracks.poses[..., 1:] != 0):
         return None

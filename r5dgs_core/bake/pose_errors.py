@@ -1,14 +1,14 @@
 """Standard deviations of the observed poses of bodies, from the training images.
 
-Notation: J is the derivative of the pixels of a body by its pose, r their misfit, g = J^T r the score of a view. The
-pose of least misfit has the covariance (J^T J)^-1 (sum g g^T) (J^T J)^-1, with the sum over views instead of pixels,
+Notation: J is the derivative of a body's pixels with respect to its pose, r their misfit, g = J^T r the score of a
+view. S knots, P values of pixels. A change of a pose is a rotation vector in world axes, and a displacement in radii of
+the body.
+
+The pose of least misfit has the covariance (J^T J)^-1 (sum g g^T) (J^T J)^-1, with the sum over views instead of pixels,
 because the misfits of trained Gaussians are correlated over a view. The ratio to the covariance for independent pixels
 is pooled over the knots of a body, because single knots have few views. A track also drifts together with the texture
 that is trained with it; `FACTORS` are measured ratios of true errors to these deviations. If the misfit is as large as
 the contrast of the texture, wrong rotations have blurred it, and the rotations are unknown.
-
-S knots, P values of pixels. A change of a pose is a rotation vector in world axes, and a displacement in
-radii of the body.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MARGIN = 2  # dilation of the pixels that show a body, px
 FEWEST_PIXELS = 8  # minimum number of pixels of a body in a view
 FACTORS = (2.0, 4.5)  # ratios of measured errors to deviations, for displacements and rotations
 UNEXPLAINED = 0.5  # misfit above which the rotations are unknown, as a share of the contrast of the texture
-LARGE = 2.0  # smallest misfit that counts as unexplained, relative to the mean misfit of all pixels
+LARGE = 2.0  # misfit that may count as unexplained, relative to the root mean square misfit of all pixels
 UNKNOWN = 1.0  # standard deviation of an unknown rotation, rad, or displacement, radii
 EXACT = 1e-6  # error that cannot be distinguished from zero, rad or radii
 _REACH = 3.0  # extent of a Gaussian, standard deviations
@@ -50,7 +50,7 @@ class _Look:
     """Pixels of a body in a view.
 
     Attributes:
-        slopes: Derivatives of the values by the pose. [P, 6]
+        slopes: Derivatives of the values with respect to the pose. [P, 6]
         misses: Picture minus image. [P]
         inner: Squared misfit of the pixels inside the body's outline.
         texture: Squared differences of these pixels in the image from their mean colour.
@@ -131,7 +131,7 @@ def _look(
     truth: np.ndarray,
     mine: np.ndarray,
 ) -> _Look:
-    """Draw the surroundings of a body in a view in the given poses of the scene, of which the first is the observed."""
+    """Compare a body's pixels in a view with pictures of the scene in the observed poses (first) and in changed ones."""
     region = ndimage.binary_dilation(mine, iterations=MARGIN)
     rows, columns = ndimage.find_objects(region.astype(np.int8))[0]
     intrinsics = view.camera.intrinsics.copy()

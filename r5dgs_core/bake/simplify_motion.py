@@ -49,8 +49,8 @@ class _Part:
 
     Attributes:
         group: Group of the body.
-        name: Row of the needs table that it decides: "rotation" (the body does not turn), "motion" (it stays in its
-            place) or "curved_path" (its path is straight).
+        name: Row of the needs table that it decides: "rotation" (without: the body does not turn), "motion" (without: it
+            stays in its place) or "curved_path" (without: its path is straight).
         poses: Simplified poses of the body. [S, 7]
         spread: Root mean square per component of the dropped motion, rad or world units.
         value: Spread in rad or diameters.
@@ -161,7 +161,7 @@ def _moving(scene: Scene) -> list[MotionGroup]:
 def _parts(
     scene: Scene, group: int, observed: np.ndarray, evidence: ImageEvidence | None, wanted: NeedsSection
 ) -> list[_Part]:
-    """Return the candidate simplifications of a body: of its rotation, and of its path to a place or else a line."""
+    """Return the candidate simplifications of a body: no rotation, a fixed place and, if it moves, a straight path."""
     poses, weights = scene.tracks.poses[group], observed.astype(np.float64)
     weights = weights if weights.any() else np.ones(len(poses))
     mean = rotations.normalize(weights @ rotations.make_continuous(poses[:, :4]))
@@ -231,7 +231,7 @@ def _independent(series: np.ndarray) -> float:
 def _unseen(
     scene: Scene, parts: Sequence[_Part], evidence: ImageEvidence | None
 ) -> tuple[list[_Part], dict[int, float]]:
-    """Return the parts that the images do not need, cheapest first, and the PSNR loss of each part by its `id`, dB."""
+    """Return the parts that can be dropped within `LOSS`, cheapest first, and the PSNR loss of each by its `id`, dB."""
     if evidence is None or not parts:
         return list(parts), {}
     losses = {id(part): evidence.loss(_with_parts(scene, [part])) for part in parts}
@@ -265,7 +265,7 @@ def _followed(scene: Scene, poses: np.ndarray) -> np.ndarray:
 
 
 def _future(poses: np.ndarray, parts: Sequence[_Part]) -> np.ndarray:
-    """Return the poses for the fit past t_max: relative to t_max, without noise even if the images need it. [S, 7]"""
+    """Return the poses for the fit past t_max, relative to t_max; noise is left out even if the images need it. [S, 7]"""
     result = poses.copy()
     for part in parts:
         if part.noise and part.name == "rotation":
@@ -332,7 +332,7 @@ def _row(part: _Part, dropped: bool, loss: float | None, future: str, travel: fl
     why = part.why
     if loss is not None:
         why += f"; without it the training views lose {loss:.3f} dB"
-        why += "" if dropped else f", more than the remaining share of {LOSS:g} dB; it ends at t_max"
+        why += "" if dropped else f", more than what remains of the allowed {LOSS:g} dB, so it is kept up to t_max"
     if part.kept:
         why = f"set on by the user; {why}"
     text = f"{_SPREADS[part.name]}: {why}"

@@ -52,7 +52,7 @@ def fixed(color: np.ndarray) -> Background:
 
 
 def learned(coefficients: np.ndarray, degree: int = sky.DEGREE) -> Background:
-    """Return a trained sky of a degree, initialised with given coefficients [Kb, 3] and zeros for the rest."""
+    """Return a sky of a given degree to be trained, initialised with coefficients [Kb, 3] and zeros for the rest."""
     start = torch.zeros((degree + 1) ** 2, 3)
     given = torch.from_numpy(np.asarray(coefficients, np.float32))[: len(start)]
     start[: len(given)] = given

@@ -58,7 +58,11 @@ class Curriculum:
         return min(most, 1 + (iteration - self._begin) * most // span)
 
     def draw(self, iteration: int, generator: torch.Generator) -> int:
-        """Return the view of a step: the next one in turn, or until all times have entered, often one of the newest."""
+        """Return the index of the view of a step.
+
+        Until all times have entered, it is drawn at random, often from the newest times; afterwards the views are taken
+        in shuffled order.
+        """
         if iteration >= self._full:
             if not self.queue:
                 self.queue = torch.randperm(len(self._view_times), generator=generator).tolist()

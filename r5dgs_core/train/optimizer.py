@@ -99,7 +99,7 @@ def check_finite(named: Mapping[str, Tensor], loss: float, place: str) -> None:
         largest = max(sizes, key=sizes.__getitem__)
         more = f" and {len(bad) - 4} more" if len(bad) > 4 else ""
         raise TrainingError(
-            f"{place}: {', '.join(bad[:4]) or 'loss'}{more} is not finite (largest finite value: "
+            f"{place}: not finite: {', '.join(bad[:4]) or 'loss'}{more} (largest finite value: "
             f"{sizes[largest]:.3g}, of {largest}); the last checkpoint is kept. "
             "Remedy: lower the learning rates (--set rates.means=5e-4) or look at that image and its camera"
         )

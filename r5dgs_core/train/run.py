@@ -195,7 +195,7 @@ def _plan(trainer: Trainer, progress: TimedProgress) -> None:
 
 
 def decision_step(trainer: Trainer) -> int | None:
-    """Return the step after which residuals are tried; None if never, as with a single observed time."""
+    """Return the step after which residuals are tried; None if they never are, such as with one observed time."""
     if not trainer.motion.takes_residuals or len(trainer.times) < 2:
         return None
     from . import residual_trial  # static scenes do not need it
@@ -289,7 +289,7 @@ def _save(
     bad = [name for name, tensor in values.items() if not tensor.isfinite().all()]
     if bad:
         raise TrainingError(
-            f"step {state.iteration}: {', '.join(bad)} is not finite; the last checkpoint is kept. "
+            f"step {state.iteration}: not finite: {', '.join(bad)}; the last checkpoint is kept. "
             "Remedy: lower the learning rates (rates.*)"
         )
     seconds = time.monotonic() - began

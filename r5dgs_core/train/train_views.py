@@ -51,7 +51,7 @@ def load(dataset: datasets.Dataset, normalization: Normalization, background: np
         DatasetError: There is no training view.
     """
     if not dataset.train:
-        raise DatasetError(f"{dataset.root}: transforms_train.json lists no frames; nothing to train on")
+        raise DatasetError(f"{dataset.root}: expected training views, found none")
     views = []
     for view in dataset.train:
         alpha = None

@@ -121,7 +121,7 @@ def extent_of(cameras: Sequence[Camera]) -> float:
 def grow(
     gaussians: Gaussians, optimizer: torch.optim.Optimizer, chosen: Tensor, split: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """Clone some Gaussians and split others; each adds one Gaussian once the split ones are removed.
+    """Clone some Gaussians and split others. After the caller removes the split ones, each has added one Gaussian.
 
     Args:
         gaussians: Changed in place, including optimizer state; new ones are appended and inherit the motion group.

@@ -33,7 +33,7 @@ NEIGHBOURS = 8
 OWN = 4.0  # weight of a Gaussian's own votes relative to its neighbourhood
 MOTION = 0.5  # weight of the group that it moves with relative to its neighbourhood
 DOUBT = 1.0  # votes with a trust of one half, pixels
-UNDECIDED = 0.55  # share of own label in the votes for it and the new one, above which an object's Gaussian keeps it
+UNDECIDED = 0.55  # an object's Gaussian keeps its label above this share of the votes for it and the new label
 UNDECIDED_BACKGROUND = 0.45  # the same for Gaussians of the background
 APART = 5.0  # maximum link between members of an object / their typical spacing
 SMALL = 0.05  # share of an object's total opacity above which a part is never an outlier
@@ -202,9 +202,10 @@ def companions(
 def _pull(
     labels: np.ndarray, going: np.ndarray | None, moving: np.ndarray | None, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the class that motion votes for and its weight.
+    """Return the class that the motion of each Gaussian votes for, and the weight of this vote.
 
-    The weight is 0 if the class is at rest; for class 0 (background), if the Gaussian's own class is at rest.
+    The weight is 0 if that class is at rest. A vote for class 0 (background) has weight 0 if the Gaussian's own class
+    is at rest.
     """
     if going is None or moving is None:
         return np.zeros(len(labels), np.int64), np.zeros(len(labels), np.float32)

@@ -21,7 +21,7 @@ from . import background_images, evidence, place_gaussians, plane_sweep, scatter
 log = logging.getLogger(__name__)
 
 MASKS = "Remedy: object_mask/train/IMAGE.png files"
-SAME_TIME = 0.1  # share of a camera's time step within which times are equal
+SAME_TIME = 0.1  # share of the cameras' median time step within which times are equal
 FEWEST_EYES = 3  # minimum number of cameras to place a scene from the images of one time
 SEEN_AT_ALL = 1e-3  # score of a time at which an object is located but not wholly visible in any view
 
@@ -75,7 +75,7 @@ class InitialState:
 def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
     """Return the knots of the tracks: the distinct observed times.
 
-    Times of slightly unsynchronised cameras, within a tenth of each camera's time step, share one knot. If more than
+    Times of slightly unsynchronised cameras, within a tenth of the cameras' median time step, share one knot. If more than
     ``limit`` knots remain, they are sampled evenly by index, so that knots are as dense as the images. The first and
     the last observed time are always knots.
     """
@@ -272,7 +272,10 @@ def _at_once(views: Sequence[TrainView], times: np.ndarray, knot: int) -> Sequen
 
 
 def _first_time(places: triangulation.ObjectPositions, count: int) -> int:
-    """Return the time at which most objects are well visible; of similar ones the middle one, to minimise drift."""
+    """Return the index of the time at which most objects are well visible.
+
+    Among similar times the middle one is taken, to minimise drift.
+    """
     if len(places.object_ids) == 0:
         return 0
     total = np.where(places.measured, places.visibility + SEEN_AT_ALL, 0.0).sum(0)
