@@ -150,8 +150,12 @@ LATE_IMPORTS = {
     "language.encoders.open_clip_encoder": {"data.images"},
     # A scene at rest loads neither tracks nor networks.
     "bake.point_motion": {"train.representations.residual"},
-    "train.representations.registry": {"train.representations.field", "train.representations.tracks"},
-    "train.representations.tracks": {"train.representations.field"},
+    "train.representations.registry": {
+        "train.representations.field_handover",
+        "train.representations.field",
+        "train.representations.tracks",
+    },
+    "train.representations.tracks": {"train.representations.field_handover", "train.representations.field"},
     "train.finish": {"train.object_discovery"},
     "train.run": {"train.object_discovery", "train.pose_repair", "train.residual_trial"},
 }

@@ -15,8 +15,7 @@ from ..config.config import Config
 from ..config.sections.needs import NeedsSection
 from ..data.dataset import Dataset
 from ..scene.scene import MotionGroup, Scene
-from ..train import checkpoint
-from ..train.identity import packed_masks
+from ..train import checkpoint, checkpoint_content
 from ..train.normalization import Normalization
 from ..train.observed_motion import ObservedMotion
 
@@ -58,7 +57,8 @@ class Context:
 
 def is_discovered(state: checkpoint.Checkpoint) -> bool:
     """Return True if the objects of a checkpoint were found by training."""
-    return packed_masks.NAME in state.tensors or packed_masks.LABELS in state.tensors
+    names = checkpoint_content.DISCOVERED_MASKS, checkpoint_content.DISCOVERED_LABELS
+    return any(name in state.tensors for name in names)
 
 
 @dataclass(frozen=True)

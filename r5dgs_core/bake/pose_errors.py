@@ -4,7 +4,7 @@ Notation: J is the derivative of a body's pixels with respect to its pose, r the
 view. S knots, P values of pixels. A change of a pose is a rotation vector in world axes, and a displacement in radii of
 the body.
 
-The pose of least misfit has the covariance (J^T J)^-1 (sum g g^T) (J^T J)^-1, with the sum over views instead of pixels,
+The pose of least misfit has the covariance (J^T J)^-1 (sum g g^T) (J^T J)^-1. The sum is over views instead of pixels,
 because the misfits of trained Gaussians are correlated over a view. The ratio to the covariance for independent pixels
 is pooled over the knots of a body, because single knots have few views. A track also drifts together with the texture
 that is trained with it; `FACTORS` are measured ratios of true errors to these deviations. If the misfit is as large as
@@ -131,7 +131,7 @@ def _look(
     truth: np.ndarray,
     mine: np.ndarray,
 ) -> _Look:
-    """Compare a body's pixels in a view with pictures of the scene in the observed poses (first) and in changed ones."""
+    """Compare a body's pixels in a view with pictures of the scene: in the observed poses (first), and in others."""
     region = ndimage.binary_dilation(mine, iterations=MARGIN)
     rows, columns = ndimage.find_objects(region.astype(np.int8))[0]
     intrinsics = view.camera.intrinsics.copy()

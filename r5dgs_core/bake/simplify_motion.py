@@ -49,8 +49,8 @@ class _Part:
 
     Attributes:
         group: Group of the body.
-        name: Row of the needs table that it decides: "rotation" (without: the body does not turn), "motion" (without: it
-            stays in its place) or "curved_path" (without: its path is straight).
+        name: Row of the needs table that it decides: "rotation" (off: the body does not turn), "motion" (off: it
+            stays in its place) or "curved_path" (off: its path is straight).
         poses: Simplified poses of the body. [S, 7]
         spread: Root mean square per component of the dropped motion, rad or world units.
         value: Spread in rad or diameters.
@@ -265,7 +265,7 @@ def _followed(scene: Scene, poses: np.ndarray) -> np.ndarray:
 
 
 def _future(poses: np.ndarray, parts: Sequence[_Part]) -> np.ndarray:
-    """Return the poses for the fit past t_max, relative to t_max; noise is left out even if the images need it. [S, 7]"""
+    """Return the poses for the fit past t_max, relative to t_max; without noise, even if the images need it. [S, 7]"""
     result = poses.copy()
     for part in parts:
         if part.noise and part.name == "rotation":

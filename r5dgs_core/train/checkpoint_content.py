@@ -14,6 +14,9 @@ from ..model.gaussians import PARAMETERS
 
 FORMAT_VERSION = 1
 RESIDUAL_GAINS = "residual.gains"  # name of a tensor that may contain nan (unknown gains)
+FROZEN = "held"  # name of a tensor: mask of the Gaussians whose centres are frozen
+DISCOVERED_MASKS = "discovery.masks"  # name of a tensor: packed masks of the training views
+DISCOVERED_LABELS = "discovery.labels"  # name of a tensor: labels that were found after the run instead of masks
 TRAIN_PSNR = "train_psnr"  # name of a tensor: `probe.training_psnr` of a finished run, dB
 TENSORS = (*(f"gaussians.{name}" for name in (*PARAMETERS, "motion_ids")), "object_ids", "background", "generator")
 
@@ -31,7 +34,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "gaussians.shading": ("N", 3),
     "gaussians.identities": ("N", "D"),
     "gaussians.motion_ids": ("N",),
-    "held": ("N",),
+    FROZEN: ("N",),
     "object_ids": ("B",),
     "background": ("Kb", 3),
     "generator": ("bytes",),
@@ -117,9 +120,9 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
             expected = ", ".join(f"{x} = {lengths[x]}" if x in lengths else str(x) for x in map(str, shape))
             raise CheckpointError(f"'{name}': expected shape [{expected}], found {list(found)}")
         wrong = (name in _WHOLE_NUMBERS) != (tensor.dtype in _WHOLE) and name != "generator"
-        if wrong or (name == "held" and tensor.dtype != torch.bool):
+        if wrong or (name == FROZEN and tensor.dtype != torch.bool):
             raise CheckpointError(f"'{name}': expected another type of number than {tensor.dtype}")
-    if len(tensors["observed"]) != max(0, lengths["B"] - 1) and "discovery.labels" not in tensors:
+    if len(tensors["observed"]) != max(0, lengths["B"] - 1) and DISCOVERED_LABELS not in tensors:
         raise CheckpointError(f"'observed': expected {lengths['B'] - 1} rows, found {len(tensors['observed'])}")
 
 

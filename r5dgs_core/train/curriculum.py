@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -34,15 +33,16 @@ class Curriculum:
         self._last = knots - 1
         self._first = first
 
-    def grow(self, iteration: int) -> Iterator[tuple[int, int, tuple[int, int]]]:
-        """Yield each knot that enters at a step, the direction of its neighbours, and the knots entered before it."""
-        reach = self._reach(iteration)
+    def grow(self, iteration: int) -> list[tuple[int, int, tuple[int, int]]]:
+        """Add the knots that enter at a step; return each, the direction of its neighbours, and the range before it."""
+        reach, found = self._reach(iteration), []
         while self.entered[0] > max(0, self._first - reach):
-            yield self.entered[0] - 1, +1, self.entered
+            found.append((self.entered[0] - 1, +1, self.entered))
             self.entered = (self.entered[0] - 1, self.entered[1])
         while self.entered[1] < min(self._last, self._first + reach):
-            yield self.entered[1] + 1, -1, self.entered
+            found.append((self.entered[1] + 1, -1, self.entered))
             self.entered = (self.entered[0], self.entered[1] + 1)
+        return found
 
     def _reach(self, iteration: int) -> int:
         """Return the distance from the first knot up to which knots take part."""

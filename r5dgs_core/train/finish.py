@@ -12,7 +12,7 @@ import torch
 from ..config import training_needs
 from ..scene.splats import to_opacities
 from . import checkpoint_content, probe
-from .identity import identity_training, label_cleanup, label_votes, packed_masks
+from .identity import identity_training, label_cleanup, label_votes
 from .representations.fused_posing import PosedSplats
 from .train_views import TrainView
 from .trainer import Trainer
@@ -77,7 +77,7 @@ def outcome(trainer: Trainer, progress: Progress) -> dict[str, torch.Tensor]:
         labels = torch.from_numpy(object_discovery.sort(trainer) + 1)
         count = int(labels.max())
         progress({"event": "prepare", "text": f"no masks: {count} moving part{'s' * (count != 1)} found"})
-        extra |= {"labels": labels, "object_ids": torch.arange(count + 1), packed_masks.LABELS: labels}
+        extra |= {"labels": labels, "object_ids": torch.arange(count + 1), checkpoint_content.DISCOVERED_LABELS: labels}
     with torch.no_grad():
         shown = probe.training_psnr(
             trainer.dataset,

@@ -23,6 +23,7 @@ from ..motion import rotations
 from ..raster import rasterize_splats
 from ..scene import visibility
 from . import motion_clusters
+from .identity import packed_masks
 from .representations import gating
 from .representations.field import FieldRepresentation
 from .representations.fused_posing import PosedSplats
@@ -35,7 +36,6 @@ JUDGES = 20  # number of views that decide if a part is needed
 GAIN = 2.0  # minimum gain in PSNR by the motion of a part, dB
 TOLERANCE = 0.02  # residual allowed for points that hardly move, normalised units
 SPECK = 0.1  # minimum size of a piece of a mask / size of its largest piece
-NAME = "discovery"  # name of the progress events
 CAP = 12000  # maximum number of Gaussians in the short run
 
 
@@ -67,7 +67,7 @@ def find(
         trainer.step()
         if trainer.iteration % config.train.log_every == 0 or trainer.done:
             total = trainer.config.train.iterations
-            progress({"event": NAME, "done": trainer.iteration, "total": total, "unit": "steps"})
+            progress({"event": packed_masks.PHASE, "done": trainer.iteration, "total": total, "unit": "steps"})
     labels = parts(trainer, config)
     count = int(labels.max(initial=-1)) + 1
     progress({"event": "prepare", "text": f"no masks: {count} moving part{'s' * (count != 1)} found"})

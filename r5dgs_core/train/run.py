@@ -8,6 +8,7 @@ import logging
 import shlex
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -66,61 +67,73 @@ def train(
         TrainingError: A value is no longer finite, or no Gaussians are left.
         Interrupted: SIGINT or SIGTERM was received; the run can be resumed.
     """
-    folder = Path(folder)
+    request = _Request(dataset_root, Path(folder), config, resume, overwrite, resume_command)
     with contextlib.ExitStack() as stack:
 
         def claim() -> None:
-            if stack.enter_context(folder_lock.hold(folder)):  # no other process is writing to these files
-                checkpoint.remove_leftovers(folder)
+            if stack.enter_context(folder_lock.hold(request.folder)):  # no other process is writing to these files
+                checkpoint.remove_leftovers(request.folder)
 
         timed = progress if isinstance(progress, TimedProgress) else TimedProgress(progress or (lambda event: None))
-        return _train(dataset_root, folder, config, resume, overwrite, resume_command, timed, claim)
+        return _train(request, timed, claim)
 
 
-def _train(
-    dataset_root: Path,
-    folder: Path,
-    config: Config,
-    resume: bool,
-    overwrite: bool,
-    resume_command: str | None,
-    progress: TimedProgress,
-    claim: Callable[[], None],
-) -> checkpoint.Run:
+@dataclass(frozen=True)
+class _Request:
+    """Arguments of `train`."""
+
+    dataset_root: Path
+    folder: Path
+    config: Config
+    resume: bool
+    overwrite: bool
+    resume_command: str | None
+
+
+@dataclass(frozen=True)
+class _Session:
+    """A run that this process trains.
+
+    Attributes:
+        run: The run folder.
+        trainer: Its trainer.
+        began: Reading of the wall clock at the start of training, minus the time of earlier sessions, s.
+        began_cpu: The same for the processor clock; None if the log of an older version has no processor time.
+        resume_command: Command that resumes the run, for messages.
+        progress: Called with a dictionary per event.
+        probe: Probe of the held-out views, or None.
+        curves: Plot of the log.
+    """
+
+    run: checkpoint.Run
+    trainer: Trainer
+    began: float
+    began_cpu: float | None
+    resume_command: str
+    progress: TimedProgress
+    probe: probe.Probe | None
+    curves: learning_curves.LearningCurves
+
+
+def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]) -> checkpoint.Run:
     """Implementation of `train`; ``claim`` locks the folder."""
-    is_new = not folder.is_dir()
-    if not is_new:
-        claim()
-    if resume and not (folder / checkpoint.RUN_FILE).exists():
-        log.warning("%s: no run to resume; starting a new one", folder)
-        resume = False
-    if not resume and not overwrite:
-        checkpoint.refuse_to_lose(folder)
-    settled = checkpoint.open_run(folder).config if resume else config
-    dataset = datasets.read(dataset_root, settled.data.masks, settled.data.min_registered)
-    dataset.require_one_numbering()
-    if is_new:  # created only now, so that an unreadable data set leaves no folder
-        checkpoint.plan_run(folder, dataset, config)
-        claim()
-        if not overwrite:
-            checkpoint.refuse_to_lose(folder)  # another process may have created a run meanwhile
+    request, dataset = _prepare(request, claim)
+    folder, resume_command = request.folder, request.resume_command
     if resume_command is None:
         root = str(Path(dataset.root).resolve())
         resume_command = shlex.join(["r5dgs", "train", root, "--out", str(folder), "--resume"])
-    run, state, replaces = _open(folder, dataset, dataset_root, config, resume)
-    iterations = run.config.train.iterations
+    run, state, replaces = _open(request, dataset)
     done = 0 if state is None else state.iteration
-    progress({"event": "start", "iterations": iterations, "from": done, "dataset": str(dataset_root)})
+    start = {"event": "start", "iterations": run.config.train.iterations, "from": done}
+    progress({**start, "dataset": str(request.dataset_root)})
     began, began_cpu = time.monotonic(), time.process_time()
     if state is not None and state.finished:
         count = len(state.tensors["gaussians.means"])
         progress({"event": "trained", "gaussians": count, "text": "already finished"})
         return run
-    kept = (
-        f"{folder} is unchanged; repeat the same command to start again"
-        if replaces
-        else f"continue with: {resume_command}"
-    )
+    kept = f"continue with: {resume_command}"
+    if replaces:
+        kept = f"{folder} is unchanged; repeat the same command to start again"
     with interrupt.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
         progress({"event": "prepare", "text": "kernels"})
         warm_up.warm_up()
@@ -129,36 +142,57 @@ def _train(
         trainer = Trainer(dataset, run.config, found)
         probe = _probe(trainer)
     if replaces:
-        run = checkpoint.create_run(folder, dataset, config)
+        run = checkpoint.create_run(folder, dataset, request.config)
     if state is not None:
         trainer.restore(state)
         began -= state.seconds
     step_log.clean_up(folder / checkpoint.LOG_FILE, trainer.iteration)
     began_cpu = step_log.processor_start(folder / checkpoint.LOG_FILE, began_cpu)
-    pictures = learning_curves.LearningCurves(run.folder)
+    curves = learning_curves.LearningCurves(run.folder)
     _plan(trainer, progress)
-    _optimise(trainer, run, began, began_cpu, resume_command, progress, probe, pictures)
-    with interrupt.at_once(f"stopped after the last step, before the labels; continue with: {resume_command}"):
-        _save(trainer, run, began, finished=True, extra=finish.outcome(trainer, progress))
-        pictures.update(finished=True)
-    progress({"event": "trained", "gaussians": len(trainer.gaussians)})
+    _complete(_Session(run, trainer, began, began_cpu, resume_command, progress, probe, curves))
     return run
 
 
-def _open(
-    folder: Path, dataset: datasets.Dataset, dataset_root: Path, config: Config, resume: bool
-) -> tuple[checkpoint.Run, checkpoint.Checkpoint | None, bool]:
+def _prepare(request: _Request, claim: Callable[[], None]) -> tuple[_Request, datasets.Dataset]:
+    """Lock the folder and read the data set; return the request, without ``resume`` if there is no run to resume."""
+    folder = request.folder
+    is_new = not folder.is_dir()
+    if not is_new:
+        claim()
+    if request.resume and not (folder / checkpoint.RUN_FILE).exists():
+        log.warning("%s: no run to resume; starting a new one", folder)
+        request = dataclasses.replace(request, resume=False)
+    if not request.resume and not request.overwrite:
+        checkpoint.refuse_to_lose(folder)
+    settled = checkpoint.open_run(folder).config if request.resume else request.config
+    dataset = datasets.read(request.dataset_root, settled.data.masks, settled.data.min_registered)
+    dataset.require_one_numbering()
+    if is_new:  # created only now, so that an unreadable data set leaves no folder
+        checkpoint.plan_run(folder, dataset, request.config)
+        claim()
+        if not request.overwrite:
+            checkpoint.refuse_to_lose(folder)  # another process may have created a run meanwhile
+    return request, dataset
+
+
+def _open(request: _Request, dataset: datasets.Dataset) -> tuple[checkpoint.Run, checkpoint.Checkpoint | None, bool]:
     """Return the run, its last state or None, and True if the files of an earlier run are still to be replaced."""
-    if not resume:
+    folder = request.folder
+    if not request.resume:
         replaces = checkpoint.newest_file(folder) is not None
-        return (checkpoint.plan_run if replaces else checkpoint.create_run)(folder, dataset, config), None, replaces
+        return (
+            (checkpoint.plan_run if replaces else checkpoint.create_run)(folder, dataset, request.config),
+            None,
+            replaces,
+        )
     run = checkpoint.open_run(folder)
     state = None if checkpoint.newest_file(folder) is None else checkpoint.load(folder, mend=True)
     if run.digest != dataset.digest and state is None:  # no step has used the other data yet
         run = checkpoint.create_run(folder, dataset, run.config)
     if run.digest != dataset.digest:
         raise CheckpointError(
-            f"{folder}: was trained on other data than {dataset_root} now holds; "
+            f"{folder}: was trained on other data than {request.dataset_root} now holds; "
             "restore the data set or train into another folder"
         )
     return run, state, False
@@ -173,17 +207,18 @@ def _found_masks(
             return None
         from . import object_discovery  # imported late: it loads the networks of the field
 
-        progress.estimate.add(Phase(object_discovery.NAME, config.discovery.iterations, DISCOVERY_COST))
+        progress.estimate.add(Phase(packed_masks.PHASE, config.discovery.iterations, DISCOVERY_COST))
         progress.estimate.add(Phase("step", config.train.iterations))
         return object_discovery.find(dataset, config, progress)
+    packed = state.tensors.get(checkpoint_content.DISCOVERED_MASKS)
     sizes = [(view.camera.height, view.camera.width) for view in dataset.train]
-    return packed_masks.unpack(state.tensors[packed_masks.NAME], sizes) if packed_masks.NAME in state.tensors else None
+    return None if packed is None else packed_masks.unpack(packed, sizes)
 
 
 def _plan(trainer: Trainer, progress: TimedProgress) -> None:
     """Add the remaining phases of training to the estimate of the time left."""
     config, estimate = trainer.config, progress.estimate
-    estimate.finish("discovery")  # `object_discovery.NAME`, without importing its networks
+    estimate.finish(packed_masks.PHASE)
     estimate.add(Phase("step", config.train.iterations))
     estimate.at("step", trainer.iteration)
     decision = decision_step(trainer)
@@ -205,7 +240,7 @@ def decision_step(trainer: Trainer) -> int | None:
 
 
 def take_step(trainer: Trainer, decision: int | None, progress: Progress) -> None:
-    """Take a step; then repair poses or, after the step ``decision`` (see `decision_step`), try residuals if due."""
+    """Take a step, then repair poses if due; after the step ``decision`` (see `decision_step`), try residuals."""
     entered = trainer.curriculum.entered
     trainer.step()
     if trainer.motion.name == TRACKS:
@@ -226,26 +261,25 @@ def _probe(trainer: Trainer) -> probe.Probe | None:
     return probe.Probe(trainer, section.probe_views)
 
 
-def _optimise(
-    trainer: Trainer,
-    run: checkpoint.Run,
-    began: float,
-    began_cpu: float | None,
-    resume_command: str,
-    progress: TimedProgress,
-    probe: probe.Probe | None,
-    pictures: learning_curves.LearningCurves,
-) -> None:
-    """Take the remaining steps, and write the log and checkpoints.
+def _complete(session: _Session) -> None:
+    """Take the remaining steps, and store the final state with labels and identities."""
+    trainer = session.trainer
+    _optimise(session)
+    stopped = "stopped after the last step, before the labels"
+    with interrupt.at_once(f"{stopped}; continue with: {session.resume_command}"):
+        _save(session, finished=True, extra=finish.outcome(trainer, session.progress))
+        session.curves.update(finished=True)
+    session.progress({"event": "trained", "gaussians": len(trainer.gaussians)})
 
-    ``began`` and ``began_cpu`` are the readings of the wall and the processor clock at the start of training, minus the
-    time of earlier sessions. The log of an older version has no processor time, so ``began_cpu`` is None.
-    """
+
+def _optimise(session: _Session) -> None:
+    """Take the remaining steps, and write the log and checkpoints."""
+    trainer, probe = session.trainer, session.probe
     section = trainer.config.train
     decision = decision_step(trainer)
-    with interrupt.collected() as asked, step_log.StepLog(run.folder / checkpoint.LOG_FILE) as steps:
+    with interrupt.collected() as asked, step_log.StepLog(session.run.folder / checkpoint.LOG_FILE) as steps:
         while not trainer.done:
-            take_step(trainer, decision, progress)
+            take_step(trainer, decision, session.progress)
             look = probe is not None and (trainer.done or trainer.iteration % section.probe_every == 0)
             if trainer.iteration % section.log_every == 0 or trainer.done or look:
                 event = {
@@ -253,34 +287,29 @@ def _optimise(
                     "iteration": trainer.iteration,
                     "loss": trainer.running_loss,
                     "gaussians": len(trainer.gaussians),
-                    "seconds": time.monotonic() - began,
+                    "seconds": time.monotonic() - session.began,
                 }
-                if began_cpu is not None:
-                    event["cpu_seconds"] = time.process_time() - began_cpu
-                event = progress.timed(event)
+                if session.began_cpu is not None:
+                    event["cpu_seconds"] = time.process_time() - session.began_cpu
+                event = session.progress.timed(event)
                 if look and probe is not None:
                     event["val_psnr"] = probe.psnr()
                 steps.append(event)
-                progress(event)
+                session.progress(event)
             stop = bool(asked)
             if trainer.iteration % section.checkpoint_every == 0 or stop or trainer.done:
-                _save(trainer, run, began, finished=False)
-                pictures.update()
+                _save(session, finished=False)
+                session.curves.update()
             if stop:
-                raise Interrupted(f"stopped at step {trainer.iteration}; continue with: {resume_command}")
+                raise Interrupted(f"stopped at step {trainer.iteration}; continue with: {session.resume_command}")
 
 
-def _save(
-    trainer: Trainer,
-    run: checkpoint.Run,
-    began: float,
-    *,
-    finished: bool,
-    extra: dict[str, torch.Tensor] | None = None,
-) -> None:
+def _save(session: _Session, *, finished: bool, extra: dict[str, torch.Tensor] | None = None) -> None:
+    """Write a checkpoint of the current state, with ``extra`` tensors."""
+    trainer = session.trainer
     state = trainer.state()
     tensors = {**state.tensors, **(extra or {})}
-    if packed_masks.LABELS in tensors:  # objects found after the run count as observed at all times
+    if checkpoint_content.DISCOVERED_LABELS in tensors:  # objects found after the run count as observed at all times
         shape = len(tensors["object_ids"]) - 1, len(trainer.times)
         state = dataclasses.replace(state, observed=torch.ones(shape, dtype=torch.bool))
     values = {
@@ -292,5 +321,5 @@ def _save(
             f"step {state.iteration}: not finite: {', '.join(bad)}; the last checkpoint is kept. "
             "Remedy: lower the learning rates (rates.*)"
         )
-    seconds = time.monotonic() - began
-    checkpoint.save(run.folder, dataclasses.replace(state, tensors=tensors, finished=finished, seconds=seconds))
+    seconds = time.monotonic() - session.began
+    checkpoint.save(session.run.folder, dataclasses.replace(state, tensors=tensors, finished=finished, seconds=seconds))

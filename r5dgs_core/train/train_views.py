@@ -91,12 +91,12 @@ def nearest_knot(times: np.ndarray, t: float) -> int:
     return int(np.argmin(np.abs(times - t)))
 
 
-def by_camera(views: Sequence[TrainView], limit: int) -> list[list[TrainView]]:
+def by_camera(views: Sequence[TrainView], limit: int | None = None) -> list[list[TrainView]]:
     """Group views by camera (pose, lens and size); ``limit`` cameras spread evenly if there are more."""
     groups: dict[bytes, list[TrainView]] = {}
     for view in views:
         groups.setdefault(camera_key(view.camera), []).append(view)
-    return spread(list(groups.values()), limit)
+    return spread(list(groups.values()), len(groups) if limit is None else limit)
 
 
 def camera_key(camera: Camera) -> bytes:

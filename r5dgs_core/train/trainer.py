@@ -7,8 +7,6 @@ depends on, so a resumed run gives the same numbers as an uninterrupted one.
 
 from __future__ import annotations
 
-import dataclasses
-import logging
 import math
 from collections.abc import Sequence
 
@@ -19,27 +17,23 @@ from torch import Tensor
 from ..config import training_needs
 from ..config.config import Config
 from ..data.dataset import Dataset
-from ..errors import CheckpointError, DatasetError, TrainingError
+from ..errors import CheckpointError, TrainingError
 from ..model.gaussians import Gaussians
 from ..raster import RasterStats, rasterize_splats
-from ..scene import spherical_harmonics
 from ..scene.cameras import Camera
 from . import background as backgrounds
-from . import curriculum, losses, normalization, train_views
+from . import checkpoint_content, curriculum, losses, normalization, train_views
 from . import optimizer as optimizers
 from .checkpoint import Checkpoint
-from .densification import densifier, gradient
+from .densification import densifier
+from .densification import registry as densification
 from .identity import joint_identity, packed_masks
-from .initialization import initialize, sky, thinning
+from .initialization import run_start
 from .representations import fused_posing, registry, static
-from .representations.representation import Representation
-
-log = logging.getLogger(__name__)
 
 TARGET_BYTES = 1 << 30  # maximum size of the cache of training images as floats
 EYES = 256  # maximum number of cameras in tests of visibility
 HOLD_EVERY = 100  # steps between updates of the held Gaussians
-HELD = "held"  # name of a tensor of the state: mask of the Gaussians whose centres are frozen
 
 
 class Trainer:
@@ -71,14 +65,14 @@ class Trainer:
         motion = registry.configured(config, still=static.applies(self.views, config))
         if not motion.moves:
             self.config = config = config.replace(**{"train.shading": False, "train.shadows": False})
-        start = self._start(shown, motion)
+        start = run_start.initial_state(shown, self.normalization, dataset, config, motion, found is not None)
         self.gaussians: Gaussians = start.gaussians
         self.motion = registry.make(motion, start, config)
         self.times = start.tracks.times
         self.object_ids = start.object_ids
         self.places = start.places
         self.first_time = start.first_time
-        self.background = self._background(start.sky)
+        self.background = run_start.background(self.views, self.behind, start.sky, config)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         classes = {int(object_id): row for row, object_id in enumerate(self.object_ids)}
         self.identity = joint_identity.joint(self.views, classes, config)
@@ -91,61 +85,14 @@ class Trainer:
         self.curriculum = curriculum.Curriculum(config, view_times, len(self.times), self.first_time)
         self.eyes = [group[0].camera for group in train_views.by_camera(self.views, EYES)]
         self.held = torch.zeros(0, dtype=torch.bool)
-        self.optimizer = self._make_optimizer()
-        self.growth = gradient.make(config, self._conditions(), len(self.gaussians))
+        self.optimizer = self.make_optimizer()
+        self.growth = densification.make(config, self._conditions(), len(self.gaussians))
         self._targets: dict[int, Tensor] = {}
 
-    def _start(self, views: Sequence[train_views.TrainView], motion: type[Representation]) -> initialize.InitialState:
-        """Return the initial state. Raises DatasetError if no Gaussian can be placed."""
-        config, dataset = self.config, self.dataset
-        rng = np.random.default_rng(config.train.seed)
-        start = initialize.start(views, config, motion, self.behind is None, rng, self._cloud())
-        if len(start.gaussians) == 0:
-            raise DatasetError(
-                f"{dataset.root}: no Gaussian can be placed: no mask shows an object, and the background is all sky "
-                "or visible to only one camera. Remedy: add masks or cameras"
-            )
-        missing = sorted(set(dataset.object_names) - {int(i) for i in start.object_ids} - {0, -1})
-        if missing and len(start.object_ids) > 1 and self.found is None:
-            named = ", ".join(f"{i} ({dataset.object_names[i]})" for i in missing)
-            log.warning("no training mask shows object %s: left out. Remedy: check the ids in objects.json", named)
-        most = config.densify.max_gaussians
-        return dataclasses.replace(start, gaussians=thinning.thin(start.gaussians, most, rng)) if most else start
-
-    def _background(self, found: np.ndarray | None) -> backgrounds.Background:
-        """Return the fixed background of the images, or one that is learned from the sky that was found."""
-        if self.behind is not None:
-            return backgrounds.fixed(self.behind)
-        degree = 0 if self.config.needs.sky_gradient == "off" else sky.DEGREE
-        return backgrounds.learned(found if found is not None else self._mean_color(), degree)
-
     def _conditions(self) -> densifier.Conditions:
-        """Return the properties of the run that densification depends on."""
-        sizes = [v.camera.width * v.camera.height for v in self.views]
-        most = self.config.densify.max_gaussians
-        focal = float(np.median([v.camera.intrinsics[0, 0] for v in self.views]))
-        return densifier.Conditions(
-            cap=most or max(len(self.gaussians), int(min(60000, 0.75 * np.median(sizes)))),
-            iterations=self.config.train.iterations,
-            pixel_size=normalization.TARGET_DISTANCE / focal,
-            image_width=float(np.median([v.camera.width for v in self.views])),
-            extent=densifier.extent_of(self.eyes),
-            eyes=self.eyes,
-            generator=self.generator,
-            white=self.behind is not None and bool((self.behind == 1).all()),
-        )
-
-    def _cloud(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return points (normalised coordinates) and colours of the data set's reconstruction; None if it has none."""
-        points, colors = self.dataset.points, self.dataset.point_colors
-        if points is None or colors is None or len(points) == 0:
-            return None
-        return (points - self.normalization.origin) / self.normalization.scale, colors
-
-    def _mean_color(self) -> np.ndarray:
-        """Coefficients of the median colour of all pixels, for scenes in which no sky was found. [1, 3]"""
-        color = np.median([np.median(v.image.reshape(-1, 3), axis=0) for v in self.views], axis=0) / 255
-        return spherical_harmonics.rgb_to_dc(color)[None]
+        white = self.behind is not None and bool((self.behind == 1).all())
+        cameras = [view.camera for view in self.views]
+        return densifier.conditions(self.config, cameras, self.eyes, len(self.gaussians), self.generator, white)
 
     @property
     def params(self) -> dict[str, Tensor]:
@@ -156,7 +103,8 @@ class Trainer:
         classifier = {} if self.identity is None else self.identity.params
         return {**self.motion.params, **self.background.params, **classifier}
 
-    def _make_optimizer(self) -> torch.optim.Adam:
+    def make_optimizer(self) -> torch.optim.Adam:
+        """Return an optimizer of all current parameters, without state."""
         return optimizers.make(self.gaussians.params, self._others(), self.rates)
 
     @property
@@ -175,7 +123,7 @@ class Trainer:
         motion = self.motion.before_step(self.gaussians, self.iteration, self.generator)
         if motion is not self.motion:
             self.motion = motion
-            self.optimizer = self._make_optimizer()
+            self.optimizer = self.make_optimizer()
         for knot, towards, entered in self.curriculum.grow(self.iteration):
             self.motion.enter(knot, towards, entered)
         index = self.curriculum.draw(self.iteration, self.generator)
@@ -298,12 +246,12 @@ class Trainer:
         if self.identity is not None:
             tensors |= self.identity.tensors(self.gaussians)
         if self.found is not None:
-            tensors[packed_masks.NAME] = self.found
+            tensors[checkpoint_content.DISCOVERED_MASKS] = self.found
         tensors["background"] = self.background.params["background"].detach()
         tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
         tensors["generator"] = self.generator.get_state()
         if len(self.held) == len(self.gaussians):
-            tensors[HELD] = self.held
+            tensors[checkpoint_content.FROZEN] = self.held
         tensors |= self.growth.tensors()
         tensors |= optimizers.tensors(self.optimizer)
         x, y, z = (float(v) for v in self.dataset.origin + self.normalization.origin)
@@ -339,8 +287,8 @@ class Trainer:
         if any(len(t) != len(self.gaussians) for n, t in tensors.items() if n.startswith("gradients.")):
             raise CheckpointError(f"the checkpoint's 'gradients.*': expected {len(self.gaussians)} rows each")
         self.growth.restore(tensors)
-        self.held = tensors.get(HELD, torch.zeros(0, dtype=torch.bool))
-        self.optimizer = self._make_optimizer()
+        self.held = tensors.get(checkpoint_content.FROZEN, torch.zeros(0, dtype=torch.bool))
+        self.optimizer = self.make_optimizer()
         optimizers.restore(self.optimizer, tensors)
         self.iteration = state.iteration
         self.curriculum.entered = state.entered

@@ -12,13 +12,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ...config.config import Config
 from ...model.gaussians import Gaussians
 from ...motion import rotations
 from ...raster import RasterStats
 from ...scene.cameras import Camera
+from ..normalization import TARGET_DISTANCE
 
 SPLIT_SHRINK = 1.6  # the two halves of a split Gaussian are smaller by this factor (0.8 N of 3DGS, N = 2)
 
@@ -46,6 +49,38 @@ class Conditions:
     eyes: Sequence[Camera]
     generator: torch.Generator
     white: bool = False
+
+
+def conditions(
+    config: Config,
+    cameras: Sequence[Camera],
+    distinct: Sequence[Camera],
+    count: int,
+    generator: torch.Generator,
+    white: bool,
+) -> Conditions:
+    """Return the properties of a run.
+
+    Args:
+        config: Its configuration.
+        cameras: Camera of each training view, in normalised coordinates.
+        distinct: Distinct ones of these.
+        count: Initial number of Gaussians.
+        generator: Its random generator.
+        white: True if its background is fixed to white.
+    """
+    sizes = [camera.width * camera.height for camera in cameras]
+    focal = float(np.median([camera.intrinsics[0, 0] for camera in cameras]))
+    return Conditions(
+        cap=config.densify.max_gaussians or max(count, int(min(60000, 0.75 * np.median(sizes)))),
+        iterations=config.train.iterations,
+        pixel_size=TARGET_DISTANCE / focal,
+        image_width=float(np.median([camera.width for camera in cameras])),
+        extent=extent_of(distinct),
+        eyes=distinct,
+        generator=generator,
+        white=white,
+    )
 
 
 class Strategy(Protocol):

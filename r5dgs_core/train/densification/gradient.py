@@ -1,4 +1,4 @@
-"""Densification by screen-space gradients: `Share` and `Adaptive` (3DGS). Factory of all strategies.
+"""Densification by screen-space gradients: `Share` and `Adaptive` (3DGS).
 
 Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5.2.
 """
@@ -10,12 +10,11 @@ import math
 import torch
 from torch import Tensor
 
-from ...config.config import Config
 from ...config.sections.densification import DensifyDefaultSection, DensifySection
 from ...model.gaussians import Gaussians
 from ...raster import RasterStats
 from ...scene.cameras import Camera
-from . import densifier, mcmc
+from . import densifier
 from .densifier import Conditions, ScreenGradients
 
 
@@ -156,18 +155,3 @@ class Adaptive(_Gradients):
         limit = self.section.reset_opacity
         gaussians.params["opacity_logits"].clamp_(max=math.log(limit / (1 - limit)))
         densifier.forget(gaussians, optimizer, ("opacity_logits",), None)
-
-
-def make(config: Config, conditions: Conditions, count: int) -> densifier.Strategy:
-    """Create the strategy that the configuration selects.
-
-    Args:
-        config: The run's configuration.
-        conditions: Properties of the run.
-        count: Initial number of Gaussians.
-    """
-    if config.densify.strategy == "mcmc":
-        return mcmc.MCMC(config.densify_mcmc, conditions)
-    if config.densify.strategy == "default":
-        return Adaptive(config.densify_default, conditions, count)
-    return Share(config.densify, conditions, count)

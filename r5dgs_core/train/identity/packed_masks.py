@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ...errors import CheckpointError
+from ..checkpoint_content import DISCOVERED_MASKS
 
-NAME = "discovery.masks"  # name of the tensor in a checkpoint
-LABELS = "discovery.labels"  # name of the tensor of labels that were found after the run instead
+PHASE = "discovery"  # event and phase of the discovery in the progress
 
 
 def pack(masks: Sequence[np.ndarray]) -> Tensor:
@@ -42,10 +42,10 @@ def unpack(packed: Tensor, sizes: Sequence[tuple[int, int]]) -> list[np.ndarray]
         if not inflate.eof and not inflate.unconsumed_tail:
             raise ValueError("incomplete")
     except (zlib.error, ValueError) as error:
-        raise CheckpointError(f"'{NAME}': damaged ({error}); train again with --overwrite") from None
+        raise CheckpointError(f"'{DISCOVERED_MASKS}': damaged ({error}); train again with --overwrite") from None
     if len(values) != ends[-1]:
         raise CheckpointError(
-            f"'{NAME}': expected {ends[-1]} pixels, found {len(values)}; train again with --overwrite"
+            f"'{DISCOVERED_MASKS}': expected {ends[-1]} pixels, found {len(values)}; train again with --overwrite"
         )
     kind = np.uint8 if values.max(initial=0) < 256 else np.uint16
     values = values.astype(kind)

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from ...data import masks
 from ...scene import cameras
-from ..train_views import TrainView, camera_key, nearest_knot, spread
+from ..train_views import TrainView, by_camera, nearest_knot, spread
 from .triangulation import ObjectPositions
 
 TEXTURE = 0.1  # change of colour per radian (root mean square) that makes rotation observable
@@ -137,11 +137,8 @@ def absent(views: Sequence[TrainView], places: ObjectPositions, times: np.ndarra
     votes = np.zeros(places.measured.shape)
     asked = np.zeros(places.measured.shape)
     colors = _usual_colors(views, places)
-    of_camera: dict[bytes, list[tuple[int, TrainView]]] = {}
-    for view in views:
-        if view.mask is not None:
-            of_camera.setdefault(camera_key(view.camera), []).append((nearest_knot(times, view.t), view))
-    for frames in of_camera.values():
+    for group in by_camera([view for view in views if view.mask is not None]):
+        frames = [(nearest_knot(times, view.t), view) for view in group]
         for s, view in frames:
             for row in np.flatnonzero(places.evidence[:, s] == 0):
                 columns, rows = _disc(view, places.centers[row, s], float(places.radii[row]))

@@ -15,7 +15,7 @@ from ...config.config import Config
 from ...config.sections.training import InitSection
 from ...model.gaussians import Gaussians
 from ..representations.representation import Representation
-from ..train_views import TrainView, camera_key, nearest_knot, spread
+from ..train_views import TrainView, by_camera, nearest_knot, spread
 from . import background_images, evidence, place_gaussians, plane_sweep, scatter, shadows, triangulation, visual_hull
 
 log = logging.getLogger(__name__)
@@ -75,15 +75,13 @@ class InitialState:
 def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
     """Return the knots of the tracks: the distinct observed times.
 
-    Times of slightly unsynchronised cameras, within a tenth of the cameras' median time step, share one knot. If more than
-    ``limit`` knots remain, they are sampled evenly by index, so that knots are as dense as the images. The first and
-    the last observed time are always knots.
+    Times of slightly unsynchronised cameras, within a tenth of the cameras' median time step, share one knot. If more
+    than ``limit`` knots remain, they are sampled evenly by index, so that knots are as dense as the images. The first
+    and the last observed time are always knots.
     """
-    of_camera: dict[bytes, set[float]] = {}
-    for view in views:
-        of_camera.setdefault(camera_key(view.camera), set()).add(round(view.t, 9))
-    steps = [np.diff(sorted(found)) for found in of_camera.values() if len(found) > 1]
-    times = np.unique([t for found in of_camera.values() for t in found])
+    of_camera = [{round(view.t, 9) for view in group} for group in by_camera(views)]
+    steps = [np.diff(sorted(found)) for found in of_camera if len(found) > 1]
+    times = np.unique([t for found in of_camera for t in found])
     if steps:
         together = SAME_TIME * float(np.median(np.concatenate(steps)))
         starts = [0]
@@ -268,7 +266,7 @@ def supporting_plane(
 def _at_once(views: Sequence[TrainView], times: np.ndarray, knot: int) -> Sequence[TrainView]:
     """Return the views of one observed time, in which moving objects have one place; all views if these are too few."""
     then = [v for v in views if nearest_knot(times, v.t) == knot]
-    return then if len({camera_key(v.camera) for v in then}) >= FEWEST_EYES else views
+    return then if len(by_camera(then)) >= FEWEST_EYES else views
 
 
 def _first_time(places: triangulation.ObjectPositions, count: int) -> int:

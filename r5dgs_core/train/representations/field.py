@@ -23,7 +23,7 @@ from torch import Tensor
 
 from ...config.config import Config
 from ...errors import CheckpointError, ConfigError
-from ...model import deformation, group_poses
+from ...model import deformation
 from ...model.gaussians import Gaussians
 from ...model.tracks import Tracks
 from ...model.trd import SHAPES as TRD_SHAPES
@@ -33,7 +33,7 @@ from ...raster import shade
 from ...scene import spherical_harmonics
 from ...scene.cameras import Camera
 from ..observed_motion import ObservedMotion
-from . import field_fitting, field_to_groups, fused_posing, gating, rigidity, shading
+from . import field_fitting, field_to_groups, fused_posing, gating, rigidity
 from .field_motion import Clock, FieldMotion
 from .representation import FIELD, Representation
 
@@ -125,18 +125,7 @@ class FieldRepresentation(Representation):
             factor = 1 + (change * params["shading"][rows]).sum(-1, keepdim=True)
             lit = colors[rows].clamp(min=0) * factor.clamp(min=0)
             colors = colors.index_copy(0, rows, lit)
-        return fused_posing.pose(
-            means,
-            quats,
-            log_scales,
-            params["opacity_logits"],
-            colors,
-            torch.zeros(len(gaussians), 3),
-            torch.zeros(3),
-            torch.zeros(len(gaussians), dtype=torch.int64),
-            group_poses.at_rest(1),
-            torch.zeros(1, 3),
-        )
+        return fused_posing.activate(means, quats, log_scales, params["opacity_logits"], colors)
 
     def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
         """Fit field and TRD to the positions of the objects before the first image."""
@@ -301,53 +290,3 @@ def _load(motion: FieldMotion, tensors: dict[str, Tensor]) -> None:
         if name not in tensors or tensors[name].shape != parameter.shape:
             raise CheckpointError(f"the checkpoint's '{name}': expected a tensor of shape {list(parameter.shape)}")
         parameter.copy_(tensors[name])
-
-
-def from_tracks(
-    tracks: Tracks, light: Tensor, gaussians: Gaussians, first: int, config: Config, draw: torch.Generator
-) -> FieldRepresentation:
-    """Return a field that continues from tracks: it is fitted to their motion, with all Gaussians at one time.
-
-    Args:
-        tracks: The trained tracks.
-        light: The trained light of the shading. [3]
-        gaussians: Changed in place: each body moves from its own canonical state to its pose at ``first``.
-        first: Knot at which the field's Gaussians are canonical.
-        config: The run's configuration.
-        draw: Random generator.
-    """
-    made = FieldRepresentation(tracks, first, config)
-    with torch.no_grad():
-        made.light.copy_(light)
-    bring_together(gaussians, tracks, first, light.detach())
-    gating.release(gaussians, tracks, config)
-    made.fit(gaussians, tracks, config.field.distill_steps, config.field.distill_steps, draw)
-    return made
-
-
-def bring_together(gaussians: Gaussians, tracks: Tracks, knot: int, light: Tensor | None = None) -> None:
-    """Move each group of Gaussians from its own reference time to its pose at one knot, in place.
-
-    Args:
-        gaussians: The Gaussians.
-        tracks: Tracks of their groups.
-        knot: The knot.
-        light: Light of their shading; None leaves colours unchanged. [3]
-    """
-    with torch.no_grad():
-        poses = tracks.poses(float(tracks.times[knot]))
-        ids, centers = gaussians.motion_ids, tracks.group_centers()
-        means, quats = gaussians.means, gaussians.quats
-        arm = (means - centers[ids])[..., None]
-        means.copy_((poses.rotmats[ids] @ arm)[..., 0] + centers[ids] + poses.displacements[ids])
-        quats.copy_(rotations.multiply(poses.quats[ids], quats))
-        if light is None:
-            return
-        sh = torch.cat([gaussians.sh, gaussians.sh_rest], dim=1).double().numpy()
-        vectors, turns = gaussians.shading.double().numpy(), poses.quats[ids].double().numpy()
-        sh = spherical_harmonics.turned(sh, turns)
-        # Unlit surfaces start dark; factors at rest are dropped, as training assumes 1.
-        sh, vectors, _ = shading.rebind(sh, vectors, np.ones(len(sh)), turns, light.double().numpy())
-        gaussians.sh.copy_(torch.from_numpy(sh[:, :1]))
-        gaussians.sh_rest.copy_(torch.from_numpy(sh[:, 1:]))
-        gaussians.shading.copy_(torch.from_numpy(vectors))

@@ -218,9 +218,9 @@ def _follow(path: np.ndarray, weights: np.ndarray, leader: np.ndarray, normal: n
 
 
 def follows(path: np.ndarray, weights: np.ndarray, leader: np.ndarray, normal: np.ndarray) -> bool:
-    """Return True if a map fitted to the earlier knots predicts a shadow's last positions at least as well as no motion.
+    """Return True if a map fitted to the earlier knots predicts a shadow's last positions no worse than no motion.
 
-    True without enough knots or members.
+    The result is also True without enough knots or members.
 
     Args:
         path: Centres of the shadow's Gaussians at the knots. [n, S, 3]

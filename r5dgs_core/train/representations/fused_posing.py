@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...model.group_poses import GroupPoses
+from ...model.group_poses import GroupPoses, at_rest
 from ...raster import compilation as kernels
 
 CHUNKS = 16
@@ -80,6 +80,31 @@ def pose(
             motion_ids,
             centers,
         )
+    )
+
+
+def activate(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    log_scales: Tensor,  # [N, 3]
+    opacity_logits: Tensor,  # [N]
+    colors: Tensor,  # [N, 3]
+) -> PosedSplats:
+    """Activate the parameters of Gaussians that are already in their pose; see `pose` for the arguments.
+
+    It is `pose` with one group at rest and no shading, so that its exponentials are the same to the bit.
+    """
+    return pose(
+        means,
+        quats,
+        log_scales,
+        opacity_logits,
+        colors,
+        torch.zeros_like(means),
+        torch.zeros(3),
+        torch.zeros(len(means), dtype=torch.int64),
+        at_rest(1),
+        torch.zeros(1, 3),
     )
 
 

@@ -47,8 +47,8 @@ def make(motion: type[Representation], start: initialize.InitialState, config: C
 
     if motion.name == TRACKS or config.field.tracks_share > 0:
         return tracks_representation.TracksRepresentation(start, config)
-    from . import field
+    from . import field, field_handover
 
     tracks = tracks_representation.first_tracks(start.tracks)
-    field.bring_together(start.gaussians, tracks, start.first_time)
+    field_handover.pose_at_knot(start.gaussians, tracks, start.first_time)
     return field.FieldRepresentation(tracks, start.first_time, config)

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from ...config.config import Config
-from ...model import group_poses
 from ...model.gaussians import Gaussians
 from ...motion import robust_weights, rotations
 from ...raster import shade
@@ -20,7 +19,7 @@ from ...scene import spherical_harmonics
 from ...scene.cameras import Camera
 from ..initialization import initialize
 from ..observed_motion import GroupTrack, ObservedMotion
-from ..train_views import TrainView, camera_key
+from ..train_views import TrainView, by_camera
 from . import fused_posing
 from .representation import STILL, Representation
 
@@ -53,17 +52,8 @@ class StillRepresentation(Representation):
         else:
             eye, means = np.asarray(camera.center)[None], params["means"].detach()
             colors = shade.seen_colors(means, params["sh"], eye, rest=params["sh_rest"])
-        return fused_posing.pose(
-            params["means"],
-            params["quats"],
-            params["log_scales"],
-            params["opacity_logits"],
-            colors,
-            params["shading"].detach(),
-            torch.tensor([0.0, 0.0, 1.0]),
-            gaussians.motion_ids,
-            group_poses.at_rest(len(self.centers)),
-            torch.zeros_like(self.centers),
+        return fused_posing.activate(
+            params["means"], params["quats"], params["log_scales"], params["opacity_logits"], colors
         )
 
     def tensors(self) -> dict[str, Tensor]:
@@ -105,12 +95,10 @@ def nothing_moves(views: Sequence[TrainView]) -> bool:
     """
     if len({view.t for view in views}) <= 1:
         return True
-    of_camera: dict[bytes, list[TrainView]] = {}
-    for view in views:
-        of_camera.setdefault(camera_key(view.camera), []).append(view)
-    if any(len({view.t for view in group}) < 2 for group in of_camera.values()):
+    cameras = by_camera(views)
+    if any(len({view.t for view in group}) < 2 for group in cameras):
         return False
-    for first, *others in of_camera.values():
+    for first, *others in cameras:
         blocks = _blocks(first.image)
         if any(_changes(blocks, _blocks(view.image)) for view in others):
             return False

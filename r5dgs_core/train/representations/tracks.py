@@ -62,9 +62,9 @@ class TracksRepresentation(Representation):
         share = config.field.tracks_share * config.train.iterations
         if config.train.representation != FIELD or iteration < share:
             return self
-        from . import field
+        from . import field_handover
 
-        return field.from_tracks(self.tracks, self.light, gaussians, self._first, config, draw)
+        return field_handover.from_tracks(self.tracks, self.light, gaussians, self._first, config, draw)
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
@@ -166,7 +166,7 @@ class TracksRepresentation(Representation):
         named["tracks.entered"] = torch.tensor(self._entered)
         named["light"] = self.light.detach()
         if self._gains is not None:
-            named["residual.gains"] = self._gains
+            named[residual.GAINS] = self._gains
         return named if self.residuals is None else named | residual.tensors_of(self.residuals)
 
     def restored(self, name: str, tensors: dict[str, Tensor]) -> Representation:
@@ -183,7 +183,7 @@ class TracksRepresentation(Representation):
         first, last = tensors.get("tracks.entered", torch.tensor([0, len(self.tracks.times) - 1])).tolist()
         self._entered = (first, last)
         self.light = tensors["light"].clone().requires_grad_(True)
-        self._gains = tensors.get("residual.gains")
+        self._gains = tensors.get(residual.GAINS)
         self.residuals = residual.residual_of(tensors)
 
     @staticmethod

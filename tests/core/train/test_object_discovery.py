@@ -13,8 +13,7 @@ from r5dgs_core.config import training_needs
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.evaluation import evaluate
 from r5dgs_core.scene import validation
-from r5dgs_core.train import checkpoint, object_discovery, run
-from r5dgs_core.train.identity import packed_masks
+from r5dgs_core.train import checkpoint, checkpoint_content, object_discovery, run
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
@@ -96,7 +95,7 @@ def test_a_resumed_run_keeps_the_masks_that_it_began_with(unmasked, tiny, tmp_pa
     checkpoint.save(parted.folder, half.state())
     run.train(unmasked.root, parted.folder, config, resume=True)
     found = checkpoint.load(parted.folder).tensors
-    assert len(calls) == 1 and found.keys() == expected.keys() and packed_masks.NAME in found
+    assert len(calls) == 1 and found.keys() == expected.keys() and checkpoint_content.DISCOVERED_MASKS in found
     for name, tensor in expected.items():
         np.testing.assert_array_equal(found[name].numpy(), tensor.numpy(), err_msg=name)
 
@@ -144,7 +143,7 @@ def test_a_field_without_masks_groups_moving_gaussians_at_the_end(unmasked, tmp_
     made = run.train(unmasked.root, tmp_path / "run", config, progress=events.append)
     assert "2 moving parts found" in [event["text"] for event in events if event["event"] == "prepare"][-1]
     tensors = checkpoint.load(made.folder).tensors
-    assert tensors["object_ids"].tolist() == [0, 1, 2] and packed_masks.LABELS in tensors
+    assert tensors["object_ids"].tolist() == [0, 1, 2] and checkpoint_content.DISCOVERED_LABELS in tensors
     scene = bake.bake(made)
     validation.check(scene, "scene")
     assert [item.name for item in scene.objects] == ["background", "object 1", "object 2"]

@@ -15,7 +15,7 @@ from r5dgs_core.errors import ConfigError
 from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.raster import RasterStats
 from r5dgs_core.train import checkpoint
-from r5dgs_core.train.densification import densifier, gradient
+from r5dgs_core.train.densification import densifier, gradient, registry
 from r5dgs_core.train.trainer import Trainer
 from tests.support import scenes, tiny_datasets
 
@@ -266,7 +266,7 @@ def test_a_strategy_restored_from_its_tensors_continues_identically(name):
         place = conditions(cap=60, seed=3)
         config = Config().replace(**{"densify.strategy": name, "densify.start": 0, "densify_default.start": 50})
         gaussians, optimizer = make(size=4 * PIXEL)
-        strategy = gradient.make(config, place, 40)
+        strategy = registry.make(config, place, 40)
         eye = scenes.orbit_camera(0.0, 48, 36)
         draws = torch.Generator().manual_seed(1)
         stats = RasterStats(torch.rand(40, generator=draws) > 0.3, torch.rand(40, generator=draws) * 9)
@@ -274,7 +274,7 @@ def test_a_strategy_restored_from_its_tensors_continues_identically(name):
         strategy.observe(stats, eye)
         if again:
             kept = {n: t.clone() for n, t in strategy.tensors().items()}
-            strategy = gradient.make(config, place, 40)
+            strategy = registry.make(config, place, 40)
             strategy.restore(kept)
         strategy.after_step(gaussians, optimizer, 100, 1e-3)
         results.append((gaussians.means.detach(), strategy.tensors()))

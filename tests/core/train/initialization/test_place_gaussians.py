@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.model.gaussians import Gaussians
-from r5dgs_core.train.initialization import thinning
+from r5dgs_core.train.initialization import place_gaussians
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
@@ -33,7 +33,7 @@ def gaussians(counts):
 @hypothesis.given(st.lists(st.integers(1, 300), min_size=1, max_size=5), st.integers(5, 800), st.integers(0, 9))
 def test_every_group_keeps_its_share_under_the_cap(counts, cap, seed):
     before = gaussians(counts)
-    after = thinning.thin(before, cap, np.random.default_rng(seed))
+    after = place_gaussians.thin(before, cap, np.random.default_rng(seed))
     assert len(after) == min(cap, sum(counts))
     share = len(after) / len(before)
     left = torch.bincount(after.motion_ids, minlength=len(counts)).tolist()
@@ -45,21 +45,21 @@ def test_every_group_keeps_its_share_under_the_cap(counts, cap, seed):
 
 @hypothesis.given(st.integers(1, 500), st.integers(1, 500))
 def test_surfaces_stay_covered(count, cap):
-    after = thinning.thin(gaussians([count]), cap, np.random.default_rng(0))
+    after = place_gaussians.thin(gaussians([count]), cap, np.random.default_rng(0))
     area = float((2 * after.log_scales[:, 0].detach()).exp().sum())
-    assert area == pytest.approx(min(count * math.exp(-6.0), len(after) * thinning.WIDEST**2), rel=1e-4)
+    assert area == pytest.approx(min(count * math.exp(-6.0), len(after) * place_gaussians.WIDEST**2), rel=1e-4)
 
 
 def test_thinning_does_not_enlarge_wide_gaussians():
     before = gaussians([100])
-    before.log_scales.data[:] = math.log(2 * thinning.WIDEST)
-    after = thinning.thin(before, 10, np.random.default_rng(0))
+    before.log_scales.data[:] = math.log(2 * place_gaussians.WIDEST)
+    after = place_gaussians.thin(before, 10, np.random.default_rng(0))
     assert torch.equal(after.log_scales, before.log_scales[:10])
 
 
 def test_few_gaussians_are_not_thinned_and_use_no_random_numbers():
     few, rng = gaussians([3, 4]), np.random.default_rng(1)
-    assert thinning.thin(few, 7, rng) is few
+    assert place_gaussians.thin(few, 7, rng) is few
     assert rng.random() == np.random.default_rng(1).random()
 
 

@@ -1,0 +1,22 @@
+"""Factory of the densification strategies."""
+
+from __future__ import annotations
+
+from ...config.config import Config
+from . import densifier, gradient, mcmc
+from .densifier import Conditions
+
+
+def make(config: Config, conditions: Conditions, count: int) -> densifier.Strategy:
+    """Create the strategy that the configuration selects.
+
+    Args:
+        config: The run's configuration.
+        conditions: Properties of the run.
+        count: Initial number of Gaussians.
+    """
+    if config.densify.strategy == "mcmc":
+        return mcmc.MCMC(config.densify_mcmc, conditions)
+    if config.densify.strategy == "default":
+        return gradient.Adaptive(config.densify_default, conditions, count)
+    return gradient.Share(config.densify, conditions, count)
