@@ -14,8 +14,9 @@ from ..scene import scene_file
 from ..scene.scene import Scene
 from ..train import checkpoint
 from . import assemble, needs, point_motion, provenance, read_checkpoint, simplify_motion
+from .draft import Stage
 
-STAGES = (point_motion, simplify_motion, needs, provenance)
+STAGES: tuple[Stage, ...] = (point_motion, simplify_motion, needs, provenance)
 
 
 def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
@@ -58,8 +59,8 @@ def run_bake(folder: Path, out: Path, dataset_root: Path | None = None, override
     dataset = datasets.read(run.data(dataset_root), run.config.data.masks, run.config.data.min_registered)
     if dataset.digest != run.digest:
         raise CheckpointError(
-            f"{dataset.root}: is not the data that {folder} was trained on, or has changed since; "
-            "name that data with --data, or train again"
+            f"{dataset.root}: is not the data that {folder} was trained on, or was changed since; "
+            "give that data with --data, or train again"
         )
     scene = bake(run, dataset)
     scene_file.write(scene, out)

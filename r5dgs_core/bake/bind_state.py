@@ -128,10 +128,10 @@ def _relative(quats: np.ndarray, path: np.ndarray, center: np.ndarray, pivot: np
 
 
 def _radius(means: np.ndarray, opacities: np.ndarray, pivot: np.ndarray) -> float:
-    """Return the 90 % quantile of the visible members' distances from the pivot; 1 without members."""
+    """Return the radius of the visible members; 1 without members."""
     if len(means) == 0:
         return 1.0
-    return float(np.quantile(np.linalg.norm(means - pivot, axis=1)[visibility.seen(opacities)], 0.9))
+    return observed_motion.radius(means[visibility.seen(opacities)], pivot)
 
 
 def _anchor(rows: np.ndarray, means: np.ndarray, opacities: np.ndarray, pivot: np.ndarray) -> int:

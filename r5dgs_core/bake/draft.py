@@ -1,12 +1,12 @@
 """Data passed between the stages of baking: the context of a run, and a draft of its scene.
 
-A stage is a module with ``apply(draft, context) -> draft``. It leaves the arrays of its arguments unchanged.
+A `Stage` is a module with a function ``apply``, which leaves the arrays of its arguments unchanged.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from torch import Tensor
@@ -185,3 +185,11 @@ class Draft:
     bent: Need
     trained: Scene | None = None
     parts: tuple[dict[str, Any], ...] = ()
+
+
+class Stage(Protocol):
+    """Interface of the stages that follow `assemble`."""
+
+    def apply(self, draft: Draft, context: Context) -> Draft:
+        """Return the draft with the part of the scene that this stage decides."""
+        ...

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..motion_fit import model_selection, shared_gravity
 
-UP = {"blender": np.array([0.0, 0.0, 1.0]), "opengl": np.array([0.0, 1.0, 0.0])}  # up axis
+UP_AXIS = {"blender": np.array([0.0, 0.0, 1.0]), "opengl": np.array([0.0, 1.0, 0.0])}
 
 
 def share_gravity(
@@ -19,6 +19,6 @@ def share_gravity(
         convention: World convention of the scene; gravity is shared only if its up axis is known.
     """
     shared = [fit for _, fit in fits.values()]
-    if convention in UP and fits:
-        shared, _ = shared_gravity.share([track for track, _ in fits.values()], shared, UP[convention])
+    if convention in UP_AXIS and fits:
+        shared, _ = shared_gravity.share([track for track, _ in fits.values()], shared, UP_AXIS[convention])
     return dict(zip(fits, shared, strict=True))

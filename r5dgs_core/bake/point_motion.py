@@ -7,10 +7,12 @@ Notation: R Gaussians with states x_s at the knots s, last knot T. Their group m
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from torch import Tensor
 
+from ..config.config import Config
 from ..motion import rotations
 from ..scene.scene import Dynamics, MotionGroup, Residuals
 from ..train.normalization import Normalization
@@ -29,23 +31,20 @@ def apply(draft: Draft, context: Context) -> Draft:
     if points is not None and context.wanted.tracks != "off":
         extent = float(np.ptp(np.quantile(bound.cloud.means, [0.01, 0.99], axis=0), axis=0).max())
         # Relative to the trained poses, so that motion that the user switched off does not return as residuals.
-        bends, own = members(
+        bends, own = residuals_and_dynamics(
             points, context.norm, bound.cloud.motion_ids, bound.trained, bound.pivots, draft.order, extent
         )
     bent = draft.bent
     if registry.by_name(context.state.representation).moves:
-        from ..train.representations import residual
-
-        found = residual.need(context.tensors, context.dataset.object_names, context.config, bends is not None)
-        bent = Need("residuals", *found, learned=found[2])
+        bent = residual_need(context.tensors, context.dataset.object_names, context.config, bends is not None)
     if not bent.on or context.wanted.residuals == "off":
         bends = None
-    groups = scene.groups if bends is None else departures(scene.groups, scene.gaussians.motion_ids, bends)
+    groups = scene.groups if bends is None else with_rigid_errors(scene.groups, scene.gaussians.motion_ids, bends)
     scene = dataclasses.replace(scene, groups=tuple(groups), residuals=bends, dynamics=own)
     return dataclasses.replace(draft, scene=scene, bent=bent)
 
 
-def members(
+def residuals_and_dynamics(
     points: PointMotion,
     norm: Normalization,
     motion_ids: np.ndarray,
@@ -110,7 +109,7 @@ def _relative(
     return offsets, np.moveaxis(rotations.make_continuous(backwards), 0, 1)[:, ::-1], growths
 
 
-def departures(groups: Sequence[MotionGroup], motion_ids: np.ndarray, residuals: Residuals) -> list[MotionGroup]:
+def with_rigid_errors(groups: Sequence[MotionGroup], motion_ids: np.ndarray, residuals: Residuals) -> list[MotionGroup]:
     """Return the groups with the deviations of their members from rigid motion in the observed time (rms and maximum).
 
     Args:
@@ -125,3 +124,29 @@ def departures(groups: Sequence[MotionGroup], motion_ids: np.ndarray, residuals:
         rms, largest = float(np.sqrt(mine.sum() / count)), float(np.sqrt(mine.max(initial=0.0)))
         result.append(dataclasses.replace(group, rigid_rms=rms, rigid_max=largest))
     return result
+
+
+def residual_need(tensors: Mapping[str, Tensor], names: Mapping[int, str], config: Config, there: bool) -> Need:
+    """Return the row "residuals" of the needs table; its value is the largest gain, dB.
+
+    Args:
+        tensors: Tensors of the checkpoint.
+        names: Names of the objects by id.
+        config: The run's configuration.
+        there: True if the scene has residuals.
+    """
+    from ..train.representations import residual  # static scenes do not need it
+
+    threshold, field = config.residual.threshold, residual.residual_of(tensors)
+    if residual.GAINS not in tensors:
+        reason = "every Gaussian moves by the deformation field" if there else "gain by bending, dB; none was tried"
+        return Need("residuals", 0.0, threshold, there, reason, there)
+    gains, ids = tensors[residual.GAINS].numpy(), tensors["object_ids"].numpy()
+    kept = [] if field is None else field.bodies
+    largest = float(np.nanmax(gains)) if np.isfinite(gains).any() else 0.0
+    bent = ", ".join(f"{names.get(int(ids[b]), f'object {ids[b]}')} ({gains[b - 1]:+.1f})" for b in kept)
+    rigid = f"{len(gains) - len(kept)} of {len(gains)} objects are rigid"
+    if kept and not there and config.needs.residuals != "off":
+        bent += ", too little to be stored"
+    reason = "gain by bending, dB: " + (f"{bent}; {rigid}" if bent else rigid)
+    return Need("residuals", largest, threshold, there, reason, there)

@@ -29,7 +29,6 @@ from ..playback import scene_player
 from ..render import posed_scene, scene_renderer
 from ..render.posed_scene import PosedScene
 from ..scene import cameras
-from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from ..train import train_views
 
@@ -42,11 +41,10 @@ UNEXPLAINED = 0.5  # misfit above which the rotations are unknown, as a share of
 LARGE = 2.0  # misfit that may count as unexplained, relative to the root mean square misfit of all pixels
 UNKNOWN = 1.0  # standard deviation of an unknown rotation, rad, or displacement, radii
 EXACT = 1e-6  # error that cannot be distinguished from zero, rad or radii
-_REACH = 3.0  # extent of a Gaussian, standard deviations
 
 
 @dataclass(frozen=True)
-class _Look:
+class _BodyPixels:
     """Pixels of a body in a view.
 
     Attributes:
@@ -86,7 +84,7 @@ def measure(
     players = [scene_player.Player(part) for part in (scene, *(_moved(scene, groups, axis) for axis in range(6)))]
     behind = train_views.behind(dataset, config)
     knots = np.array([train_views.nearest_knot(scene.tracks.times, view.t) for view in dataset.train])
-    looks: dict[tuple[int, int], list[_Look]] = {}
+    looks: dict[tuple[int, int], list[_BodyPixels]] = {}
     misfits = []
     for knot in range(len(scene.tracks.times)) if groups else ():
         views = [view for view, k in zip(dataset.train, knots, strict=True) if k == knot]
@@ -130,15 +128,14 @@ def _look(
     view: datasets.View,
     truth: np.ndarray,
     mine: np.ndarray,
-) -> _Look:
+) -> _BodyPixels:
     """Compare a body's pixels in a view with pictures of the scene: in the observed poses (first), and in others."""
     region = ndimage.binary_dilation(mine, iterations=MARGIN)
     rows, columns = ndimage.find_objects(region.astype(np.int8))[0]
-    intrinsics = view.camera.intrinsics.copy()
-    intrinsics[:2, 2] -= columns.start, rows.start
-    size = {"width": columns.stop - columns.start, "height": rows.stop - rows.start}
-    camera = dataclasses.replace(view.camera, intrinsics=intrinsics, **size)
-    near = _near(frames[0], camera)
+    size = columns.stop - columns.start, rows.stop - rows.start
+    camera = cameras.crop(view.camera, columns.start, rows.start, *size)
+    centers, scales = frames[0].means.astype(np.float64) + frames[0].origin, np.exp(frames[0].log_scales.max(1))
+    near = np.flatnonzero(cameras.reached_by(camera, centers, scales))
     own = scene.gaussians.motion_ids[near] == group
     parts = [posed_scene.rows_of(frame, near) for frame in frames]
     region = np.asarray(region[rows, columns], bool)
@@ -150,7 +147,7 @@ def _look(
     image = np.asarray(truth[rows, columns], np.float64)
     slopes = np.stack([(picture - pictures[0])[region].ravel() for picture in pictures[1:]], -1) / STEP
     inner = image[core] - (image[core].mean(0) if core.any() else 0.0)
-    return _Look(
+    return _BodyPixels(
         slopes,
         (pictures[0] - image)[region].ravel(),
         float(((pictures[0] - image)[core] ** 2).sum()),
@@ -159,20 +156,11 @@ def _look(
     )
 
 
-def _near(posed: PosedScene, camera: Camera) -> np.ndarray:
-    """Return the rows of the Gaussians that may reach a camera's picture."""
-    pixels, depth = cameras.project(camera, posed.means.astype(np.float64) + posed.origin)
-    scales = np.exp(posed.log_scales.max(1))
-    reach = _REACH * scales * camera.intrinsics[0, 0] / np.maximum(depth, 1e-6) + 1
-    outside = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1) > reach
-    return np.flatnonzero(~outside & (depth > 0))
-
-
-def _errors(looks: Sequence[Sequence[_Look]], radius: float, usual: float) -> PoseErrors:
+def _errors(looks: Sequence[Sequence[_BodyPixels]], radius: float, usual: float) -> PoseErrors:
     """Return the errors of a body's poses.
 
     Args:
-        looks: Its looks at each knot. S
+        looks: Its pixels in the views of each knot. S
         radius: Its radius, world units.
         usual: Squared misfit of a value anywhere in the images.
     """

@@ -44,13 +44,40 @@ LARGEST = 0.05  # spread (rad or diameters) above which motion is kept without c
 
 
 @dataclass(frozen=True)
-class _Part:
+class _Kind:
+    """Part of a body's motion that can be simplified.
+
+    Attributes:
+        name: Row of the needs table that it decides.
+        columns: Its columns of the poses.
+        offset: Parameter of motion models that moves the fitted motion to the last pose.
+        meaning: Meaning of the spread, in words.
+    """
+
+    name: str
+    columns: slice
+    offset: str
+    meaning: str
+
+    @property
+    def turns(self) -> bool:
+        """True if it is measured in rad, not in world units."""
+        return self.columns == _TURN
+
+
+_TURN, _PATH = slice(0, 4), slice(4, 7)  # columns of poses
+_ROTATION = _Kind("rotation", _TURN, "offset_rotvec", "spread of its rotations, rad")  # none instead
+_PLACE = _Kind("motion", _PATH, "offset_displacement", "spread of its places, diameters")  # one fixed place instead
+_BEND = _Kind("curved_path", _PATH, "offset_displacement", "distance from a straight path, diameters")  # line instead
+
+
+@dataclass(frozen=True)
+class _Simplification:
     """Simplification of one body's motion.
 
     Attributes:
         group: Group of the body.
-        name: Row of the needs table that it decides: "rotation" (off: the body does not turn), "motion" (off: it
-            stays in its place) or "curved_path" (off: its path is straight).
+        kind: The part of the motion that is simplified.
         poses: Simplified poses of the body. [S, 7]
         spread: Root mean square per component of the dropped motion, rad or world units.
         value: Spread in rad or diameters.
@@ -62,7 +89,7 @@ class _Part:
     """
 
     group: int
-    name: str
+    kind: _Kind
     poses: np.ndarray
     spread: float
     value: float
@@ -73,7 +100,7 @@ class _Part:
     seen: bool
 
     @property
-    def noise(self) -> bool:
+    def is_noise(self) -> bool:
         """True if the poses change by no more than their noise."""
         return self.change <= self.allowed and not self.kept
 
@@ -127,7 +154,7 @@ def simplify(
     names = {item.id: item.name for item in scene.objects}
     bodies = _moving(scene)
     parts = [part for g in bodies for part in _parts(scene, g.id, observed[g.id], evidence, wanted)]
-    dropped, losses = _unseen(scene, [part for part in parts if part.noise], evidence)
+    dropped, losses = _affordable(scene, [part for part in parts if part.is_noise], evidence)
     bound = bind_state.rebind(scene, _with_parts(scene, dropped))
     rows: list[dict[str, Any]] = []
     fits: dict[int, tuple[shared_gravity.Track, model_selection.Fit]] = {}
@@ -145,9 +172,8 @@ def simplify(
     models = {index: fit.model for index, fit in shared.items()}
     groups = list(bound.groups)
     for part in parts:  # a model fitted without noise starts at the bind state
-        if part.noise and part.group in models:
-            offset = "offset_rotvec" if part.name == "rotation" else "offset_displacement"
-            models[part.group] = dataclasses.replace(models[part.group], **{offset: np.zeros(3)})
+        if part.is_noise and part.group in models:
+            models[part.group] = dataclasses.replace(models[part.group], **{part.kind.offset: np.zeros(3)})
     for index, model in models.items():
         groups[index] = dataclasses.replace(groups[index], model=model, history=shared[index].history)
     return Simplified(dataclasses.replace(bound, groups=tuple(groups)), tuple(rows))
@@ -160,7 +186,7 @@ def _moving(scene: Scene) -> list[MotionGroup]:
 
 def _parts(
     scene: Scene, group: int, observed: np.ndarray, evidence: ImageEvidence | None, wanted: NeedsSection
-) -> list[_Part]:
+) -> list[_Simplification]:
     """Return the candidate simplifications of a body: no rotation, a fixed place and, if it moves, a straight path."""
     poses, weights = scene.tracks.poses[group], observed.astype(np.float64)
     weights = weights if weights.any() else np.ones(len(poses))
@@ -168,35 +194,35 @@ def _parts(
     upright = poses.copy()
     upright[:, :4] = mean
     turns = rotations.quats_to_rotvecs(rotations.multiply(poses[:, :4], rotations.conjugate(mean)))
-    result = [_judged(scene, group, "rotation", upright, turns, weights, evidence, wanted.rotation == "on")]
+    result = [_measured(scene, group, _ROTATION, upright, turns, weights, evidence, wanted.rotation == "on")]
     tau = scene.tracks.times - scene.tracks.times[-1]
-    for name, degree in (("motion", 0), ("curved_path", 1)):
+    for kind, degree in ((_PLACE, 0), (_BEND, 1)):
         columns = tau[:, None] ** np.arange(degree + 1)
         root = np.sqrt(weights)[:, None]
         plain = poses.copy()
         plain[:, 4:] = columns @ np.linalg.lstsq(columns * root, poses[:, 4:] * root, rcond=None)[0]
         dropped = poses[:, 4:] - plain[:, 4:]
-        result.append(_judged(scene, group, name, plain, dropped, weights, evidence, wanted.tracks == "on"))
-        if result[-1].noise:
+        result.append(_measured(scene, group, kind, plain, dropped, weights, evidence, wanted.tracks == "on"))
+        if result[-1].is_noise:
             break
     return result
 
 
-def _judged(
+def _measured(
     scene: Scene,
     group: int,
-    name: str,
+    kind: _Kind,
     poses: np.ndarray,
     dropped: np.ndarray,
     weights: np.ndarray,
     evidence: ImageEvidence | None,
     kept: bool,
-) -> _Part:
+) -> _Simplification:
     """Return a candidate whose dropped motion [S, 3] (rad or world units) is measured in units of its noise."""
-    unit = 1.0 if name == "rotation" else 2 * scene.groups[group].model.radius
+    unit = 1.0 if kind.turns else 2 * scene.groups[group].model.radius
     spread = float(np.sqrt(np.average((dropped**2).mean(1), weights=weights)))
     if evidence is None:
-        limit = needs.TURN if name == "rotation" else needs.STILL
+        limit = needs.TURN if kind.turns else needs.STILL
         change, allowed, seen = float(np.linalg.norm(dropped, axis=1).max()) / unit / limit, 1.0, False
         why = "the images are missing"
     elif spread > LARGEST * unit:
@@ -204,10 +230,10 @@ def _judged(
     else:
         after = scene.tracks.poses.copy()
         after[group] = poses
-        largest = 2 * float(np.linalg.norm(dropped, axis=1).max()) / (unit if name != "rotation" else 2.0)
+        largest = 2 * float(np.linalg.norm(dropped, axis=1).max()) / (2.0 if kind.turns else unit)
         free, seen = 3 * _independent(dropped[weights > 0]), True
         for rows in (evidence.strongest_views(np.linalg.norm(dropped, axis=1)), None):
-            support = evidence.support(group, scene.tracks.poses, _followed(scene, after), largest, rows)
+            support = evidence.support(group, scene.tracks.poses, _move_followers(scene, after), largest, rows)
             change = max(support.sigmas, 0.0) / np.sqrt(free)
             allowed = float(np.sqrt(stats.f.ppf(1 - LEVEL, free, max(support.clusters - 1, 1))))
             if change > CLEARLY * allowed:
@@ -217,7 +243,7 @@ def _judged(
             allowed, why = max(allowed, change), f"the images do not show it ({255 * support.level:.2g} levels of 255)"
         elif support.shape < SHAPE:
             allowed, why = max(allowed, change), f"it only fits colours (shape is {support.shape:.0%} of its effect)"
-    return _Part(group, name, poses, spread, spread / unit, float(change), allowed, why, kept, seen)
+    return _Simplification(group, kind, poses, spread, spread / unit, float(change), allowed, why, kept, seen)
 
 
 def _independent(series: np.ndarray) -> float:
@@ -228,9 +254,9 @@ def _independent(series: np.ndarray) -> float:
     return max(1.0, len(series) * (1 - lag) / (1 + lag))
 
 
-def _unseen(
-    scene: Scene, parts: Sequence[_Part], evidence: ImageEvidence | None
-) -> tuple[list[_Part], dict[int, float]]:
+def _affordable(
+    scene: Scene, parts: Sequence[_Simplification], evidence: ImageEvidence | None
+) -> tuple[list[_Simplification], dict[int, float]]:
     """Return the parts that can be dropped within `LOSS`, cheapest first, and the PSNR loss of each by its `id`, dB."""
     if evidence is None or not parts:
         return list(parts), {}
@@ -246,16 +272,15 @@ def _unseen(
     return chosen, losses
 
 
-def _with_parts(scene: Scene, parts: Sequence[_Part]) -> np.ndarray:
+def _with_parts(scene: Scene, parts: Sequence[_Simplification]) -> np.ndarray:
     """Return the poses of all groups with some simplifications applied. [G, S, 7]"""
     poses = scene.tracks.poses.copy()
     for part in parts:
-        columns = slice(0, 4) if part.name == "rotation" else slice(4, 7)
-        poses[part.group, :, columns] = part.poses[:, columns]
-    return _followed(scene, poses)
+        poses[part.group, :, part.kind.columns] = part.poses[:, part.kind.columns]
+    return _move_followers(scene, poses)
 
 
-def _followed(scene: Scene, poses: np.ndarray) -> np.ndarray:
+def _move_followers(scene: Scene, poses: np.ndarray) -> np.ndarray:
     """Update the poses of followers to the new poses of their leaders, in place, and return the poses. [G, S, 7]"""
     change = poses[..., 4:] - scene.tracks.poses[..., 4:]
     for g in scene.groups:
@@ -264,13 +289,13 @@ def _followed(scene: Scene, poses: np.ndarray) -> np.ndarray:
     return poses
 
 
-def _future(poses: np.ndarray, parts: Sequence[_Part]) -> np.ndarray:
+def _future(poses: np.ndarray, parts: Sequence[_Simplification]) -> np.ndarray:
     """Return the poses for the fit past t_max, relative to t_max; without noise, even if the images need it. [S, 7]"""
     result = poses.copy()
     for part in parts:
-        if part.noise and part.name == "rotation":
+        if part.is_noise and part.kind.turns:
             result[:, :4] = rotations.identity()
-        elif part.noise:
+        elif part.is_noise:
             result[:, 4:] = part.poses[:, 4:] - part.poses[-1, 4:]
     return result
 
@@ -280,7 +305,7 @@ def _fit(
     group: int,
     observed: np.ndarray,
     poses: np.ndarray,
-    parts: Sequence[_Part],
+    parts: Sequence[_Simplification],
     errors: PoseErrors | None,
 ) -> tuple[shared_gravity.Track, model_selection.Fit]:
     """Fit a body's motion past t_max and return its track and the fit.
@@ -295,7 +320,7 @@ def _fit(
     if errors is not None:
         weights, drift = pose_errors.weights(errors, observed, radius, turns), pose_errors.drift(errors, observed)
     track = shared_gravity.Track(scene.tracks.times, poses[:, :4], poses[:, 4:], weights)
-    noise = {part.name == "rotation": part.spread / part.change for part in parts if part.seen and part.change > 0}
+    noise = {part.kind.turns: part.spread / part.change for part in parts if part.seen and part.change > 0}
     fit = model_selection.fit(
         track.times,
         track.quats,
@@ -305,7 +330,7 @@ def _fit(
         inertia=body,
         least_noise=noises.of_images(radius, noise.get(False, 0.0), noise.get(True, 0.0)),
         drift=drift if turns else (drift[0], 0.0),
-        up=falling_bodies.UP.get(scene.world_convention),
+        up=falling_bodies.UP_AXIS.get(scene.world_convention),
     )
     return track, dataclasses.replace(fit, history=dataclasses.replace(fit.history, errors=errors))
 
@@ -319,14 +344,7 @@ def _describe(fit: model_selection.Fit | None) -> str:
     return f"{text}; {more}" if more else text
 
 
-_SPREADS = {
-    "rotation": "spread of its rotations, rad",
-    "motion": "spread of its places, diameters",
-    "curved_path": "distance from a straight path, diameters",
-}
-
-
-def _row(part: _Part, dropped: bool, loss: float | None, future: str, travel: float) -> dict[str, Any]:
+def _row(part: _Simplification, dropped: bool, loss: float | None, future: str, travel: float) -> dict[str, Any]:
     """Row of the needs table for a part; its threshold is the maximum spread that counts as noise."""
     threshold = part.value * part.allowed / part.change if part.change > 0 else LARGEST
     why = part.why
@@ -335,7 +353,7 @@ def _row(part: _Part, dropped: bool, loss: float | None, future: str, travel: fl
         why += "" if dropped else f", more than what remains of the allowed {LOSS:g} dB, so it is kept up to t_max"
     if part.kept:
         why = f"set on by the user; {why}"
-    text = f"{_SPREADS[part.name]}: {why}"
-    if part.name == "motion":
+    text = f"{part.kind.meaning}: {why}"
+    if part.kind == _PLACE:
         text += f"; goes {travel:.3g} diameters; past t_max: {future}"
-    return Need(part.name, part.value, threshold, not dropped, text).row()
+    return Need(part.kind.name, part.value, threshold, not dropped, text).row()

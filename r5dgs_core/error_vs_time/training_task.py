@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..train import learning_curves
+from ..train import step_log
 from ..train.checkpoint import LOG_FILE, RUN_FILE
 from .report_rows import Row
 
@@ -29,7 +29,7 @@ def measure(folder: Path | None, test: Sequence[Row] = ()) -> tuple[list[Row], l
     if folder is None:
         return [], ["training: a scene file holds no log of its training; give the run folder"]
     try:
-        log = learning_curves.read_log(folder / LOG_FILE)
+        log = step_log.read(folder / LOG_FILE)
         config = json.loads((folder / RUN_FILE).read_text())["config"]["train"]
     except (OSError, ValueError, KeyError) as error:
         return [], [f"training: {folder / LOG_FILE}: cannot be read ({error}); train again"]

@@ -17,6 +17,7 @@ MOST_PIXELS = 1 << 16  # maximum image side
 _MOST_FOCAL = 1e12  # pixels; the smallest focal length is its reciprocal
 _RIGID_TOLERANCE = 1e-3  # maximum entry of R R^T - 1
 _ROUNDING = 1e-9  # tolerance of matrix entries that must be 0 or 1
+EXTENT = 3.0  # radius of a Gaussian in images, standard deviations
 FAR = 1e4  # camera distance that replaces infinity for parallel projections, in half depth ranges
 
 
@@ -174,6 +175,20 @@ def resize(camera: Camera, width: int, height: int) -> Camera:
     intrinsics[0] *= width / camera.width
     intrinsics[1] *= height / camera.height
     return dataclasses.replace(camera, width=width, height=height, intrinsics=intrinsics)
+
+
+def reached_by(camera: Camera, points: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """Return a mask of the Gaussians that may reach a camera's image: within three standard deviations and 1 px.
+
+    Args:
+        camera: The camera.
+        points: Their centres, world. [N, 3] float64
+        scales: Their largest standard deviations. [N]
+    """
+    pixels, depth = project(camera, points)
+    reach = EXTENT * scales * camera.intrinsics[0, 0] / np.maximum(depth, 1e-6) + 1
+    outside = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1) > reach
+    return ~outside & (depth > 0)
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import logging
 import time
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import atomic_files
+from . import step_log
 from .checkpoint import CURVES_FILE, LOG_FILE
 
 log = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ class LearningCurves:
             return
         began = time.monotonic()
         try:
-            rows = read_log(self.path.with_name(LOG_FILE))
+            rows = step_log.read(self.path.with_name(LOG_FILE))
             if len(rows) > 1:
                 atomic_files.write(self.path, draw(rows))
         except Exception as error:  # a missing matplotlib or a full disk must not end the run
@@ -46,17 +46,6 @@ class LearningCurves:
             log.warning("%s: the learning curves cannot be drawn: %s: %s", self.path, type(error).__name__, error)
         self._last = time.monotonic()
         self._cost = self._last - began
-
-
-def read_log(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of a run's log, without an incomplete last line."""
-    rows = []
-    for line in path.read_bytes().splitlines():
-        try:
-            rows.append(json.loads(line))
-        except ValueError:
-            break
-    return rows
 
 
 def draw(rows: Sequence[dict[str, Any]]) -> bytes:

@@ -110,3 +110,8 @@ class ObservedMotion:
     points: PointMotion | None = None
     smooth: bool = False
     moves: RegroupCounts | None = None
+
+
+def radius(points: np.ndarray, center: np.ndarray) -> float:
+    """Return the radius of a group, the 90 % quantile of its members' distances from a centre. [n, 3], n >= 1"""
+    return float(np.quantile(np.linalg.norm(points - center, axis=1), 0.9))

@@ -7,7 +7,6 @@ body's centre in world axes, and a displacement in radii of the body; P values o
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +30,6 @@ FEWEST_PIXELS = 8  # minimum number of pixels of a mask
 STEP = 0.02  # change of the pose for finite differences, rad or radii
 _LARGEST = 0.35  # step of the refinement, rad or radii
 _ENOUGH = 1e-2  # relative gain of a step below which the refinement ends
-_REACH = 3.0  # extent of a Gaussian, standard deviations
 _FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 
@@ -146,10 +144,8 @@ class Registration:
     def _look(self, view: train_views.TrainView, mine: np.ndarray) -> _Look:
         region = grown(mine)
         rows, columns = ndimage.find_objects(region.astype(np.int8))[0]
-        intrinsics = view.camera.intrinsics.copy()
-        intrinsics[:2, 2] -= columns.start, rows.start
-        size = {"width": columns.stop - columns.start, "height": rows.stop - rows.start}
-        camera = dataclasses.replace(view.camera, intrinsics=intrinsics, **size)
+        size = columns.stop - columns.start, rows.stop - rows.start
+        camera = cameras.crop(view.camera, columns.start, rows.start, *size)
         splats = self._trainer.splats(camera, view.t)
         near = self._others_near(camera, splats)
         others = PosedSplats(**{name: getattr(splats, name)[near] for name in _FIELDS})
@@ -157,11 +153,9 @@ class Registration:
 
     def _others_near(self, camera: Camera, splats: PosedSplats) -> torch.Tensor:
         """Rows of the Gaussians of other groups that reach a camera's picture."""
-        pixels, depth = cameras.project(camera, splats.means.numpy().astype(np.float64))
-        reach = _REACH * splats.scales.amax(1).numpy() * camera.intrinsics[0, 0] / np.maximum(depth, 1e-6) + 1
-        outside = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1) > reach
+        centers, scales = splats.means.numpy().astype(np.float64), splats.scales.amax(1).numpy()
         other = self._trainer.gaussians.motion_ids.numpy() != self._body
-        return torch.from_numpy(np.flatnonzero(other & ~outside & (depth > 0)))
+        return torch.from_numpy(np.flatnonzero(other & cameras.reached_by(camera, centers, scales)))
 
 
 def views_at(trainer: Trainer, knot: int) -> list[train_views.TrainView]:

@@ -43,15 +43,25 @@ class StepLog:
             raise CheckpointError(f"{place}; free disk space and continue with --resume") from error
 
 
+def read(path: Path) -> list[dict[str, Any]]:
+    """Return the events of a log, up to the first incomplete line."""
+    events = []
+    for line in path.read_bytes().splitlines():
+        event = _parse(line)
+        if event is None:
+            break
+        events.append(event)
+    return events
+
+
 def clean_up(path: Path, iteration: int) -> None:
     """Drop incomplete lines of a log, and lines of steps after ``iteration``, which will be taken again."""
     kept = []
     try:
         if not path.exists():
             return
-        for line in path.read_bytes().splitlines():
-            event = _parse(line)
-            if event is None or event["iteration"] > iteration:
+        for line, event in zip(path.read_bytes().splitlines(), read(path), strict=False):
+            if event["iteration"] > iteration:
                 break
             kept.append(line + b"\n")
         atomic_files.write(path, b"".join(kept))

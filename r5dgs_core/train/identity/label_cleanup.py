@@ -23,6 +23,7 @@ from scipy.sparse import csgraph
 
 from ...motion import rotations
 from ...scene import visibility
+from .. import observed_motion
 from ..observed_motion import GroupTrack
 
 log = logging.getLogger(__name__)
@@ -191,7 +192,7 @@ def companions(
         members = points[motion_ids == g]
         if len(members) == 0:
             continue
-        radius = np.quantile(np.linalg.norm(members - np.median(members, axis=0), axis=1), 0.9)
+        radius = observed_motion.radius(members, np.median(members, axis=0))
         turned = rotations.multiply(group.quats, rotations.conjugate(group.quats[-1]))
         chords = 2 * np.linalg.norm(turned[:, 1:], axis=1)  # 2 sin(angle / 2)
         went = np.linalg.norm(group.displacements - group.displacements[-1], axis=1) + chords * radius

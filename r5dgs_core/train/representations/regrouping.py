@@ -20,6 +20,7 @@ from scipy import spatial
 
 from ...motion import rotations
 from ...scene import visibility
+from .. import observed_motion
 from ..observed_motion import GroupTrack, RegroupCounts
 
 log = logging.getLogger(__name__)
@@ -100,7 +101,7 @@ def radii(points: np.ndarray, ids: np.ndarray, opacities: np.ndarray, groups: Se
     for g, group in enumerate(groups):
         members = _voting(points, ids, opacities, g)
         if len(members):
-            result[g] = np.quantile(np.linalg.norm(points[members] - group.center, axis=1), 0.9)
+            result[g] = observed_motion.radius(points[members], group.center)
     return result
 
 

@@ -1,4 +1,4 @@
-"""Residual motion of non-rigid bodies: checkpoint tensors, shading, baking, and the row of the needs table."""
+"""Residual motion of non-rigid bodies: checkpoint tensors, shading and baking."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...config.config import Config
 from ...model.residual_field import Change, ResidualField
 from ...model.tracks import Tracks
 from ...motion import rotations
@@ -102,30 +101,3 @@ def point_motion(
         states.append((moved.numpy(), rotations.multiply(turn, quats).numpy(), sizes.numpy()))
     means, quats, sizes = (np.stack(parts, 1) for parts in zip(*states, strict=True))
     return PointMotion(rows, means, quats, sizes), bind
-
-
-def need(
-    tensors: Mapping[str, Tensor], names: Mapping[int, str], config: Config, there: bool
-) -> tuple[float, float, bool, str]:
-    """Return value, threshold, decision and reason for the row "residuals" of the needs table.
-
-    The value is the largest gain, dB.
-
-    Args:
-        tensors: Tensors of the checkpoint.
-        names: Names of the objects by id.
-        config: The run's configuration.
-        there: True if the scene has residuals.
-    """
-    threshold, field = config.residual.threshold, residual_of(tensors)
-    if GAINS not in tensors:
-        reason = "every Gaussian moves by the deformation field" if there else "gain by bending, dB; none was tried"
-        return 0.0, threshold, there, reason
-    gains, ids = tensors[GAINS].numpy(), tensors["object_ids"].numpy()
-    kept = [] if field is None else field.bodies
-    largest = float(np.nanmax(gains)) if np.isfinite(gains).any() else 0.0
-    bent = ", ".join(f"{names.get(int(ids[b]), f'object {ids[b]}')} ({gains[b - 1]:+.1f})" for b in kept)
-    rigid = f"{len(gains) - len(kept)} of {len(gains)} objects are rigid"
-    if kept and not there and config.needs.residuals != "off":
-        bent += ", too little to be stored"
-    return largest, threshold, there, "gain by bending, dB: " + (f"{bent}; {rigid}" if bent else rigid)

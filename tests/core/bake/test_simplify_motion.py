@@ -141,7 +141,7 @@ def test_another_bind_state_shows_the_same_and_followers_follow(given):
     scene = dataclasses.replace(truth.with_arrays(track_poses=poses), groups=(*truth.groups, shadow))
     calm = poses.copy()
     calm[BRICK, -1, 4] += 0.003
-    rebound = bind_state.rebind(scene, simplify_motion._followed(scene, calm))
+    rebound = bind_state.rebind(scene, simplify_motion._move_followers(scene, calm))
     np.testing.assert_array_equal(rebound.tracks.poses[:, -1], [[1, 0, 0, 0, 0, 0, 0]] * 4)
     np.testing.assert_allclose(rebound.groups[BRICK].pivot - truth.groups[BRICK].pivot, [0.003, 0, 0], atol=1e-12)
     np.testing.assert_allclose(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.bake import bake
+from r5dgs_core.bake import bake, point_motion
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError, TrainingError
@@ -250,8 +250,8 @@ def test_nothing_is_tried_with_a_single_observed_time(tiny, tmp_path):
     trainer = advance(Trainer(datasets.read(tmp_path / "still"), settings), 30)
     tensors = trainer.state().tensors
     assert trainer.motion.name == "still" and not any(name.startswith("residual.") for name in tensors)
-    largest, _, there, reason = residual.need(tensors, {}, settings, there=False)
-    assert (largest, there) == (0.0, False) and "none was tried" in reason
+    row = point_motion.residual_need(tensors, {}, settings, there=False)
+    assert (row.value, row.on) == (0.0, False) and "none was tried" in row.reason
 
 
 def test_the_table_marks_deformation_too_small_to_store():
@@ -259,7 +259,7 @@ def test_the_table_marks_deformation_too_small_to_store():
     tensors = residual.tensors_of(field_on(means, ids, weights).only([2]))
     tensors |= {"residual.gains": torch.tensor([-1.0, 0.7]), "object_ids": torch.tensor([0, 1, 2])}
     for there in (True, False):
-        reason = residual.need(tensors, {2: "ball"}, config.load(None), there)[3]
+        reason = point_motion.residual_need(tensors, {2: "ball"}, config.load(None), there).reason
         assert "ball (+0.7)" in reason and ("too little to be stored" in reason) != there
 
 
