@@ -30,7 +30,7 @@ def identity_steps(trainer: Trainer) -> int:
     return trainer.config.identity.iterations if masked and len(trainer.object_ids) > 1 else 0
 
 
-def outcome(trainer: Trainer, progress: Progress) -> dict[str, torch.Tensor]:
+def final_tensors(trainer: Trainer, progress: Progress) -> dict[str, torch.Tensor]:
     """Return labels, identity encodings and the training views' PSNR on the final geometry, by checkpoint names."""
     classes = {int(i): row for row, i in enumerate(trainer.object_ids)}
     group_classes = trainer.motion.group_classes(trainer.motion.tensors())

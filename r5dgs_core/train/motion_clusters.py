@@ -23,13 +23,13 @@ from ..motion import rotations
 SHARE = 0.12  # allowed residual / travel of a point; fields bend rigid motions slightly
 PROPOSALS = 48  # per part
 NEIGHBOURHOOD = 24  # points per proposal
-LINKS = 8  # nearest neighbours that a point may be connected with
+NEIGHBOURS = 8  # nearest neighbours that a point may be connected with
 REACH = 4.0  # maximum connection / median distance of nearest neighbours
 REFITS = 4
-JOINT = 0.7  # minimum share of inliers in both parts for a merge
-LOOSE = 1.5  # factor on the allowed residual for a merge
-LATE = 1.5  # factor on the allowed residual for points that are added at the end
-MOST = 4000  # maximum number of sampled points
+MERGE_INLIERS = 0.7  # minimum share of inliers in both parts for a merge
+MERGE_FACTOR = 1.5  # factor on the allowed residual for a merge
+ATTACH_FACTOR = 1.5  # factor on the allowed residual for points that are added at the end
+MAX_POINTS = 4000  # maximum number of sampled points
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def find(paths: np.ndarray, weights: np.ndarray, tolerance: float, fewest: int, 
         return labels
     reference = paths.shape[1] // 2
     allowed = _allowed(paths, tolerance)
-    sampled = rng.permutation(len(paths))[:MOST]
+    sampled = rng.permutation(len(paths))[:MAX_POINTS]
     parts = _parts(paths[sampled], weights[sampled], allowed[sampled], reference, fewest, rng)
     parts = _joined(paths[sampled], weights[sampled], allowed[sampled], reference, parts)
     parts.sort(key=lambda rows: -weights[sampled][rows].sum())
@@ -158,7 +158,7 @@ def _features(paths: np.ndarray) -> np.ndarray:
 
 def _graph(features: np.ndarray) -> sparse.csr_matrix:
     """Adjacency of points that are neighbours at all times. [R, R]"""
-    count = min(LINKS + 1, len(features))
+    count = min(NEIGHBOURS + 1, len(features))
     found = KDTree(features).query(features, k=count)
     distance, index = np.asarray(found[0]), np.asarray(found[1])
     longest = REACH * np.median(distance[:, 1:])
@@ -195,7 +195,9 @@ def _joined(
                 continue
             balance = np.concatenate([np.full(len(p), 1 / weights[p].sum()) for p in pair])
             motion = fit(paths[both], weights[both] * balance, reference)
-            if all((motion.residuals(paths[p], reference) < LOOSE * allowed[p]).mean() > JOINT for p in pair):
+            if all(
+                (motion.residuals(paths[p], reference) < MERGE_FACTOR * allowed[p]).mean() > MERGE_INLIERS for p in pair
+            ):
                 parts[k] = both
                 del parts[other]
                 break
@@ -221,7 +223,7 @@ def _attached(
         tree = KDTree(features[members])
         spacing = np.median(tree.query(features[members], k=min(2, len(members)))[0][..., -1])
         off = motion.residuals(paths[open_rows], reference) / allowed[open_rows]
-        likely = np.flatnonzero((off < LATE) & (off < best))
+        likely = np.flatnonzero((off < ATTACH_FACTOR) & (off < best))
         reach = 2 * REACH * spacing
         chosen = likely[tree.query(features[open_rows[likely]], distance_upper_bound=reach)[0] < reach]
         labels[open_rows[chosen]], best[chosen] = k, off[chosen]

@@ -19,7 +19,7 @@ import numpy as np
 from ..motion import rotations
 from ..motion.se3 import Pose
 from . import registration
-from .registration import Registration
+from .registration import BodyRegistration
 from .representations.tracks import TracksRepresentation
 from .trainer import Trainer
 
@@ -128,7 +128,7 @@ def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit
         seen: Knots that may predict it.
         limit: Picture error above which turns of the prediction are tried.
     """
-    look = Registration(trainer, _tracks(trainer), body, knot, VIEWS)
+    look = BodyRegistration(trainer, _tracks(trainer), body, knot, VIEWS)
     predicted = _predictions(trainer, body, knot, seen)
     if len(look) < FEWEST_VIEWS or not predicted:
         return False
@@ -142,7 +142,7 @@ def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit
     best = min(near, key=lambda pose: float(rotations.angle_between(pose[0], predicted[0][0])))
     better = _apart(best, own) and least < CLEARLY * look.error(own)
     if better:
-        look.put(best)
+        look.write_pose(best)
     return better
 
 

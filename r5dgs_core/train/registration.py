@@ -43,7 +43,7 @@ class _Look:
     others: PosedSplats
 
 
-class Registration:
+class BodyRegistration:
     """Pictures of a body at a knot.
 
     Args:
@@ -83,7 +83,7 @@ class Registration:
         base, rotvec, shift = (x.numpy().astype(np.float64) for x in self._entries())
         return rotations.normalize(rotations.multiply(rotations.rotvecs_to_quats(rotvec), base)), shift
 
-    def put(self, pose: Pose) -> None:
+    def write_pose(self, pose: Pose) -> None:
         """Write a pose into the tracks."""
         quat, shift = (torch.from_numpy(x).float() for x in pose)
         for entry, value in zip(self._entries(), (quat, torch.zeros(3), shift), strict=True):

@@ -267,7 +267,7 @@ def _complete(session: _Session) -> None:
     _optimise(session)
     stopped = "stopped after the last step, before the labels"
     with interrupt.at_once(f"{stopped}; continue with: {session.resume_command}"):
-        _save(session, finished=True, extra=finish.outcome(trainer, session.progress))
+        _save(session, finished=True, extra=finish.final_tensors(trainer, session.progress))
         session.curves.update(finished=True)
     session.progress({"event": "trained", "gaussians": len(trainer.gaussians)})
 

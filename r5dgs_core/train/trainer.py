@@ -32,8 +32,8 @@ from .initialization import run_start
 from .representations import fused_posing, registry, static
 
 TARGET_BYTES = 1 << 30  # maximum size of the cache of training images as floats
-EYES = 256  # maximum number of cameras in tests of visibility
-HOLD_EVERY = 100  # steps between updates of the held Gaussians
+MAX_CAMERAS = 256  # maximum number of cameras in tests of visibility
+FREEZE_EVERY = 100  # steps between updates of the frozen Gaussians
 
 
 class Trainer:
@@ -83,8 +83,8 @@ class Trainer:
         self.running_loss = math.nan
         view_times = np.array([train_views.nearest_knot(self.times, v.t) for v in self.views])
         self.curriculum = curriculum.Curriculum(config, view_times, len(self.times), self.first_time)
-        self.eyes = [group[0].camera for group in train_views.by_camera(self.views, EYES)]
-        self.held = torch.zeros(0, dtype=torch.bool)
+        self.distinct_cameras = [group[0].camera for group in train_views.by_camera(self.views, MAX_CAMERAS)]
+        self.frozen = torch.zeros(0, dtype=torch.bool)
         self.optimizer = self.make_optimizer()
         self.growth = densification.make(config, self._conditions(), len(self.gaussians))
         self._targets: dict[int, Tensor] = {}
@@ -92,7 +92,9 @@ class Trainer:
     def _conditions(self) -> densifier.Conditions:
         white = self.behind is not None and bool((self.behind == 1).all())
         cameras = [view.camera for view in self.views]
-        return densifier.conditions(self.config, cameras, self.eyes, len(self.gaussians), self.generator, white)
+        return densifier.conditions(
+            self.config, cameras, self.distinct_cameras, len(self.gaussians), self.generator, white
+        )
 
     @property
     def params(self) -> dict[str, Tensor]:
@@ -154,7 +156,7 @@ class Trainer:
         if not (math.isfinite(value) and optimizers.has_finite_gradients(self.optimizer)):
             optimizers.check_finite(self.params, value, place)
         self._hide_harmonics()
-        self._hold_places()
+        self._freeze_single_view_centres()
         self.optimizer.step()
         self.growth.observe(stats, view.camera)
         self.iteration += 1
@@ -162,13 +164,13 @@ class Trainer:
         self._maintain()
         return value
 
-    def _hold_places(self) -> None:
+    def _freeze_single_view_centres(self) -> None:
         """Freeze the centres of background Gaussians that only one camera sees, as their depth is not determined."""
-        if self.iteration % HOLD_EVERY == 0 or len(self.held) != len(self.gaussians):
-            self.held = densifier.single_view(self.gaussians, self.eyes)
+        if self.iteration % FREEZE_EVERY == 0 or len(self.frozen) != len(self.gaussians):
+            self.frozen = densifier.seen_by_one_camera(self.gaussians, self.distinct_cameras)
         gradient = self.gaussians.params["means"].grad
         if gradient is not None:
-            gradient[self.held] = 0.0
+            gradient[self.frozen] = 0.0
 
     def _draw_all(
         self, view: train_views.TrainView, stats: RasterStats
@@ -250,8 +252,8 @@ class Trainer:
         tensors["background"] = self.background.params["background"].detach()
         tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
         tensors["generator"] = self.generator.get_state()
-        if len(self.held) == len(self.gaussians):
-            tensors[checkpoint_content.FROZEN] = self.held
+        if len(self.frozen) == len(self.gaussians):
+            tensors[checkpoint_content.FROZEN] = self.frozen
         tensors |= self.growth.tensors()
         tensors |= optimizers.tensors(self.optimizer)
         x, y, z = (float(v) for v in self.dataset.origin + self.normalization.origin)
@@ -287,7 +289,7 @@ class Trainer:
         if any(len(t) != len(self.gaussians) for n, t in tensors.items() if n.startswith("gradients.")):
             raise CheckpointError(f"the checkpoint's 'gradients.*': expected {len(self.gaussians)} rows each")
         self.growth.restore(tensors)
-        self.held = tensors.get(checkpoint_content.FROZEN, torch.zeros(0, dtype=torch.bool))
+        self.frozen = tensors.get(checkpoint_content.FROZEN, torch.zeros(0, dtype=torch.bool))
         self.optimizer = self.make_optimizer()
         optimizers.restore(self.optimizer, tensors)
         self.iteration = state.iteration

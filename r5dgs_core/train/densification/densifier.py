@@ -186,7 +186,9 @@ def grow(
     return remove
 
 
-def forget(gaussians: Gaussians, optimizer: torch.optim.Optimizer, names: Sequence[str], rows: Tensor | None) -> None:
+def reset_moments(
+    gaussians: Gaussians, optimizer: torch.optim.Optimizer, names: Sequence[str], rows: Tensor | None
+) -> None:
     """Reset the optimizer's moments of some parameters to zero, for some rows or for all (None)."""
     for name in names:
         state = optimizer.state.get(gaussians.params[name], {})
@@ -195,7 +197,7 @@ def forget(gaussians: Gaussians, optimizer: torch.optim.Optimizer, names: Sequen
                 state[key][slice(None) if rows is None else rows] = 0.0
 
 
-def single_view(gaussians: Gaussians, eyes: Sequence[Camera]) -> Tensor:
+def seen_by_one_camera(gaussians: Gaussians, eyes: Sequence[Camera]) -> Tensor:
     """Mask of the background Gaussians in the image of at most one camera: no parallax determines their depth.
 
     Args:
@@ -234,7 +236,7 @@ def floaters(gaussians: Gaussians, eyes: Sequence[Camera], distance: float) -> T
     Returns:
         Mask. [N] bool
     """
-    found = single_view(gaussians, eyes) if distance > 0 else torch.zeros(len(gaussians), dtype=torch.bool)
+    found = seen_by_one_camera(gaussians, eyes) if distance > 0 else torch.zeros(len(gaussians), dtype=torch.bool)
     rows = torch.nonzero(found)[:, 0]
     means = gaussians.params["means"].detach()[rows]
     near = torch.zeros(len(rows), dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Densification by screen-space gradients: `Share` and `Adaptive` (3DGS).
+"""Densification by screen-space gradients: `TopGradientShare` and `AdaptiveDensityControl` (3DGS).
 
 Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5.2.
 """
@@ -47,7 +47,7 @@ class _Gradients:
         self.gradients = ScreenGradients.of(tensors)
 
 
-class Share(_Gradients):
+class TopGradientShare(_Gradients):
     """Default strategy: the Gaussians with the largest gradients grow, up to a share of all per round; no resets.
 
     A small weight on the mean opacity fades Gaussians that no image needs. Otherwise Gaussians that no camera sees, or
@@ -97,7 +97,7 @@ class Share(_Gradients):
         self.gradients = ScreenGradients(len(gaussians))
 
 
-class Adaptive(_Gradients):
+class AdaptiveDensityControl(_Gradients):
     """Default strategy of 3DGS (adaptive density control with opacity resets), with a hard cap.
 
     With a white background, opacities are also reset when growth begins, so that white Gaussians in front of it fade.
@@ -154,4 +154,4 @@ class Adaptive(_Gradients):
         """Lower all opacities to ``reset_opacity``; only those that the images need recover."""
         limit = self.section.reset_opacity
         gaussians.params["opacity_logits"].clamp_(max=math.log(limit / (1 - limit)))
-        densifier.forget(gaussians, optimizer, ("opacity_logits",), None)
+        densifier.reset_moments(gaussians, optimizer, ("opacity_logits",), None)

@@ -110,7 +110,7 @@ class MCMC:
         motion_ids = gaussians.motion_ids.clone()
         motion_ids[rows] = motion_ids[source]
         gaussians.motion_ids = motion_ids
-        densifier.forget(gaussians, optimizer, tuple(gaussians.params), torch.cat([rows, source]))
+        densifier.reset_moments(gaussians, optimizer, tuple(gaussians.params), torch.cat([rows, source]))
 
     @torch.no_grad()
     def add(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
@@ -121,7 +121,7 @@ class MCMC:
         if count > 0 and (opacities > 0).any():
             source = self._draw(opacities, count)
             self._divide(gaussians, source)
-            densifier.forget(gaussians, optimizer, tuple(gaussians.params), source)
+            densifier.reset_moments(gaussians, optimizer, tuple(gaussians.params), source)
             new = {name: tensor[source].clone() for name, tensor in gaussians.params.items()}
             gaussians.extend(optimizer, new, gaussians.motion_ids[source])
 

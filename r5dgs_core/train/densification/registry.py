@@ -18,5 +18,5 @@ def make(config: Config, conditions: Conditions, count: int) -> densifier.Strate
     if config.densify.strategy == "mcmc":
         return mcmc.MCMC(config.densify_mcmc, conditions)
     if config.densify.strategy == "default":
-        return gradient.Adaptive(config.densify_default, conditions, count)
-    return gradient.Share(config.densify, conditions, count)
+        return gradient.AdaptiveDensityControl(config.densify_default, conditions, count)
+    return gradient.TopGradientShare(config.densify, conditions, count)

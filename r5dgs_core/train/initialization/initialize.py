@@ -206,7 +206,7 @@ def _background(
     """Return points and colours of the background: random, of a reconstruction, or of the sweep. [P, 3] each"""
     where, shade = placed.points, placed.colors
     if init.placement == "random":
-        where, shade = scatter.everywhere(backgrounds, init.background_points, rng)
+        where, shade = scatter.random_points(backgrounds, init.background_points, rng)
     elif cloud is not None:
         known, hues = scatter.behind_objects(*cloud, views, init.background_points, rng)
         fill = rng.permutation(len(where))[: max(0, init.background_points - len(known))]

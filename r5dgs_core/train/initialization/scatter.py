@@ -17,7 +17,7 @@ REACH = 1.5  # half the side of the sampled cube / distance of the cameras from 
 BATCHES = 64
 
 
-def everywhere(
+def random_points(
     backgrounds: Sequence[BackgroundImage], count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw random points that at least two cameras see (one if there is only one camera).

@@ -27,7 +27,9 @@ VELOCITY = 30.0  # standard deviation of its velocity, units per span; long gaps
 DEPTH_NOISE = 3.0  # standard deviation of the depth about its prior, the cameras' focus, normalised units
 CUT_OFF = 0.003  # weight of masks that the image border cuts
 PLACED = 0.05  # maximum standard deviation of a measured position, normalised units
-MOST_OF_IT = 0.5  # minimum visible area of an object whose pose training determines, relative to the median over time
+MIN_VISIBLE_AREA = (
+    0.5  # minimum visible area of an object whose pose training determines, relative to the median over time
+)
 ROUNDS = 5
 
 
@@ -105,7 +107,7 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> O
         radii[row] = np.quantile(sizes, 0.8)
         evidence[row] /= np.median(evidence[row][evidence[row] > 0])
     peak = visibility.max(axis=1, keepdims=True) if m else visibility
-    shown = measured | (from_two & (evidence >= MOST_OF_IT))
+    shown = measured | (from_two & (evidence >= MIN_VISIBLE_AREA))
     visibility = visibility / np.maximum(peak, 1e-12)
     return ObjectPositions(ids, centers, measured, visibility, radii, np.minimum(evidence, 1.0), shown)
 

@@ -76,14 +76,14 @@ def observed_motion(
 
     groups, moves = fit(own), None
     if regrouping != "off":
-        made_for = own
-        own, groups, moves = regroup.tidy(path, own, opacities, fit)
+        original_ids = own
+        own, groups, moves = regroup.regroup_until_stable(path, own, opacities, fit)
         if len(shadows) == 0:  # without shadow groups, background Gaussians may imitate shadows
             casters = regroup.imitators(path, own, opacities, groups, normal)
             shadows = np.unique(casters[casters > 0]).tolist()
             if shadows:
                 own = np.where(casters > 0, len(object_ids) + np.searchsorted(shadows, casters), own)
-                own, groups, moves = regroup.tidy(path, own, opacities, fit, made_for)
+                own, groups, moves = regroup.regroup_until_stable(path, own, opacities, fit, original_ids)
         motion_ids[rows] = own
     return ObservedMotion(at, tuple(groups), light, bind, motion_ids, points, moves=moves)
 
@@ -179,11 +179,11 @@ def _groups(
     groups = [GroupTrack(0, "pinned", np.zeros(3), *still, observed[0])]
     for row in range(1, len(object_ids)):
         members = ids == row
-        center, quat, shift = _track(path[members], regroup.voters(path[members, -1], opacities[members]))
+        center, quat, shift = _track(path[members], regroup.fit_weights(path[members, -1], opacities[members]))
         groups.append(GroupTrack(int(object_ids[row]), "body", center, quat, shift, observed[row]))
     for k, caster in enumerate(shadows):
         members = ids == len(object_ids) + k
-        leader, weights = groups[caster], regroup.voters(path[members, -1], opacities[members])
+        leader, weights = groups[caster], regroup.fit_weights(path[members, -1], opacities[members])
         matrix = _follow(path[members], weights, leader.displacements, normal)
         if not follows(path[members], weights, leader.displacements, normal):
             matrix = np.zeros((3, 3))

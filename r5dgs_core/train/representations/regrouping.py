@@ -37,12 +37,12 @@ FEWEST = 5  # minimum number of Gaussians in a shadow
 AT_ONCE = 8192  # Gaussians per block; bounds memory
 
 
-def tidy(
+def regroup_until_stable(
     path: np.ndarray,
     ids: np.ndarray,
     opacities: np.ndarray,
     fit: Callable[[np.ndarray], list[GroupTrack]],
-    made_for: np.ndarray | None = None,
+    original_ids: np.ndarray | None = None,
 ) -> tuple[np.ndarray, list[GroupTrack], RegroupCounts]:
     """Regroup Gaussians and refit the groups until no Gaussian changes its group.
 
@@ -51,12 +51,12 @@ def tidy(
         ids: Their groups. [R]
         opacities: [R]
         fit: Fits the groups to given ids, with poses relative to the last knot.
-        made_for: Original groups for the counts, if they are not ``ids``. [R]
+        original_ids: Original groups for the counts, if they are not ``ids``. [R]
 
     Returns:
         Groups of the Gaussians [R], the groups fitted to them, and the counts of changes.
     """
-    start, groups = ids if made_for is None else made_for, fit(ids)
+    start, groups = ids if original_ids is None else original_ids, fit(ids)
     for _ in range(ROUNDS):
         found = regroup(path, ids, opacities, groups)
         if (found == ids).all():
@@ -71,7 +71,7 @@ def tidy(
     return ids, groups, moves
 
 
-def voters(points: np.ndarray, opacities: np.ndarray) -> np.ndarray:
+def fit_weights(points: np.ndarray, opacities: np.ndarray) -> np.ndarray:
     """Return the weights of members in the fit of their group: their opacities, or 0 for floaters. [n]
 
     Faint members are not excluded: without them, tracks are less accurate (measured against true poses).
@@ -230,7 +230,7 @@ def _alone(
 def _voting(points: np.ndarray, ids: np.ndarray, opacities: np.ndarray, group: int) -> np.ndarray:
     """Rows of the members that define a group's place: visible, and not floaters."""
     rows = np.flatnonzero(ids == group)
-    return rows[(voters(points[rows], opacities[rows]) > 0) & visibility.seen(opacities[rows])]
+    return rows[(fit_weights(points[rows], opacities[rows]) > 0) & visibility.seen(opacities[rows])]
 
 
 def _distances(points: np.ndarray, members: np.ndarray, limit: float) -> np.ndarray:

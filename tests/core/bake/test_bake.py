@@ -68,7 +68,7 @@ def test_unfinished_runs_with_other_options_bake_to_their_current_state(tiny, tm
     def stop(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(finish, "outcome", stop)
+    monkeypatch.setattr(finish, "final_tensors", stop)
     with pytest.raises(Interrupted):
         train_briefly(tiny, tmp_path / "run", *overrides)
     made = checkpoint.open_run(tmp_path / "run")

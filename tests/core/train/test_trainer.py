@@ -155,7 +155,7 @@ def test_background_seen_by_a_single_camera_keeps_its_position(tiny):
     trainer = make(tiny, "densify.start=1000")
     means = trainer.gaussians.params["means"]
     row = int(torch.nonzero(trainer.gaussians.motion_ids == 0)[0, 0])
-    eye = trainer.eyes[0]
+    eye = trainer.distinct_cameras[0]
     with torch.no_grad():
         means[row] = torch.from_numpy(eye.center + 0.3 * eye.forward).float()
     before = means.detach().clone()

@@ -59,13 +59,15 @@ def conditions(cap=1000, seed=0, extent=1.0, eyes=(), iterations=1000):
 
 def densify(gaussians, optimizer, found, cap=1000, section=SECTION, width_limit=10.0, seed=0):
     section = dataclasses.replace(section, prune_width=width_limit / (100 * PIXEL))
-    strategy = gradient.Share(section, conditions(cap, seed), len(gaussians))
+    strategy = gradient.TopGradientShare(section, conditions(cap, seed), len(gaussians))
     strategy.gradients = found
     strategy.round(gaussians, optimizer)
 
 
 def adapt(gaussians, optimizer, found, cap=1000, seed=0, extent=1.0, sizes=False, **section):
-    strategy = gradient.Adaptive(DensifyDefaultSection(**section), conditions(cap, seed, extent), len(gaussians))
+    strategy = gradient.AdaptiveDensityControl(
+        DensifyDefaultSection(**section), conditions(cap, seed, extent), len(gaussians)
+    )
     strategy.gradients = found
     strategy.round(gaussians, optimizer, sizes=sizes)
 
@@ -157,7 +159,7 @@ def test_background_near_a_camera_that_no_other_camera_sees_is_removed():
         gaussians.means.copy_(torch.stack([before_first, before_first, middle, -50 * before_first]))
     gaussians.motion_ids = torch.tensor([0, 1, 0, 0])  # the second belongs to a body
     assert densifier.floaters(gaussians, eyes, 1.0).tolist() == [True, False, False, False]
-    assert densifier.single_view(gaussians, eyes).tolist() == [True, False, False, True]
+    assert densifier.seen_by_one_camera(gaussians, eyes).tolist() == [True, False, False, True]
     assert not densifier.floaters(gaussians, eyes, 0.0).any()
     assert not densifier.floaters(gaussians, eyes[:2], 1.0).any()  # no second opinion
 
@@ -171,7 +173,7 @@ def test_nothing_grows_under_the_gradient_of_the_configuration():
 def test_gaussians_that_no_image_needs_fade_and_are_removed():
     gaussians, optimizer = make(n=6)
     wanted = torch.arange(6) < 4
-    strategy = gradient.Share(SECTION, conditions(), 6)
+    strategy = gradient.TopGradientShare(SECTION, conditions(), 6)
     optimizer.param_groups[3]["lr"] = 0.05
     for iteration in range(1, 301):
         optimizer.zero_grad()
@@ -183,7 +185,7 @@ def test_gaussians_that_no_image_needs_fade_and_are_removed():
     torch.testing.assert_close(
         torch.sigmoid(gaussians.opacity_logits).detach(), torch.full((4,), 0.7), atol=0.03, rtol=0
     )
-    kept = gradient.Share(dataclasses.replace(SECTION, opacity=0.0), conditions(), 6)
+    kept = gradient.TopGradientShare(dataclasses.replace(SECTION, opacity=0.0), conditions(), 6)
     assert kept.penalty(gaussians) is None
 
 
@@ -219,7 +221,7 @@ def test_a_reset_lowers_high_opacities_and_clears_their_moments():
         gaussians.opacity_logits.copy_(torch.tensor([0.9, 0.5, 0.006]).logit())
     (gaussians.opacity_logits.sum() + gaussians.means.sum()).backward()
     optimizer.step()
-    strategy = gradient.Adaptive(DensifyDefaultSection(), conditions(iterations=30000), 3)
+    strategy = gradient.AdaptiveDensityControl(DensifyDefaultSection(), conditions(iterations=30000), 3)
     strategy.after_step(gaussians, optimizer, 2999, 1e-3)
     assert torch.sigmoid(gaussians.opacity_logits)[0] > 0.8
     strategy.gradients = gradients(torch.zeros(3))
@@ -235,7 +237,7 @@ def test_opacities_are_reset_as_growth_begins_where_the_background_is_white(whit
     section = DensifyDefaultSection(start=30, every=1000, reset_every=100)
     place = dataclasses.replace(conditions(iterations=500), white=white)
     gaussians, optimizer = make()
-    strategy, found = gradient.Adaptive(section, place, 40), []
+    strategy, found = gradient.AdaptiveDensityControl(section, place, 40), []
     for iteration in range(1, 501):
         with torch.no_grad():
             gaussians.opacity_logits.fill_(1.0)
@@ -247,7 +249,7 @@ def test_opacities_are_reset_as_growth_begins_where_the_background_is_white(whit
 
 def test_rounds_follow_the_schedule_of_the_section():
     section = DensifyDefaultSection(start=100, stop=0.5, every=50, reset_every=0)
-    strategy = gradient.Adaptive(section, conditions(cap=10**6), 40)
+    strategy = gradient.AdaptiveDensityControl(section, conditions(cap=10**6), 40)
     gaussians, optimizer = make()
     grew = []
     for iteration in range(1, 1001):

@@ -29,7 +29,7 @@ RANDOM = (
 def test_every_point_is_seen_by_two_cameras(tiny):
     trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings(*RANDOM))
     scenes = background_images.compute(trainer.views)
-    points, colors = scatter.everywhere(scenes, 200, np.random.default_rng(0))
+    points, colors = scatter.random_points(scenes, 200, np.random.default_rng(0))
     assert points.shape == colors.shape == (200, 3)
     assert colors.min() >= 0 and colors.max() <= 1
     seen = 0

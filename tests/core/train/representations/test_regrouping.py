@@ -46,7 +46,7 @@ def fit_to(path, opacities):
 
 
 def tidy(path, ids, opacities):
-    return regrouping.tidy(path, ids, opacities, fit_to(path, opacities))
+    return regrouping.regroup_until_stable(path, ids, opacities, fit_to(path, opacities))
 
 
 def spread_of(groups, truth):
