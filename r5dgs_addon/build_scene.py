@@ -41,7 +41,7 @@ class Options:
     Attributes:
         world_convention: Key of `cameras.WORLD_TO_BLENDER`, or "" for the one stored in the file.
         frame_zero: Frame of scene time 0.
-        t_end: Scene time up to which motion is extrapolated, or None for `timeline.default_end`.
+        t_end: Scene time up to which motion is extrapolated, or None for `predictability.horizon`.
         key_tolerance: Maximum error of the reduced keys, as a fraction of the scene's extent.
         fit_timeline: True to set the frame range, and markers at t_max and at the observed events.
         sh_degree: Highest spherical-harmonics degree stored on the points.

@@ -36,6 +36,8 @@ def poses(scene: Scene, t: float, mode: str = "rigid") -> dict[str, np.ndarray]:
     Returns:
         Matrix of each object by its name, which maps world positions at t_max to those at ``t``: the pose of the
         object's first rigid body, or the identity for objects at rest. [4, 4] float64
+        ``scene.predictability.warnings`` names objects whose motion past t_max is not predictable, and
+        ``scene.predictability.outlooks`` has the half widths of their confidence bands.
     """
     quats, displacements = Player(scene, mode).group_poses(t)
     bodies = {group.object_id: group for group in reversed(scene.groups) if group.role == "body"}

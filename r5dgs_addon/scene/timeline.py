@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import bpy
 
 from ...r5dgs_core import errors
+from ...r5dgs_core.scene import predictability
 from ...r5dgs_core.scene.scene import Scene
 
 MARKER = "t_max"
@@ -35,7 +36,7 @@ class Times:
     def of(scene: Scene, frame_zero: float = 1.0, t_end: float | None = None) -> "Times":
         """Times of a scene; an end before t_max is clamped to t_max."""
         start = float(scene.tracks.times[0])
-        end = default_end(scene) if t_end is None else max(float(t_end), scene.t_max)
+        end = predictability.horizon(scene) if t_end is None else max(float(t_end), scene.t_max)
         return Times(start, float(scene.t_max), end, float(scene.frames_per_unit), float(frame_zero))
 
     def frame(self, t: float) -> float:
@@ -51,12 +52,6 @@ def of_collection(collection: bpy.types.Collection) -> Times:
     """Times of a loaded scene, from its properties."""
     state = collection.r5dgs
     return Times(state.t_start, state.t_max, state.t_end, state.frames_per_unit, state.frame_zero)
-
-
-def default_end(scene: Scene) -> float:
-    """Default end of extrapolation: a third of the observed span after t_max, but at least scene time 1."""
-    start = float(scene.tracks.times[0])
-    return max(scene.t_max + (scene.t_max - start) / 3, 1.0)
 
 
 def check_end(name: str, times: Times) -> None:

@@ -24,7 +24,7 @@ from scipy import ndimage
 from ..config.config import Config
 from ..data import dataset as datasets
 from ..motion import rotations
-from ..motion.history import PoseErrors
+from ..motion.history import UNKNOWN_TURN, PoseErrors
 from ..playback import scene_player
 from ..render import posed_scene, scene_renderer
 from ..render.posed_scene import PosedScene
@@ -39,7 +39,7 @@ FEWEST_PIXELS = 8  # minimum number of pixels of a body in a view
 FACTORS = (2.0, 4.5)  # ratios of measured errors to deviations, for displacements and rotations
 UNEXPLAINED = 0.5  # misfit above which the rotations are unknown, as a share of the contrast of the texture
 LARGE = 2.0  # misfit that may count as unexplained, relative to the root mean square misfit of all pixels
-UNKNOWN = 1.0  # standard deviation of an unknown rotation, rad, or displacement, radii
+UNKNOWN = UNKNOWN_TURN  # also the standard deviation of an unknown displacement, radii
 EXACT = 1e-6  # error that cannot be distinguished from zero, rad or radii
 
 

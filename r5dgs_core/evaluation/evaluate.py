@@ -22,6 +22,7 @@ from ..data import images
 from ..errors import ConfigError
 from ..playback import scene_player
 from ..render import scene_renderer
+from ..scene import predictability
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from . import ground_truth_poses, metrics, miou
@@ -82,13 +83,14 @@ def evaluate(
         progress: Called with the number of measured images and the total.
 
     Returns:
-        ``{"scene", "splits": {split: {mode: METRICS}}, "objects": [...], "train": {...}}`` in JSON types. Values that
-        cannot be computed are None.
+        ``{"scene", "splits": {split: {mode: METRICS}}, "objects": [...], "horizon", "train": {...}}`` in JSON
+        types. Values that cannot be computed are None.
     """
     background = truth_background(scene) if background is None else background
     total = sum(len(dataset.views(split)) for split in splits) * len(modes)
     done = 0
     result: dict[str, Any] = {"scene": scene.name, "splits": {}, "objects": object_errors(scene, dataset.ground_truth)}
+    result["horizon"] = predictability.horizon(scene)
     for split in splits:
         result["splits"][split] = {}
         views = dataset.views(split)
@@ -222,8 +224,9 @@ def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> li
     the observed times at which the object was seen (`ground_truth_poses.bodies`).
 
     Returns:
-        Per object ``id name position_error rotation_error_deg``, in world units and degrees; None if the object has no
-        true pose or no motion group. Without ground truth, one row per object of the scene.
+        Per object ``id name position_error rotation_error_deg warning half_width half_width_percent``, in world units
+        and degrees. The errors are None if the object has no true pose or no motion group, the others if the scene
+        stores no confidence band (`predictability.Outlook`). Without ground truth, one row per object of the scene.
     """
     named = {item.id: item.name for item in scene.objects if item.id > 0}
     known: tuple[ground_truth_poses.Body, ...] = ()
@@ -231,8 +234,10 @@ def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> li
         known = ground_truth_poses.bodies(scene, ground_truth)
         if not scene.provenance.get("discovered"):  # ids of discovered objects do not correspond to the true ids
             named = dict(zip(ground_truth.object_ids, ground_truth.names, strict=True)) | named
+    outlooks = predictability.outlooks(scene)
     rows: dict[int, dict[str, Any]] = {
         key: {"id": key, "name": name, "position_error": None, "rotation_error_deg": None}
+        | outlooks.get(key, predictability.UNKNOWN).prediction()
         for key, name in named.items()
     }
     for body in known:

@@ -1,4 +1,4 @@
-"""Table of a scene's objects: visibility, motion and confidence of the label of each."""
+"""Tables of a scene's objects: visibility, motion and confidence of the label of each; errors of its motion."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from rich.text import Text
 from ..data import dataset as datasets
 from ..playback import scene_player
 from ..render import viewpoints
+from ..scene import predictability
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
 from . import evaluate, miou
@@ -42,6 +43,7 @@ class ObjectRow:
             None if the scene stores no encodings.
         strays: Number of members that move with the group of another object.
         iou: IoU with the true masks of the views, same ids; None if no mask shows the object.
+        outlook: Reliability of its motion.
     """
 
     id: int
@@ -56,6 +58,7 @@ class ObjectRow:
     confidence: float | None
     strays: int
     iou: float | None
+    outlook: predictability.Outlook = predictability.UNKNOWN
 
 
 def measure(
@@ -84,6 +87,7 @@ def measure(
             tally.add(ids, mask)
     found = tally.result()
     known, sure, astray = found["iou_objects"] or {}, confidences(scene), strays(scene)
+    outlooks = predictability.outlooks(scene)
     rows = []
     for item in scene.objects:
         groups = [group for group in scene.groups if group.object_id == item.id and group.role == "body"]
@@ -100,6 +104,7 @@ def measure(
             confidence=sure.get(item.id),
             strays=astray.get(item.id, 0),
             iou=known.get(str(item.id)) if item.id > 0 else found["iou_background"] if item.id == 0 else None,
+            outlook=outlooks[item.id],
         )
         rows.append(row)
     return rows
@@ -178,11 +183,51 @@ def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:
     return shown
 
 
+def outlook_table(scene: Scene, rows: Sequence[ObjectRow]) -> Table | None:
+    """Return the reliability of the objects' motion as a terminal table; None if nothing is known of any object.
+
+    Args:
+        scene: The scene.
+        rows: Rows of `measure`.
+    """
+    known = [row for row in rows if row.outlook.is_known]
+    if not known:
+        return None
+    title = "errors of observed poses, and confidence of the prediction"
+    shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    end = f"at t = {predictability.horizon(scene):g}"
+    for name in ("id", "name", "rotation", "position", end, "prediction"):
+        left = name in ("name", "prediction")
+        shown.add_column(name, justify="left" if left else "right", no_wrap=name == "id", overflow="fold")
+    for row in known:
+        own = row.outlook
+        turn = "-" if own.rotation_error_deg is None else predictability.rotation_text(own.rotation_error_deg)
+        place = "-" if own.position_error_percent is None else predictability.position_text(own.position_error_percent)
+        width = "-" if own.half_width is None else f"± {own.half_width:.2g} ({own.half_width_percent:.2g} %)"
+        shown.add_row(*map(Text, (str(row.id), row.name, turn, place, width, own.warning or "")))
+    shown.caption, shown.caption_justify = _OUTLOOK, "left"
+    return shown
+
+
+_OUTLOOK = (
+    "rotation, position: estimated standard deviations of the observed poses, median over the times and worst; "
+    "%: of the object's size; ±: half width of the 95 % band in world units"
+)
+
+
 def to_json(scene: Scene, rows: Sequence[ObjectRow], views: int) -> dict[str, Any]:
-    """Return the rows as JSON: ``{"scene", "views", "hygiene", "label_hygiene", "objects": [ObjectRow, ...]}``."""
-    objects = [asdict(row) | {"aliases": list(row.aliases)} for row in rows]
+    """Return the rows as JSON: ``{"scene", "views", "horizon", "hygiene", "label_hygiene", "objects": [...]}``.
+
+    An object has the attributes of `ObjectRow`, with those of its `predictability.Outlook`.
+    """
+    objects = []
+    for row in rows:
+        found = asdict(row)
+        outlook = found.pop("outlook")
+        objects.append({**found, "aliases": list(row.aliases), **outlook})
     cleaned = {"hygiene": _recorded(scene, "regrouping"), "label_hygiene": _recorded(scene, "label_hygiene")}
-    return {"scene": scene.name, "views": views, **cleaned, "objects": objects}
+    end = predictability.horizon(scene)
+    return {"scene": scene.name, "views": views, "horizon": end, **cleaned, "objects": objects}
 
 
 def _recorded(scene: Scene, key: str) -> dict[str, Any] | None:

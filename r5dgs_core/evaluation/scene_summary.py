@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import terminal
 from ..motion.models import KINDS
-from ..scene import quality
+from ..scene import predictability, quality
 from ..scene.scene import MotionGroup, Scene
 
 STILL = 0.05  # maximum motion of a still object, as a share of its radius
@@ -44,7 +44,8 @@ def summary(scene: Scene, path: Path | None = None) -> str:
     objects = [item for item in scene.objects if item.id > 0]
     first, fps = float(scene.tracks.times[0]), scene.frames_per_unit
     frames = round((scene.t_max - first) * fps) + 1
-    moving = [(item.name, motion) for item in objects if (motion := observed_motion(scene, item.id)) is not None]
+    moving = [(item, motion) for item in objects if (motion := observed_motion(scene, item.id)) is not None]
+    outlooks = predictability.outlooks(scene)
     count = "1 object" if len(objects) == 1 else f"{len(objects)} objects"
     lines = [
         f"scene      {terminal.printable(scene.name)}: {len(scene.gaussians.means)} Gaussians, {count}",
@@ -52,11 +53,19 @@ def summary(scene: Scene, path: Path | None = None) -> str:
         f"frames     {fps:g} per unit of scene time (per second if the data set's times are seconds)",
         f"extent     {scene.extent:.3g} world units",
         f"moving     {len(moving)} of {len(objects)} objects",
-        *(f"  {terminal.printable(name)}: {motion}" for name, motion in moving),
+        *(f"  {terminal.printable(item.name)}: {motion}{_band(scene, outlooks[item.id])}" for item, motion in moving),
         f"quality    {quality.of(scene, path).text()}",
         *_loss_of_baking(scene),
     ]
     return "\n".join(lines)
+
+
+def _band(scene: Scene, outlook: predictability.Outlook) -> str:
+    """Return the half width of an object's confidence band in words, or "" if it is unknown."""
+    if outlook.half_width is None:
+        return ""
+    share = f"{outlook.half_width_percent:.2g} % of its size"
+    return f"; ± {outlook.half_width:.2g} world units ({share}) at t = {predictability.horizon(scene):g}"
 
 
 def _loss_of_baking(scene: Scene) -> list[str]:

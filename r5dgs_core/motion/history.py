@@ -9,6 +9,7 @@ import numpy as np
 
 EVENTS = ("start", "stop", "impact", "change")
 MOST_KNOTS = 16
+UNKNOWN_TURN = 1.0  # standard deviation of a rotation that the images do not determine, rad
 _RATES = {"velocity": True, "acceleration": True, "angular_velocity": False}  # True for rates that scale with the scene
 _DONE = {"start": "set off", "stop": "stopped", "impact": "hit", "change": "changed"}
 
@@ -89,7 +90,7 @@ class PoseErrors:
 
     Attributes:
         place: Of the displacements, world units. [S]
-        turn: Of the rotations, rad. [S]
+        turn: Of the rotations, rad; `UNKNOWN_TURN` if the images do not determine them. [S]
     """
 
     place: tuple[float, ...]

@@ -6,18 +6,21 @@ from typing import Any
 
 import numpy as np
 
+from ..scene import predictability
 from ..scene.scene import Scene
 from . import scene_player
 
 
 def info(scene: Scene) -> dict[str, Any]:
     """Return the output of `r5dgs info --json` as JSON types."""
+    outlooks = predictability.outlooks(scene)
     return {
         "name": scene.name,
         "gaussians": len(scene.gaussians.means),
         "sh_degree": int(np.sqrt(scene.gaussians.sh.shape[1])) - 1,
         "objects": [
-            {"id": o.id, "name": o.name, "aliases": list(o.aliases), "gaussians": o.count} for o in scene.objects
+            {"id": o.id, "name": o.name, "aliases": list(o.aliases), "gaussians": o.count} | outlooks[o.id].prediction()
+            for o in scene.objects
         ],
         "motion_groups": [
             {
@@ -31,6 +34,7 @@ def info(scene: Scene) -> dict[str, Any]:
             for g in scene.groups
         ],
         "times": [float(scene.tracks.times[0]), scene.t_max],
+        "horizon": predictability.horizon(scene),
         "knots": len(scene.tracks.times),
         "frames_per_unit": scene.frames_per_unit,
         "world_convention": scene.world_convention,

@@ -66,6 +66,7 @@ def run_evaluate(
 
     from ...evaluation import evaluate, evaluation_table
     from ...progress import make
+    from ...scene import predictability
     from ...train import checkpoint
 
     options.use_threads(threads)
@@ -86,6 +87,8 @@ def run_evaluate(
     path = json_path or default
     if progress_kind != "json":
         terminal.console().print(evaluation_table.make(result))
+        for line in predictability.warnings(scene):
+            print(line)
     evaluate.write(result, path)
     if progress_kind != "json":
         print(f"written: {path}")

@@ -83,7 +83,11 @@ def run_objects(
     if as_json:
         print(json.dumps(result, indent=2))
     else:
-        terminal.console().print(object_table.table(scene, rows, len(views)))
+        console = terminal.console()
+        console.print(object_table.table(scene, rows, len(views)))
+        outlook = object_table.outlook_table(scene, rows)
+        if outlook is not None:
+            console.print(outlook)
     if legend is not None and standpoint is not None:
         from ...data import images
         from ...evaluation import legend as legends

@@ -45,13 +45,24 @@ def run_train(
     threads: int | None = None,
     progress_kind: str,
 ) -> None:
-    """Train a run folder from a data set (see `train.run.train`)."""
+    """Train a run folder from a data set (see `train.run.train`), and name objects whose motion is not predictable."""
     from ...progress import make
 
     settings = options.training_settings(out, config_path, overrides, preset=preset, resume=resume)
     inputs.check_dataset(data)
-    from ...train import run
+    from ...bake import quick_fit
+    from ...scene import predictability
+    from ...train import interrupt, run
 
     options.use_threads(threads)
     with make(progress_kind) as progress:
-        run.train(data, out, settings, resume=resume, overwrite=overwrite, progress=progress)
+        trained = run.train(data, out, settings, resume=resume, overwrite=overwrite, progress=progress)
+        with interrupt.at_once(f"{out} is trained; stopped while its motion was fitted"):
+            progress({"event": "prepare", "text": "motion past the last observed time"})
+            lines = predictability.warnings(quick_fit.scene_of(trained))
+        if progress_kind == "json":
+            for line in lines:
+                progress({"event": "warning", "text": line})
+    if progress_kind == "auto":
+        for line in lines:
+            print(line)

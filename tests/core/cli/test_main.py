@@ -24,6 +24,7 @@ from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.config import presets
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.evaluation import evaluate, scene_summary
+from r5dgs_core.motion.history import Band, History
 from r5dgs_core.playback import modes
 from r5dgs_core.raster import compilation
 from r5dgs_core.scene import scene_file
@@ -83,7 +84,7 @@ def test_evaluate_measures_a_run_and_a_scene(made, tiny, capsys, target):
 
 def test_evaluate_writes_to_the_given_path(made, tmp_path, capsys):
     assert main.main(["evaluate", str(made[0]), "--json", str(tmp_path / "e.json")]) == 0
-    assert set(json.loads((tmp_path / "e.json").read_text())) == {"scene", "splits", "objects", "train"}
+    assert set(json.loads((tmp_path / "e.json").read_text())) == {"scene", "splits", "objects", "horizon", "train"}
 
 
 def test_info_prints_the_same_values_as_text_and_json(made, capsys):
@@ -110,6 +111,13 @@ def test_a_summary_names_what_moves_and_how(scene):
         assert (f"\n  {item.name}: " in text) == (item.name not in resting)
     shown = [item for item in scene.objects if item.id > 0]
     assert f"moving     {len(scene.objects) - len(resting)} of {len(shown)} objects" in text
+
+
+def test_a_summary_has_the_half_width_of_a_known_band(scene):
+    assert "±" not in scene_summary.summary(scene)
+    band = Band((scene.t_max, 2 * scene.t_max), (0.1, 0.1), (0.1, 0.1))
+    groups = tuple(dataclasses.replace(g, history=History(band=band)) if g.id == 1 else g for g in scene.groups)
+    assert "; ± 0.1 world units (" in scene_summary.summary(dataclasses.replace(scene, groups=groups))
 
 
 @pytest.mark.parametrize("odd", ["x", {}, {"checkpoint_psnr": 1.0, "baked_psnr": "x"}])

@@ -28,12 +28,13 @@ def changed_group(scene, index: int, **model):
 
 
 def test_the_result_has_its_fixed_shape_and_is_json(result, scene):
-    assert set(result) == {"scene", "splits", "objects", "train"}
+    assert set(result) == {"scene", "splits", "objects", "horizon", "train"}
     assert set(result["splits"]) == {"val", "test"}
     for split in result["splits"].values():
         assert tuple(split["rigid"]) == evaluate.METRICS
     for row in result["objects"]:
-        assert set(row) == {"id", "name", "position_error", "rotation_error_deg"}
+        keys = {"id", "name", "position_error", "rotation_error_deg", "warning", "half_width", "half_width_percent"}
+        assert set(row) == keys
     assert set(result["train"]) == {"seconds", "iterations", "gaussians"}
     assert result["train"]["gaussians"] == len(scene.gaussians.means)
     assert json.loads(json.dumps(result, allow_nan=False)) == result

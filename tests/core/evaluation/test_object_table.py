@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from r5dgs_core.evaluation import evaluate, object_table, scene_summary
+from r5dgs_core.motion.history import Band, Event, History, PoseErrors
 from tests.support import pictures
 
 BACKEND = pictures.BACKEND
@@ -121,6 +122,25 @@ def test_names_are_shown_unchanged_and_json_is_valid(scene):
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert found["hygiene"] == {"moving": 90, "to_bodies": 7} and found["objects"][2]["aliases"] == ["cup"]
     assert object_table.to_json(scene, rows, 0)["hygiene"] is None
+
+
+def test_errors_of_poses_and_the_confidence_of_predictions_are_a_second_table(scene):
+    assert object_table.outlook_table(scene, object_table.measure(scene, [])) is None
+    band = Band((scene.t_max, 2 * scene.t_max), (0.1, 0.1), (0.1, 0.1), predictable_until=0.85)
+    found = History((Event(0.55, "impact", 0.01),), (), band, PoseErrors((0.01, 0.02), (0.01, 0.05)))
+    groups = [dataclasses.replace(g, history=found) if g.id == 1 else g for g in scene.groups]
+    hit = dataclasses.replace(scene, groups=tuple(groups))
+    rows = object_table.measure(hit, [])
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(object_table.outlook_table(hit, rows))
+    text = console.export_text()
+    assert "1.7°, worst 2.9°" in text and "± 0.1" in text and "not predictable past 0.85 (hit at 0.55)" in text
+    shown = object_table.to_json(hit, rows, 0)
+    assert json.loads(json.dumps(shown, allow_nan=False)) == shown
+    mug, other = shown["objects"][2], shown["objects"][3]
+    assert mug["warning"] == found.warning() and mug["half_width"] == pytest.approx(0.1)
+    assert set(mug["rotation_error_deg"]) == {"median", "worst"}
+    assert other["warning"] is None and other["half_width"] is None and other["position_error_percent"] is None
 
 
 def test_the_table_fits_a_narrow_terminal(scene, data):

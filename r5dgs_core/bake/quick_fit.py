@@ -1,0 +1,26 @@
+"""Prediction of a run without the training images: the fit of `bake`, in a fraction of its time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..scene.scene import Scene
+from ..train import checkpoint
+from . import assemble, read_checkpoint, simplify_motion
+
+
+def scene_of(run: checkpoint.Run) -> Scene:
+    """Return a scene with the motion past t_max fitted to the trained poses alone.
+
+    Compared with `bake.bake`, slight motion is not checked against the images, and the errors of the poses are unknown.
+
+    Args:
+        run: A run folder; its data set is where it was during training.
+
+    Raises:
+        CheckpointError, DatasetError: A file is missing or damaged.
+    """
+    context = read_checkpoint.open_context(run, None)
+    draft = assemble.draft(read_checkpoint.observe(context), context)
+    observed = np.stack([group.observed for group in draft.observed.motion.groups])
+    return simplify_motion.simplify(draft.scene, observed, None, context.wanted).scene
