@@ -25,14 +25,11 @@ import numpy as np
 from scipy import stats
 
 from ..config.sections.needs import NeedsSection
-from ..motion import free_top, rotations
+from ..motion import rotations
 from ..motion.history import PoseErrors
 from ..motion_fit import model_selection, shared_gravity
-from ..motion_fit import noise as noises
-from ..scene import visibility
 from ..scene.scene import MotionGroup, Scene
-from ..scene.splats import to_opacities
-from . import bind_state, falling_bodies, image_evidence, needs, pose_errors, track_checks
+from . import bind_state, future_fit, image_evidence, needs, pose_errors, track_checks
 from .draft import Context, Draft, Need
 from .image_evidence import ImageEvidence
 
@@ -163,12 +160,12 @@ def simplify(
         future = _future(bound.tracks.poses[g.id], mine)
         if np.any(future[:, 1:] != 0):
             track_checks.warn_of_aliasing(names[g.object_id], scene.tracks.times, future)
-            fits[g.id] = _fit(bound, g.id, observed[g.id], future, mine, errors.get(g.id))
-        description = _describe(fits[g.id][1] if g.id in fits else None)
+            fits[g.id] = future_fit.fit(bound, g.id, observed[g.id], future, _noise(mine), errors.get(g.id))
+        description = future_fit.describe(fits[g.id][1] if g.id in fits else None)
         travel = float(np.linalg.norm(bound.tracks.poses[g.id, :, 4:], axis=1).max()) / (2 * g.model.radius)
         found = [_row(part, part in dropped, losses.get(id(part)), description, travel) for part in mine]
         rows += [{"object": names[g.object_id], **row} for row in found]
-    shared = falling_bodies.share_gravity(fits, scene.world_convention)
+    shared = future_fit.share_gravity(fits, scene.world_convention)
     models = {index: fit.model for index, fit in shared.items()}
     groups = list(bound.groups)
     for part in parts:  # a model fitted without noise starts at the bind state
@@ -300,48 +297,10 @@ def _future(poses: np.ndarray, parts: Sequence[_Simplification]) -> np.ndarray:
     return result
 
 
-def _fit(
-    scene: Scene,
-    group: int,
-    observed: np.ndarray,
-    poses: np.ndarray,
-    parts: Sequence[_Simplification],
-    errors: PoseErrors | None,
-) -> tuple[shared_gravity.Track, model_selection.Fit]:
-    """Fit a body's motion past t_max and return its track and the fit.
-
-    The noise is at least that measured in the images.
-    """
-    members = scene.gaussians.motion_ids == group
-    opacities = to_opacities(scene.gaussians.opacity_logits[members])
-    body = free_top.inertia(scene.gaussians.means[members][visibility.seen(opacities)].astype(np.float64))
-    radius, turns = scene.groups[group].model.radius, bool(np.any(poses[:, 1:4] != 0))
-    weights, drift = observed.astype(np.float64), (0.0, 0.0)
-    if errors is not None:
-        weights, drift = pose_errors.weights(errors, observed, radius, turns), pose_errors.drift(errors, observed)
-    track = shared_gravity.Track(scene.tracks.times, poses[:, :4], poses[:, 4:], weights)
-    noise = {part.kind.turns: part.spread / part.change for part in parts if part.seen and part.change > 0}
-    fit = model_selection.fit(
-        track.times,
-        track.quats,
-        track.displacements,
-        radius=radius,
-        weights=track.weights,
-        inertia=body,
-        least_noise=noises.of_images(radius, noise.get(False, 0.0), noise.get(True, 0.0)),
-        drift=drift if turns else (drift[0], 0.0),
-        up=falling_bodies.UP_AXIS.get(scene.world_convention),
-    )
-    return track, dataclasses.replace(fit, history=dataclasses.replace(fit.history, errors=errors))
-
-
-def _describe(fit: model_selection.Fit | None) -> str:
-    """Description of a body's motion past t_max."""
-    if fit is None:
-        return "static"
-    text = f"came to rest, {fit.chosen}" if fit.rested else fit.chosen
-    more = fit.history.text()
-    return f"{text}; {more}" if more else text
+def _noise(parts: Sequence[_Simplification]) -> tuple[float, float]:
+    """Return the noise of displacements and rotations that was measured in the images, 0 if it was not."""
+    found = {part.kind.turns: part.spread / part.change for part in parts if part.seen and part.change > 0}
+    return found.get(False, 0.0), found.get(True, 0.0)
 
 
 def _row(part: _Simplification, dropped: bool, loss: float | None, future: str, travel: float) -> dict[str, Any]:

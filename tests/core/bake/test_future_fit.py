@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from r5dgs_core.bake import falling_bodies
+from r5dgs_core.bake import future_fit
 from r5dgs_core.motion import rotations
 from r5dgs_core.motion_fit import model_selection, shared_gravity
 
@@ -29,7 +29,7 @@ def test_falling_bodies_share_gravity_and_braking_ones_do_not(convention, up):
     down = np.zeros(3)
     down[up] = -6.0
     fits = fits_of([down, down, np.array([-4.0, 0, 0])])
-    shared = {index: fit.model for index, fit in falling_bodies.share_gravity(fits, convention).items()}
+    shared = {index: fit.model for index, fit in future_fit.share_gravity(fits, convention).items()}
     np.testing.assert_array_equal(shared[0].acceleration, shared[1].acceleration)
     np.testing.assert_allclose(shared[0].acceleration, down, atol=0.2)
     assert np.delete(shared[0].acceleration, up).tolist() == [0, 0]
@@ -38,5 +38,5 @@ def test_falling_bodies_share_gravity_and_braking_ones_do_not(convention, up):
 
 def test_conventions_without_an_up_axis_share_no_gravity():
     fits = fits_of([np.array([0, 0, -6.0])] * 2)
-    assert falling_bodies.share_gravity(fits, "colmap") == {k: fit for k, (_, fit) in fits.items()}
-    assert falling_bodies.share_gravity({}, "blender") == {}
+    assert future_fit.share_gravity(fits, "colmap") == {k: fit for k, (_, fit) in fits.items()}
+    assert future_fit.share_gravity({}, "blender") == {}

@@ -1,0 +1,76 @@
+"""Fit of the motion of bodies past t_max, with one gravity for falling bodies if the up axis is known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from ..motion import free_top
+from ..motion.history import PoseErrors
+from ..motion_fit import model_selection, shared_gravity
+from ..motion_fit import noise as noises
+from ..scene import visibility
+from ..scene.scene import Scene
+from ..scene.splats import to_opacities
+from . import pose_errors
+
+UP_AXIS = {"blender": np.array([0.0, 0.0, 1.0]), "opengl": np.array([0.0, 1.0, 0.0])}
+
+
+def share_gravity(
+    fits: dict[int, tuple[shared_gravity.Track, model_selection.Fit]], convention: str
+) -> dict[int, model_selection.Fit]:
+    """Return the fits, with one common acceleration for bodies that fall alike.
+
+    Args:
+        fits: Track and fit of each moving group, by group index.
+        convention: World convention of the scene; gravity is shared only if its up axis is known.
+    """
+    shared = [fit for _, fit in fits.values()]
+    if convention in UP_AXIS and fits:
+        shared, _ = shared_gravity.share([track for track, _ in fits.values()], shared, UP_AXIS[convention])
+    return dict(zip(fits, shared, strict=True))
+
+
+def fit(
+    scene: Scene,
+    group: int,
+    observed: np.ndarray,
+    poses: np.ndarray,
+    noise: tuple[float, float],
+    errors: PoseErrors | None,
+) -> tuple[shared_gravity.Track, model_selection.Fit]:
+    """Fit a body's motion past t_max and return its track and the fit.
+
+    The noise is at least ``noise``, that of displacements and rotations.
+    """
+    members = scene.gaussians.motion_ids == group
+    opacities = to_opacities(scene.gaussians.opacity_logits[members])
+    body = free_top.inertia(scene.gaussians.means[members][visibility.seen(opacities)].astype(np.float64))
+    radius, turns = scene.groups[group].model.radius, bool(np.any(poses[:, 1:4] != 0))
+    weights, drift = observed.astype(np.float64), (0.0, 0.0)
+    if errors is not None:
+        weights, drift = pose_errors.weights(errors, observed, radius, turns), pose_errors.drift(errors, observed)
+    track = shared_gravity.Track(scene.tracks.times, poses[:, :4], poses[:, 4:], weights)
+    found = model_selection.fit(
+        track.times,
+        track.quats,
+        track.displacements,
+        radius=radius,
+        weights=track.weights,
+        inertia=body,
+        least_noise=noises.of_images(radius, *noise),
+        drift=drift if turns else (drift[0], 0.0),
+        up=UP_AXIS.get(scene.world_convention),
+    )
+    return track, dataclasses.replace(found, history=dataclasses.replace(found.history, errors=errors))
+
+
+def describe(chosen: model_selection.Fit | None) -> str:
+    """Description of a body's motion past t_max."""
+    if chosen is None:
+        return "static"
+    text = f"came to rest, {chosen.chosen}" if chosen.rested else chosen.chosen
+    more = chosen.history.text()
+    return f"{text}; {more}" if more else text
