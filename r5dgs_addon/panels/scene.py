@@ -3,7 +3,7 @@
 import bpy
 
 from ..motion import event_markers
-from ..scene import evaluated_points, loaded_scenes, timeline, trust, viewport_display
+from ..scene import captured_cameras, evaluated_points, loaded_scenes, timeline, trust, viewport_display
 from ..splats import viewport_splats
 from ..ui import plural, status_bar
 from . import sidebar
@@ -43,6 +43,10 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
         if not (timeline.fits(context.scene, times) and event_markers.shown(context.scene, collection)):
             layout.operator("r5dgs.fit_timeline", icon="TIME")
         layout.operator("r5dgs.view_as_trained", icon="CAMERA_DATA")
+        if captured_cameras.all_of(collection):
+            row = layout.row(align=True)
+            row.operator_menu_enum("r5dgs.use_captured_camera", "camera", text="Camera")
+            row.operator("r5dgs.show_captured_images", text="Images", icon="IMAGE_BACKGROUND")
         row = layout.row(align=True)
         for value, name, *_ in viewport_display.ITEMS:
             row.operator("r5dgs.set_display", text=name, depress=state.display == value).display = value

@@ -11,6 +11,7 @@ from . import first_view, object_names
 COLLECTION = "Cameras"
 SENSOR_MM = 36.0  # Blender's own width
 DISPLAY_SIZE = 0.05  # of the scene's extent
+CAPTURED = "r5dgs_captured"  # custom property of a camera: name in the data set, width, height and pixel aspect
 FACTORY_PLACE = (7.3589, -6.9258, 4.9583)  # of the camera in Blender's factory settings
 
 
@@ -33,6 +34,9 @@ def build(
         camera.data.display_size = DISPLAY_SIZE * scene.extent
         start, end = first_view.clip_range(first_view.distance(scene, captured))
         camera.data.clip_start, camera.data.clip_end = start, end
+        aspect = float(captured.intrinsics[0, 0] / captured.intrinsics[1, 1])
+        size = {"width": captured.width, "height": captured.height, "aspect": aspect}
+        camera[CAPTURED] = {"name": captured.name or name, **size}
         camera.parent = root
         camera.matrix_basis = Matrix(cameras.cam_world_to_opengl(captured.T_cam_world).tolist())
         home.objects.link(camera)
@@ -41,15 +45,26 @@ def build(
     layer.children[home.name].hide_viewport = True
     if not is_own_camera_used(context.scene):
         best = first_view.best(scene)
-        use(context.scene, found[best], scene.cameras[best])
+        use(context.scene, found[best])
     return found
 
 
-def use(scene: bpy.types.Scene, camera: bpy.types.Object, captured: cameras.Camera) -> None:
+def all_of(collection: bpy.types.Collection) -> list[bpy.types.Object]:
+    """Captured cameras of a loaded scene; none for scenes that an earlier version loaded."""
+    return [obj for obj in collection.all_objects if obj.type == "CAMERA" and CAPTURED in obj]
+
+
+def name_of(camera: bpy.types.Object) -> str:
+    """Name of a captured camera in its data set."""
+    return str(camera[CAPTURED]["name"])
+
+
+def use(scene: bpy.types.Scene, camera: bpy.types.Object) -> None:
     """Render a Blender scene from a captured camera, with its resolution and pixel aspect."""
-    render, aspect = scene.render, captured.intrinsics[0, 0] / captured.intrinsics[1, 1]
+    render, captured = scene.render, camera[CAPTURED]
     scene.camera = camera
-    render.resolution_x, render.resolution_y, render.resolution_percentage = captured.width, captured.height, 100
+    render.resolution_x, render.resolution_y = int(captured["width"]), int(captured["height"])
+    render.resolution_percentage, aspect = 100, float(captured["aspect"])
     square = abs(aspect - 1) < 1e-3
     render.pixel_aspect_x, render.pixel_aspect_y = (1, 1) if square else (max(1 / aspect, 1), max(aspect, 1))
 

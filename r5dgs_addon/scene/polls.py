@@ -2,7 +2,7 @@
 
 from bpy.props import IntProperty, StringProperty
 
-from . import loaded_scenes, object_names, selection
+from . import captured_cameras, loaded_scenes, object_names, selection
 
 
 class NeedsScene:
@@ -25,6 +25,19 @@ class NeedsCamera(NeedsScene):
             return False
         if context.scene.camera is None:
             cls.poll_message_set("Add a camera to the scene first")
+            return False
+        return True
+
+
+class NeedsCapturedCameras(NeedsScene):
+    """Mixin for operators on the captured cameras of the loaded scene."""
+
+    @classmethod
+    def poll(cls, context):
+        if not super().poll(context):
+            return False
+        if not captured_cameras.all_of(loaded_scenes.active_collection(context)):
+            cls.poll_message_set("The scene has no captured cameras: load its file again with 'Captured Cameras'")
             return False
         return True
 

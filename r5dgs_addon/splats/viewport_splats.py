@@ -17,7 +17,7 @@ from ...r5dgs_core import errors
 from ..engine import engine
 from ..scene import loaded_scenes, render_settings, viewport_display
 from ..ui import status_bar
-from . import mesh_depth, paste, shaders, visible_splats
+from . import camera_images, mesh_depth, paste, shaders, visible_splats
 from . import splat_renderer as renderer
 
 SOLID = {"MESH", "CURVE", "SURFACE", "META", "FONT", "VOLUME", "CURVES", "POINTCLOUD", "GPENCIL", "GREASEPENCIL"}
@@ -146,6 +146,7 @@ def _draw_in_region(context: bpy.types.Context, found: visible_splats.VisibleSpl
     wired = space.shading.type == "WIREFRAME"
     sky = found.sky if render_settings.of(context.scene).sky and not wired else None
     paste.paste(picture.buffer, picture.meshes, view, sky, found.world, paste.background(context))
+    camera_images.draw(context)
 
 
 def _drop_closed(context: bpy.types.Context) -> None:

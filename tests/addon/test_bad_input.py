@@ -153,7 +153,7 @@ WITHOUT_A_SCENE = {
         "export_format", "export_masks", "export_ply", "export_scene", "extrapolate_until", "fit_timeline", "isolate",
         "merge_with_meshes", "preview", "remove_alias", "rename_object", "retime", "select_by_prompt",
         "select_floaters", "select_gaussians", "select_object", "set_display",
-        "show_confidence", "view_as_trained", "viewport_render",
+        "show_captured_images", "show_confidence", "use_captured_camera", "view_as_trained", "viewport_render",
     ),
     "Select an object of an R5DGS scene first": (
         "delete_object", "duplicate_object", "pivot_to_cursor", "re_extrapolate", "reset_motion", "simplify_keys",

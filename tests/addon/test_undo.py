@@ -39,9 +39,11 @@ OPERATORS = {  # call of each; None if another module tests it
     "set_display": lambda ops: ops.set_display(display="POINTS"),
     "show_colors_as_trained": lambda ops: ops.show_colors_as_trained(),
     "show_confidence": lambda ops: ops.show_confidence(),
+    "show_captured_images": None,  # scene/test_captured_cameras.py
     "simplify_keys": lambda ops: ops.simplify_keys(tolerance=0.05),
     "stop_merging": None,  # engine/test_mesh_merge.py
     "unisolate": lambda ops: ops.unisolate(),
+    "use_captured_camera": None,  # scene/test_captured_cameras.py
     "use_engine": lambda ops: ops.use_engine(),
     "view_as_trained": lambda ops: ops.view_as_trained(),
 }

@@ -45,6 +45,7 @@ def checks(path: str, folder: str = "", *chosen: str):
     for obj in list(bpy.data.objects):
         bpy.data.objects.remove(obj)
     with inside():
+        bpy.ops.ed.undo_push(message="Empty")
         bpy.ops.r5dgs.load_scene(filepath=path)
     space = area_of("VIEW_3D").spaces[0]
     space.overlay.show_overlays, space.show_gizmo = False, False
@@ -237,6 +238,59 @@ def check_selection(before: np.ndarray):
     yield 0.5
 
 
+def check_undo_of_loading(before: np.ndarray):
+    """Undo of loading removes the picture, and redo brings it back."""
+    steps = 0
+    while any(one.r5dgs.is_scene for one in bpy.data.collections):
+        with inside():
+            bpy.ops.ed.undo()
+        steps += 1
+        assert steps < 50
+        yield 0.1
+    yield 1.0
+    assert seen("unloaded").std() < 0.02, "something is visible after undo"
+    for _ in range(steps):
+        with inside():
+            bpy.ops.ed.redo()
+        yield 0.1
+    yield 1.0
+    compare("after redo of loading", seen("loaded_again"), before)
+
+
+def check_camera_images(before: np.ndarray):
+    """A captured image is visible over the splats in the view through its camera, and only there."""
+    space, area = area_of("VIEW_3D").spaces[0], area_of("VIEW_3D")
+    loaded = next(one for one in bpy.data.collections if one.r5dgs.is_scene)
+    camera = service("scene.captured_cameras").all_of(loaded)[0]
+    folder = out / "images"
+    folder.mkdir(exist_ok=True)
+    image = bpy.data.images.new("red", 8, 8)
+    image.pixels.foreach_set(np.tile(np.float32([1, 0, 0, 1]), 64))
+    image.filepath_raw, image.file_format = str(folder / f"{camera['r5dgs_captured']['name']}.png"), "PNG"
+    image.save()
+    bpy.data.images.remove(image)
+    with inside():
+        bpy.ops.ed.undo_push(message="Before")
+        bpy.ops.r5dgs.use_captured_camera(camera=camera.name)
+    yield 0.5
+    through = seen("through_camera")
+    with inside():
+        bpy.ops.r5dgs.show_captured_images(directory=str(folder))
+    space.overlay.show_overlays = True
+    yield 0.5
+    found = seen("captured_image")
+    red = (found[..., 0] - found[..., 1]) - (through[..., 0] - through[..., 1])
+    print(f"captured image: {(red > 0.2).mean():.0%} of the pixels", flush=True)
+    assert 0.2 < (red > 0.2).mean() < 1
+    space.overlay.show_overlays = False
+    yield 0.5
+    compare("without overlays", seen("without_image"), through)
+    area.spaces[0].region_3d.view_perspective = "PERSP"
+    with inside():
+        bpy.ops.ed.undo_push(message="After")
+    yield 0.5
+
+
 def check_undo(before: np.ndarray):
     """Undo of a change and its redo change the picture, and undo brings the first one back."""
     anchor = next(obj for obj in main_window().scene.objects if obj.r5dgs.role == "CLOUD" and obj.r5dgs.object_id > 0)
@@ -318,6 +372,8 @@ CHECKS = (
     check_windows,
     check_scene_switch,
     check_undo,
+    check_undo_of_loading,
+    check_camera_images,
     check_reopen,
     check_render,
 )

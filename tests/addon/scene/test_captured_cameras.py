@@ -1,10 +1,12 @@
 """Captured cameras of a loaded scene as Blender cameras."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 
+from r5dgs_core.formats import image_files
 from r5dgs_core.scene import cameras, scene_file
 from tests.support import motions, scenes
 
@@ -28,14 +30,15 @@ def captured():
 def test_blender_sees_what_the_cameras_saw(blender, captured, tmp_path, convention):
     captured = dataclasses.replace(captured, world_convention=convention)
     collection = motions.load(blender, scene_file.write(captured, tmp_path / "scene.r5dgs"))
-    home, scene = collection.children["Cameras"], blender.context.scene
+    home = collection.children["Cameras"]
     assert {one.name for one in home.objects} == {"away", "camera 2", "upright"}
     assert not any(camera.visible_get() for camera in home.objects)
     module, view_cameras = motions.addon("scene.captured_cameras"), motions.addon("engine.view_cameras")
     world = np.eye(4)
     world[:3, :3] = cameras.WORLD_TO_BLENDER[convention]
     for name, camera in zip(("away", "camera 2", "upright"), captured.cameras, strict=True):
-        module.use(scene, home.objects[name], camera)
+        assert blender.ops.r5dgs.use_captured_camera(camera=name) == {"FINISHED"}
+        assert module.name_of(home.objects[name]) == camera.name or not camera.name
         blender.context.view_layer.update()
         seen = view_cameras.of_camera(blender.context.evaluated_depsgraph_get(), lambda: np.zeros((0, 3))).camera
         assert (seen.width, seen.height) == (camera.width, camera.height)
@@ -59,3 +62,50 @@ def test_cameras_are_left_out_on_demand(blender, captured, tmp_path):
     before = len(blender.data.cameras)
     collection = motions.load(blender, scene_file.write(captured, tmp_path / "scene.r5dgs"), cameras=False)
     assert "Cameras" not in collection.children and len(blender.data.cameras) == before
+
+
+def png(path, value):
+    """An image of one pixel."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return image_files.write_png(path, np.full((1, 1), value, np.uint8))
+
+
+def shown(home):
+    """Names of the background images by camera."""
+    return {
+        camera.name: [one.image.name for one in camera.data.background_images]
+        for camera in home.objects
+        if camera.data.show_background_images
+    }
+
+
+def test_images_of_the_current_time_are_backgrounds_of_their_cameras(blender, captured, tmp_path):
+    collection = motions.load(blender, scene_file.write(captured, tmp_path / "scene.r5dgs"))
+    folder, home = tmp_path / "data", collection.children["Cameras"]
+    frames = []
+    for number, (view, t) in enumerate((("away", 0.0), ("away", 0.4), ("upright", 0.4))):
+        png(folder / "train" / f"r_{number}.png", number)
+        frames.append({"file_path": f"./train/r_{number}", "time": t, "view": view})
+    frames.append({"file_path": "../../secret", "time": 0.4, "view": "camera 2"})
+    png(tmp_path.parent / "secret.png", 9)
+    (folder / "transforms_train.json").write_text(json.dumps({"frames": frames}))
+    motions.go_to(blender, collection, 0.5)
+    assert blender.ops.r5dgs.show_captured_images(directory=str(folder)) == {"FINISHED"}
+    assert shown(home) == {"away": ["r_1.png"], "upright": ["r_2.png"]}
+    motions.go_to(blender, collection, 0.0)
+    assert blender.ops.r5dgs.show_captured_images(directory=str(folder)) == {"FINISHED"}
+    assert shown(home) == {"away": ["r_0.png"], "upright": ["r_2.png"]}
+
+
+def test_images_are_found_by_the_names_of_files_and_folders(blender, captured, tmp_path):
+    collection = motions.load(blender, scene_file.write(captured, tmp_path / "scene.r5dgs"))
+    folder, home = tmp_path / "data", collection.children["Cameras"]
+    png(folder / "images" / "upright.png", 1)
+    for number in range(3):
+        png(folder / "images" / "away" / f"{number:04d}.png", number)
+    motions.go_to(blender, collection, scenes.T_MAX)
+    assert blender.ops.r5dgs.show_captured_images(directory=str(folder)) == {"FINISHED"}
+    assert shown(home) == {"away": ["0002.png"], "upright": ["upright.png"]}
+    for other, message in ((tmp_path / "empty", "found none"), (tmp_path, "found no image of a captured camera")):
+        with pytest.raises(RuntimeError, match=message):
+            blender.ops.r5dgs.show_captured_images(directory=str(other))

@@ -1,0 +1,99 @@
+"""Captured images of a data set as backgrounds of the captured cameras.
+
+The data set is that of `transforms_*.json` files, whose frames name their camera, or a folder of images named like the
+cameras: ``CAMERA.png``, or a folder ``CAMERA`` of images in the order of time.
+"""
+
+import json
+import math
+from pathlib import Path
+
+import bpy
+
+from ...r5dgs_core import errors
+from . import captured_cameras, timeline
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
+OPACITY = 0.5
+
+
+def show(collection: bpy.types.Collection, folder: Path, t: float) -> int:
+    """Show in each captured camera its image nearest to a time, in place of images shown before.
+
+    Args:
+        collection: Loaded scene.
+        folder: Folder of the data set.
+        t: Scene time.
+
+    Returns:
+        Number of cameras with an image.
+
+    Raises:
+        ConfigError: There is no such folder, or no image of any camera in it.
+    """
+    if not folder.is_dir():
+        raise errors.ConfigError(f"{folder}: expected the folder of the data set, found none; choose another")
+    cameras = captured_cameras.all_of(collection)
+    times = timeline.of_collection(collection)
+    named = _named_in_files(folder)
+    shown = 0
+    for camera in cameras:
+        name = captured_cameras.name_of(camera)
+        found = named.get(name) or _named_by_path(folder, name, times.t_start, times.t_max)
+        if not found:
+            continue
+        _, path = min(found, key=lambda one: (abs(one[0] - t), one[1]))
+        data = camera.data
+        data.background_images.clear()
+        background = data.background_images.new()
+        background.image = bpy.data.images.load(str(path), check_existing=True)
+        background.alpha, background.display_depth, background.frame_method = OPACITY, "FRONT", "FIT"
+        data.show_background_images = True
+        shown += 1
+    if not shown:
+        raise errors.ConfigError(
+            f"{folder}: found no image of a captured camera such as '{captured_cameras.name_of(cameras[0])}'; choose "
+            "the folder that the scene was trained on"
+        )
+    return shown
+
+
+def _named_in_files(folder: Path) -> dict[str, list[tuple[float, Path]]]:
+    """Time and path of the images that the files of a data set list, by camera."""
+    found: dict[str, list[tuple[float, Path]]] = {}
+    for file in sorted(folder.glob("transforms*.json")):
+        try:
+            frames = json.loads(file.read_text(encoding="utf-8"))["frames"]
+            listed = [(one, str(one["file_path"]), float(one.get("time", 0.0))) for one in frames]
+        except (OSError, ValueError, KeyError, TypeError):
+            continue  # no file of a data set
+        for frame, given, t in listed:
+            path = _image(folder, given)
+            if path is None or not math.isfinite(t):
+                continue
+            for name in {str(frame.get("view", frame.get("camera", ""))), Path(given).stem} - {""}:
+                found.setdefault(name, []).append((t, path))
+    return found
+
+
+def _image(folder: Path, given: str) -> Path | None:
+    """Image inside a folder, with or without its suffix, or None."""
+    place = (folder / given).resolve()
+    if not place.is_relative_to(folder.resolve()):
+        return None
+    every = [place, *(place.with_name(place.name + suffix) for suffix in SUFFIXES)]
+    return next((path for path in every if path.suffix.lower() in SUFFIXES and path.is_file()), None)
+
+
+def _named_by_path(folder: Path, name: str, first: float, last: float) -> list[tuple[float, Path]]:
+    """Time and path of the images whose file or folder is named like a camera."""
+    for home in (folder / "images", folder):
+        alone = _image(home, name)
+        if alone is not None:
+            return [(first, alone)]
+        inside = (home / name).resolve()
+        if inside.is_dir() and inside.is_relative_to(folder.resolve()):
+            files = sorted(path for path in inside.iterdir() if path.suffix.lower() in SUFFIXES)
+            step = (last - first) / max(len(files) - 1, 1)
+            return [(first + number * step, path) for number, path in enumerate(files)]
+    return []
