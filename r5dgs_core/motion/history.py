@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -59,7 +60,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Band:
-    """Confidence band of the motion past t_max, at most `MOST_KNOTS` knots; linear in between.
+    """Confidence band of the motion past t_max, at most `MOST_KNOTS` knots; linear in between and after the last one.
 
     Attributes:
         times: Scene times, increasing, the first is t_max. [H]
@@ -76,12 +77,19 @@ class Band:
     predictable_until: float | None = None
 
     def widths(self, times: np.ndarray) -> np.ndarray:
-        """Half widths of the position at scene times; constant after the last knot. [H]"""
-        return np.interp(times, self.times, self.half_width)
+        """Half widths of the position at scene times; after the last knot they grow with the last slope. [H]"""
+        return self._at(times, self.half_width)
 
     def angles(self, times: np.ndarray) -> np.ndarray:
-        """Half widths of the rotation at scene times. [H]"""
-        return np.interp(times, self.times, self.half_angle)
+        """Half widths of the rotation at scene times, at most pi; likewise. [H]"""
+        return np.minimum(self._at(times, self.half_angle), math.pi)
+
+    def _at(self, times: np.ndarray, values: tuple[float, ...]) -> np.ndarray:
+        inside = np.interp(times, self.times, values)
+        if len(values) < 2:
+            return inside
+        slope = (values[-1] - values[-2]) / (self.times[-1] - self.times[-2])
+        return inside + max(slope, 0.0) * np.maximum(np.asarray(times) - self.times[-1], 0.0)
 
 
 @dataclass(frozen=True)

@@ -122,6 +122,8 @@ def test_a_similarity_of_the_world_scales_widths_and_turns_rates():
     np.testing.assert_allclose(moved.segments[0].parameters["angular_velocity"], [-2, 0, 0], atol=1e-12)
 
 
-def test_a_band_is_linear_between_its_knots_and_constant_after_them():
-    np.testing.assert_allclose(BAND.widths(np.array([0.75, 1.2, 9.0])), [0.01, 0.16, 0.3])
-    np.testing.assert_allclose(BAND.angles(np.array([0.9, 9.0])), [0.1, 0.5])
+def test_a_band_is_linear_between_its_knots_and_keeps_growing_after_them():
+    np.testing.assert_allclose(BAND.widths(np.array([0.75, 1.2, 9.0])), [0.01, 0.16, 0.3 + 7.5 * 0.28 / 0.6])
+    np.testing.assert_allclose(BAND.angles(np.array([0.9, 1.8, 9.0])), [0.1, 0.7, np.pi])
+    still = Band((0.75, 1.5), (0.2, 0.1), (0.2, 0.1))
+    assert still.widths(np.array([9.0])) == still.angles(np.array([9.0])) == [0.1]
