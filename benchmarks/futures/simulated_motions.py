@@ -6,6 +6,7 @@ from ranges. The body is a box whose circumscribed ball has the radius `RADIUS`;
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,11 +34,15 @@ class Motion:
         events: Times at which the velocity or the kind of motion changes, in [0, 1].
         jump: Largest velocity jump at the events, including RADIUS times that of the spin; 0 if only the kind of motion
             changes.
+        slip: Rotation vector, in the body's frame, by which the last observed rotations are wrong.
+        slipped: Number of these poses.
     """
 
     path: Path
     events: tuple[float, ...] = ()
     jump: float = 0.0
+    slip: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    slipped: int = 0
 
 
 Maker = Callable[[np.random.Generator], Motion]
@@ -370,6 +375,16 @@ def grid(poses: int = POSES) -> np.ndarray:
     return np.linspace(0.0, T_MAX, poses)
 
 
+def slipped(make: Maker, poses: int) -> Maker:
+    """A motion whose last observed rotations slipped by a constant turn in the body's frame."""
+
+    def slip(rng: np.random.Generator) -> Motion:
+        motion = make(rng)
+        return dataclasses.replace(motion, slip=math.radians(rng.uniform(15, 60)) * _direction(rng), slipped=poses)
+
+    return slip
+
+
 SIMPLE: dict[str, Maker] = {
     "steady": steady, "ballistic": ballistic, "hinge": hinge, "pendulum": pendulum, "circle": circle,
     "tumbling": tumbling,
@@ -398,6 +413,10 @@ MOTIONS: dict[str, Maker] = {
     "stop, 3 left": left(stops, 3),
     "one bounce, 3 left": left(bounces_once, 3),
     "falls from a table, 5 left": left(leaves_table, 5),
+    "steady, last one slipped": slipped(steady, 1),
+    "steady, last 3 slipped": slipped(steady, 3),
+    "ballistic, last 3 slipped": slipped(ballistic, 3),
+    "ballistic, last 5 slipped": slipped(ballistic, 5),
 }
 
 
@@ -465,10 +484,11 @@ def draw(name: str, noise: Noise, seed: int, poses: int = POSES) -> Draw:
     for i in range(1, poses):
         values[i] = rho * values[i - 1] + math.sqrt(1 - rho**2) * values[i]
     values *= np.where(rng.uniform(size=(poses, 1)) < noise.outliers, 10.0, 1.0)
+    slip = np.where(np.arange(poses)[:, None] >= poses - motion.slipped, motion.slip, 0.0)
     return Draw(
         times,
         places + noise.place * 2 * RADIUS * values[:, :3],
-        _turned(math.radians(noise.degrees) * values[:, 3:]) * turns,
+        _turned(math.radians(noise.degrees) * values[:, 3:]) * turns * _turned(slip),
         later,
         *motion.path(later),
         motion,

@@ -72,5 +72,5 @@ def describe(chosen: model_selection.Fit | None) -> str:
     if chosen is None:
         return "static"
     text = f"came to rest, {chosen.chosen}" if chosen.rested else chosen.chosen
-    more = chosen.history.text()
-    return f"{text}; {more}" if more else text
+    slips = [f"its rotation slipped at t={time:.2f}" for time in chosen.slips]
+    return "; ".join(part for part in (text, *slips, chosen.history.text()) if part)

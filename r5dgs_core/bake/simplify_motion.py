@@ -161,6 +161,7 @@ def simplify(
         if np.any(future[:, 1:] != 0):
             track_checks.warn_of_aliasing(names[g.object_id], scene.tracks.times, future)
             fits[g.id] = future_fit.fit(bound, g.id, observed[g.id], future, _noise(mine), errors.get(g.id))
+            track_checks.warn_of_slips(names[g.object_id], fits[g.id][1].slips)
         description = future_fit.describe(fits[g.id][1] if g.id in fits else None)
         travel = float(np.linalg.norm(bound.tracks.poses[g.id, :, 4:], axis=1).max()) / (2 * g.model.radius)
         found = [_row(part, part in dropped, losses.get(id(part)), description, travel) for part in mine]

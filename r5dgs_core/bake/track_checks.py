@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -55,3 +56,9 @@ def warn_of_aliasing(name: str, times: np.ndarray, track: np.ndarray) -> None:
             first,
             second,
         )
+
+
+def warn_of_slips(name: str, slips: Sequence[float]) -> None:
+    """Warn if the rotations of an object slipped, at the times given."""
+    for time in slips:
+        log.warning("rotation of %s slipped at t=%.2f; its motion past t_max ignores this turn", name, time)

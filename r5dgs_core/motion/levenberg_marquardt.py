@@ -18,6 +18,8 @@ _DIFFERENCE = 1e-6
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-10, 1e10
 _TOLERANCE = 1e-5  # predicted gain / cost at which iteration ends
+_TRIAL_STEPS = 2  # number of steps before a hopeless start may end
+_STALLING = 0.05  # share of the weighted squared residuals that a step of a hopeless start must remove
 _NEGLIGIBLE_GAIN = 1e-20  # predicted gain at which iteration ends even if the cost is less
 
 
@@ -71,6 +73,8 @@ def solve_all(
     softness: float = np.inf,
     steps: int = 40,
     enough: float = _NEGLIGIBLE_GAIN,
+    hopeless: float = np.inf,
+    behind: float = np.inf,
 ) -> Solution:
     """Minimise weighted sums of squared residuals from several starts, whose problems may differ.
 
@@ -85,6 +89,8 @@ def solve_all(
             squares.
         steps: Maximum number of steps. Each calls ``residuals`` once, with P + 1 parameter vectors per start.
         enough: Predicted gain below which a start is finished.
+        hopeless: Cost above which a start is also finished if its next step would hardly reduce the residuals.
+        behind: The same, as excess over the cost of the best start.
 
     Source: Marquardt 1963, with damping relative to the diagonal of the normal matrix and forward differences. The
         damping follows the ratio of actual to predicted gain (Nielsen 1999). Robust fits reweight inside each step,
@@ -97,7 +103,7 @@ def solve_all(
     problem = _Problem(base, prior, softness)
     point = problem.linearize(starts, residuals(starts[:, None] + nudges, np.arange(count)))
     damping, growth, live = np.full(count, _FIRST_DAMPING), np.full(count, 2.0), np.arange(count)
-    for _ in range(steps):
+    for number in range(steps):
         diagonal = np.einsum("bii->bi", point.normal[live])
         diagonal = diagonal + 1e-12 * diagonal.sum(1, keepdims=True) + np.finfo(float).tiny
         damped = damping[live, None] * diagonal
@@ -105,6 +111,8 @@ def solve_all(
         step = -np.linalg.solve(point.normal[live] + damped[:, :, None] * np.eye(size), gradient[..., None])[..., 0]
         gain = (step * (damped * step - gradient)).sum(1)  # if the residuals were linear
         moving = (gain > _TOLERANCE * point.cost[live] + enough) & np.isfinite(gain)
+        if number >= _TRIAL_STEPS:
+            moving &= ~problem.stalls(point, live, gain, min(hopeless, float(np.min(point.cost)) + behind))
         live, step, gain = live[moving], step[moving], gain[moving]
         if len(live) == 0:
             break
@@ -130,6 +138,13 @@ class _Problem:
     base: np.ndarray
     prior: np.ndarray
     softness: float
+
+    def stalls(self, point: Solution, live: np.ndarray, gain: np.ndarray, limit: float) -> np.ndarray:
+        """Starts that cost more than a limit and whose next step hardly reduces their residuals. [L]"""
+        if not np.isfinite(limit):
+            return np.zeros(len(live), bool)
+        squares = (self.base * point.robust[live] * (point.residuals[live] ** 2).sum(-1)).sum(-1)
+        return (point.cost[live] > limit) & (gain < _STALLING * squares)
 
     def linearize(self, x: np.ndarray, batch: np.ndarray) -> Solution:
         """Normal equations at x [B, P] from the residuals there and at their neighbours. batch: [B, P + 1, S, D]"""

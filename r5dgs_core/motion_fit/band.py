@@ -17,7 +17,7 @@ from ..motion.history import MOST_KNOTS, Band
 from . import backtest
 from .candidates import Noise, Solution
 from .evidence import Evidence
-from .fitted_motion import FADE_PER_SPAN
+from .fitted_motion import fade_time
 from .search import Selected
 
 LEVEL = 0.95
@@ -50,7 +50,7 @@ def of(selected: Selected, variance: float, drift: Noise) -> Widths:
     chosen, evidence, noise = selected.chosen, selected.evidence, selected.noise
     place, turn = _variance(chosen, variance, tau)
     place2, turn2 = _spread(chosen, selected.solutions, evidence, tau)
-    fading = np.exp(-2 * tau / FADE_PER_SPAN)  # of the bind state, which is a noisy pose
+    fading = np.exp(-2 * tau / fade_time(chosen))  # of the bind state, which is a noisy pose
     last = evidence.level * fading
     scale = min(max(backtest.relative_error(chosen, selected.track, noise, variance), 1.0), _MOST_SCALE)
     growth = 3 * (0.5 + tau) ** 2

@@ -19,6 +19,7 @@ from ..motion.models.first_guesses import Guess
 from ..motion.pose_track import PoseTrack, Window
 
 SOFTNESS = 24.0  # squared residual of a pose, in variances of its six numbers, at which its weight is one half
+HOPELESS_LOSS = 400.0  # excess over the best loss above which a fit may end early
 _ENOUGH = 0.02  # gain of a step, in variances, below which a fit is good enough to compare candidates
 
 
@@ -63,6 +64,15 @@ class Candidate:
     def law_parameters(self, theta: np.ndarray) -> np.ndarray:
         """Parameters of `law`. [..., P] -> [..., P']"""
         return theta
+
+    def slip(self, theta: np.ndarray) -> np.ndarray:
+        """Turn by which the last observed pose is wrong, in the body's frame. [P] -> [3]"""
+        return np.zeros(3)
+
+    @property
+    def slip_times(self) -> tuple[float, ...]:
+        """Times at which the observed rotation slips."""
+        return ()
 
     @property
     def oscillates(self) -> bool:
@@ -229,6 +239,7 @@ def solve(
     starts: Sequence[np.ndarray] | None = None,
     steps: int = 25,
     enough: float = _ENOUGH,
+    hopeless: float = np.inf,
 ) -> Solution | None:
     """Fit a candidate to poses, robustly.
 
@@ -239,6 +250,7 @@ def solve(
         starts: Initial guesses, or None for those of the candidate. [P] each
         steps: Maximum number of steps.
         enough: Gain of a step, in variances, below which the fit ends.
+        hopeless: Loss above which the fit ends early if it improves slowly.
 
     Returns:
         The best of the solutions from all starts; None if the candidate cannot apply.
@@ -254,6 +266,8 @@ def solve(
         softness=SOFTNESS,
         steps=steps,
         enough=enough,
+        hopeless=hopeless,
+        behind=HOPELESS_LOSS,
     )
     finite = np.isfinite(found.residuals).all((1, 2)) & np.isfinite(found.normal).all((1, 2))
     if not finite.any():

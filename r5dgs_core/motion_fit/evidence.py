@@ -87,26 +87,25 @@ def variance(solution: Solution, track: PoseTrack, noise: Noise, evidence: Evide
     if free <= 0:
         return evidence.variance
     steps = np.diff(track.tau) / np.median(np.diff(track.tau))
-    likelihoods, variances = [], []
-    for rho in _RHOS:
-        phi = (rho**steps)[:, None]
-        rest = np.sqrt(1 - phi**2)
-        white, columns = (
-            np.concatenate([x[..., :1, :], (x[..., 1:, :] - phi * x[..., :-1, :]) / rest], axis=-2)
-            for x in (weights * misses, weights * slopes)
-        )
-        normal = np.einsum("psc,qsc->pq", columns, columns) + np.diag(solution.candidate.precision**2)
-        pull = np.einsum("psc,sc->p", columns, white)
-        loss = max(float((white**2).sum() - pull @ np.linalg.pinv(normal, hermitian=True) @ pull), _LEAST_LEVEL**2)
-        logs = 12 * np.log(rest).sum() + np.linalg.slogdet(normal)[1] + free * math.log(loss)
-        if not math.isfinite(logs):  # only a weak prior determines a direction, and exact poses hide it in rounding
-            continue
-        likelihoods.append(-0.5 * float(logs))
-        variances.append(loss / free * (1 + rho) / (1 - rho))
-    if not likelihoods:
+    phi = _RHOS[:, None, None] ** steps[:, None]  # [R, S - 1, 1]
+    rest = np.sqrt(1 - phi**2)
+    values = weights * np.concatenate([misses[None], slopes])  # [1 + P, S, 6]
+    first = np.broadcast_to(values[:, :1], (len(_RHOS), *values[:, :1].shape))
+    white = np.concatenate([first, (values[:, 1:] - phi[:, None] * values[:, :-1]) / rest[:, None]], axis=2)
+    white = white.reshape(*white.shape[:2], -1)  # [R, 1 + P, 6 S]
+    squares = white @ white.swapaxes(1, 2)
+    normal = squares[:, 1:, 1:] + np.diag(solution.candidate.precision**2)
+    pull = squares[:, 1:, 0]
+    explained = np.einsum("rp,rpq,rq->r", pull, np.linalg.pinv(normal, hermitian=True), pull)
+    losses = np.maximum(squares[:, 0, 0] - explained, _LEAST_LEVEL**2)
+    logs = 12 * np.log(rest).sum((1, 2)) + np.linalg.slogdet(normal)[1] + free * np.log(losses)
+    used = np.isfinite(logs)  # if only a weak prior determines a direction, exact poses hide it in rounding
+    if not used.any():
         return evidence.variance
-    shares = np.exp(np.array(likelihoods) - max(likelihoods))
-    return max(evidence.variance, float(shares @ np.array(variances) / shares.sum()))
+    variances = (losses / free * (1 + _RHOS) / (1 - _RHOS))[used]
+    likelihoods = -0.5 * logs[used]
+    shares = np.exp(likelihoods - likelihoods.max())
+    return max(evidence.variance, float(shares @ variances / shares.sum()))
 
 
 def _inflation(parts: Sequence[Solution], count: int, parameters: int) -> float:

@@ -14,8 +14,14 @@ from ..motion import models, rotations
 from ..motion.history import Event, Segment
 from .candidates import Candidate, Solution
 
-FADE_PER_SPAN = 0.1 / 0.75
+_FADE_PER_SPAN = 0.1 / 0.75
+_SLIPPED = 0.1  # factor on this time if the last observed rotation is known to be wrong
 _RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration")
+
+
+def fade_time(solution: Solution) -> float:
+    """Time constant, in spans, with which the body leaves the last observed pose for the fitted curve."""
+    return _FADE_PER_SPAN * (_SLIPPED if solution.candidate.slip(solution.theta).any() else 1.0)
 
 
 def to_model(solution: Solution, variance: float, radius: float, span: float) -> models.MotionModel:
@@ -40,7 +46,7 @@ def to_model(solution: Solution, variance: float, radius: float, span: float) ->
         kind=law.kind,
         **values,
         inertia=inertia,
-        fade_time=FADE_PER_SPAN * span,
+        fade_time=fade_time(solution) * span,
         radius=radius,
         covariance=0.5 * (spread + spread.T),
         covariance_names=tuple(name for group in labels for name in group),

@@ -147,12 +147,13 @@ class Kink(Candidate):
         return [(self.broken.event, self.time(self.parts(theta)))]
 
 
-def search(track: PoseTrack, noise: Noise, first_gap: int = 2) -> list[Solution]:
+def search(track: PoseTrack, noise: Noise, hopeless: float = np.inf, first_gap: int = 2) -> list[Solution]:
     """Fit all kinds of breaks in all gaps; the best gap of each kind.
 
     Args:
         track: The poses.
         noise: Their noise.
+        hopeless: See `candidates.solve`.
         first_gap: Minimum number of poses before a break.
     """
     gaps = np.arange(first_gap, len(track) - LEAST_AFTER + 1)
@@ -174,6 +175,8 @@ def search(track: PoseTrack, noise: Noise, first_gap: int = 2) -> list[Solution]
             softness=families.SOFTNESS,
             steps=_STEPS,
             enough=0.05,
+            hopeless=hopeless,
+            behind=families.HOPELESS_LOSS,
         )
         cost = np.where(np.isfinite(solved.cost) & np.isfinite(solved.normal).all((1, 2)), solved.cost, np.inf)
         best = int(np.argmin(cost))

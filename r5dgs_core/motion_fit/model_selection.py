@@ -55,6 +55,7 @@ class Fit:
         sigma_t: Noise of the displacements, per component, world units.
         sigma_r: Noise of the rotations, per component, rad.
         history: Events and segments in the observed window, and the confidence band past t_max.
+        slips: Times at which the tracked rotation slipped by a constant turn, see `slips`.
     """
 
     model: models.MotionModel
@@ -64,6 +65,7 @@ class Fit:
     sigma_t: float
     sigma_r: float
     history: History = NONE
+    slips: tuple[float, ...] = ()
 
 
 def fit(
@@ -159,6 +161,7 @@ def _result(
         sigma_t=scale * level.place * radius,
         sigma_r=scale * level.turn,
         history=History(found, segments, band),
+        slips=tuple(t_max + span * time for part, _ in parts for time in part.candidate.slip_times),
     )
 
 

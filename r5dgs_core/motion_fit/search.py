@@ -10,7 +10,7 @@ import numpy as np
 
 from ..motion import rotations
 from ..motion.pose_track import PoseTrack
-from . import backtest, kinks, noise
+from . import backtest, kinks, noise, slips
 from . import candidates as families
 from . import evidence as evidences
 from .candidates import Candidate, Noise, Solution
@@ -79,26 +79,28 @@ def select(
     level = Noise(max(level.place, least.place), max(level.turn, least.turn))
     most = 6 * len(track) - 6 if len(track) >= _FEW else _PER_POSE * len(track)
     tried = [c for c in family if c.parameters <= most] or [min(family, key=lambda c: c.parameters)]
-    found, broken = _try_all(tried, track, level, breaks)
-    coarser = _misfit((*found, *broken))
+    found, broken, slipped = _try_all(tried, track, level, breaks)
+    coarser = _misfit((*found, *broken, *slipped))
     if (
         max(coarser) > _NOTHING_FITS
     ):  # if the noise is underestimated, the robust losses of all candidates are nearly equal
         level = level.scaled(*(math.sqrt(max(ratio, 1.0)) for ratio in coarser))
-        found, broken = _try_all(tried, track, level, breaks)
+        found, broken, slipped = _try_all(tried, track, level, breaks)
     for _ in range(_ROUNDS):
-        shares = _shares((*found, *broken))
+        shares = _shares((*found, *broken, *slipped))
         if min(shares) > _TOO_LARGE:
             break
         finer = level.scaled(*(math.sqrt(min(share, 1.0)) for share in shares))
         finer = Noise(max(finer.place, least.place), max(finer.turn, least.turn))
         if finer.place > 0.9 * level.place and finer.turn > 0.9 * level.turn:
             break
-        best = _best(found, broken)
+        best = _best(found, broken, slipped)
         found = _refined(found, best, track, level, finer)
-        broken = kinks.search(track, finer) if best.candidate.placed else _refined(broken, best, track, level, finer)
+        slipped = _refined(slipped, best, track, level, finer)
+        searched = isinstance(best.candidate, kinks.Kink)
+        broken = kinks.search(track, finer) if searched else _refined(broken, best, track, level, finer)
         level = finer
-    evidence = Evidence.of((*found, *broken), _floor(level, least))
+    evidence = Evidence.of((*found, *broken, *slipped), _floor(level, least))
     laws = [s for s in found if _determined(s, evidence) and not _rises(s, up)] or found[:1]
     plausible = [s for s in laws if not runs_away(s, track)] or laws[:1]
     chosen = _simplest(plausible, evidence, track, level)
@@ -110,7 +112,11 @@ def select(
         best = min(broken, key=evidence.score)
         if evidence.score(best) + _margin(best) < min(evidence.score(s) for s in plausible):
             chosen = best
-    solutions = (*laws, *broken)
+    if slipped:
+        best = min(slipped, key=evidence.score)
+        if evidence.score(best) < min(evidence.score(s) for s in (*laws, *broken)):
+            chosen = best
+    solutions = (*laws, *broken, *slipped)
     final = _again(chosen, track, level, _EXACT)
     solutions = tuple(final if s is chosen else s for s in solutions)
     whole = Selected(final, solutions, evidence, track, level, float(track.tau[0]))
@@ -120,11 +126,24 @@ def select(
 
 def _try_all(
     tried: Sequence[Candidate], track: PoseTrack, level: Noise, breaks: bool
-) -> tuple[list[Solution], list[Solution]]:
-    """Fits of all laws, and of all kinds of breaks."""
-    found = [s for c in tried if (s := families.solve(c, track, level)) is not None]
+) -> tuple[list[Solution], list[Solution], list[Solution]]:
+    """Fits of all laws, of all kinds of breaks, and of slips."""
+    hopeless, solved = math.inf, {}
+    for candidate in sorted(tried, key=lambda c: c.name not in _PLAIN):  # a good fit early on saves time later
+        solution = solved[candidate.name] = families.solve(candidate, track, level, hopeless=hopeless)
+        if solution is not None:
+            hopeless = min(hopeless, _hopeless(solution))
+    found = [s for c in tried if (s := solved[c.name]) is not None]
     found = found or [s for s in [families.solve(families.STATIC, track, level)] if s is not None]
-    return found, kinks.search(track, level) if breaks and len(track) >= _FEW else []
+    if not breaks or len(track) < _FEW:
+        return found, [], []
+    return found, kinks.search(track, level, hopeless), slips.search(track, level, hopeless)
+
+
+def _hopeless(best: Solution) -> float:
+    """Loss above which other candidates may end early, from that of a good one."""
+    free = max(best.residuals.size - best.parameters, 1)
+    return best.loss + families.HOPELESS_LOSS * max(1.0, best.loss / free)
 
 
 def _misfit(solutions: Sequence[Solution]) -> tuple[float, float]:

@@ -62,7 +62,7 @@ def share(
     found = {
         i: _acceleration(fit)
         for i, fit in enumerate(fits)
-        if fit.chosen in FALLING and not (fit.rested or fit.history.events)
+        if fit.chosen in FALLING and not (fit.rested or fit.history.events or fit.slips)
     }
     if up is not None:
         found = {i: (a, cov) for i, (a, cov) in found.items() if _apart(a, cov, *_mean([(a, cov)], basis)) < AGREE}

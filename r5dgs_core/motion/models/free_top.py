@@ -51,7 +51,9 @@ class FreeTop(MotionKind):
         assert inertia is not None
         first, span = rotations.rotvecs_to_quats(rotvec), tau[:, None]
         starts = rotations.rotate(rotations.conjugate(first), rates.w)[..., 0, :]
-        quats, _ = free_top.turns(inertia, starts, tau)
+        # Most parameter vectors of a Jacobian change the position alone.
+        own, rows = np.unique(starts.reshape(-1, 3), axis=0, return_inverse=True)
+        quats = free_top.turns(inertia, own, tau)[0][rows.reshape(starts.shape[:-1])]
         return rotations.multiply(first, quats), displacement + rates.v * span + rates.a * (0.5 * span**2)
 
     def spins(self, model: MotionModel) -> bool:
