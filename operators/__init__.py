@@ -46,7 +46,7 @@ def register():
     for module in modules():
         for cls in module.CLASSES:
             bpy.utils.register_class(cls)
-    tools.register()  # their keys name operators
+    tools.register()  # after the operators, because the keymaps of the tools refer to them
     for menu, draw in MENUS:
         menu.append(draw)
 

@@ -156,7 +156,8 @@ def _remove_nodes(tree: bpy.types.NodeTree) -> None:
 def _merge_group() -> bpy.types.NodeTree:
     """Node group that merges pictures as described above.
 
-    An *Alpha Over* of a foreground with alpha 0 adds both. `render_passes.FRONT` holds the visible part of the meshes
+    With a foreground of alpha 0, the node *Alpha Over* adds foreground and background. `render_passes.FRONT` holds the
+    visible part of the meshes
     as its alpha.
     """
     group = bpy.data.node_groups.new(NAME, "CompositorNodeTree")

@@ -43,7 +43,8 @@ def _read_file(path: Path) -> File:
     return _content(scene_file.read(path))
 
 
-# Quoted: `typing` would keep the class, and thus this module, alive until after Blender's exit, which crashes.
+# The type is quoted, because `typing` would keep the class, and with it this module, alive beyond Blender's exit, and
+# Blender would crash.
 _files: "file_cache.Remembered[File]" = file_cache.Remembered(_read_file)
 
 

@@ -151,7 +151,7 @@ def _replace(anchor: bpy.types.Object, curve: bpy.types.FCurve, frame: float, ta
     keep = before.last(frame) + 1
     points = curve.keyframe_points
     if keep == 0:  # the user removed all earlier keys; hold the value at the frame
-        still = getattr(anchor, curve.data_path)[curve.array_index]  # of a curve without keys
+        still = getattr(anchor, curve.data_path)[curve.array_index]  # used if the curve has no keys
         value = float(before.co[0, 1]) if before.count else still
         _shorten(curve, 0)
         _start(curve, frame, value)

@@ -38,7 +38,8 @@ def remember(
     """Store the learned motions of a scene on its anchors, so that editing does not need the scene file.
 
     Args:
-        anchors: Anchors by object id and motion id; the object id is 0 unless the motion id is 0.
+        anchors: Anchors by (object id, motion id): (object id, 0) for the pinned Gaussians of an object, (0, motion id)
+            for any other motion group.
         scene: Source scene.
         times: Times of the scene.
         tolerance: Maximum error of the keys, as a fraction of the scene's extent.

@@ -24,7 +24,7 @@ def shown(scene: bpy.types.Scene) -> dict[bpy.types.Collection, list[bpy.types.O
     """Loaded scenes in a Blender scene, and the objects that instance them.
 
     Returns:
-        Instancers by collection. Scenes whose own objects are in the Blender scene come first and have none.
+        Instancers by collection. Scenes whose own objects are in the Blender scene come first, with an empty list.
     """
     inside = set(scene.collection.children_recursive)
     loaded = scene_collections()

@@ -101,7 +101,7 @@ class DepthOrder:
         Returns:
             Rows of the Gaussians, from far to near. [n] int64
         """
-        if self._view != (near, parallel):  # keys of the other depths may be missing
+        if self._view != (near, parallel):  # the stored keys belong to another near plane or projection
             self._view, self._planes, self._still = (near, parallel), {}, None
         now = {group: (plane.tobytes(), versions.get(group, 0)) for group, plane in planes.items()}
         unmoved = frozenset(group for group, plane in now.items() if self._planes.get(group) == plane)

@@ -65,7 +65,7 @@ class MeshDepth:
 
     @property
     def texture(self) -> gpu.types.GPUTexture:
-        """Texture whose red channel is the depth in [0, 1], 1 where nothing is."""
+        """Texture whose red channel is the depth in [0, 1]; 1 in empty pixels."""
         return self._picture.texture_color
 
     def find(self, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> tuple:

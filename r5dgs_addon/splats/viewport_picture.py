@@ -36,7 +36,8 @@ def draw(context: bpy.types.Context, width: int, height: int) -> np.ndarray:
     _draw_scene(context, picture, view)
     meshes, drawn = None, mesh_depth.MeshDepth()
     if found is not None and viewport_splats.is_anything_else_drawn(context):
-        if space.shading.type in ("MATERIAL", "RENDERED"):  # these leave no depth, with overlays either
+        # these write no depth buffer here, even if overlays are shown
+        if space.shading.type in ("MATERIAL", "RENDERED"):
             drawn.find(depsgraph, space)
             drawn.draw(view)
             meshes = drawn.texture

@@ -43,7 +43,7 @@ def fit(
 ) -> tuple[shared_gravity.Track, model_selection.Fit]:
     """Fit a body's motion past t_max and return its track and the fit.
 
-    The noise is at least ``noise``, that of displacements and rotations.
+    ``noise`` holds lower bounds of the noise of displacements and of rotations.
     """
     members = scene.gaussians.motion_ids == group
     opacities = to_opacities(scene.gaussians.opacity_logits[members])

@@ -84,7 +84,8 @@ class ImageEvidence:
     def support(
         self, group: int, before: np.ndarray, after: np.ndarray, size: float, rows: Sequence[int] | None = None
     ) -> Support:
-        """Return the significance of a change of shape and place; both are drawn with the colours of ``after``.
+        """Return the significance of a change of shape and place. All pictures are drawn with the shading of ``after``,
+        so that changes of colour do not count.
 
         Args:
             group: The group.

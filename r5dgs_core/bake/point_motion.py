@@ -21,7 +21,8 @@ from ..train.representations import registry
 from .draft import Context, Draft, Need
 
 BLOCK = 8192  # Gaussians per block, which bounds memory
-VISIBLE = 1e-4  # minimum residual to store: offset / scene size, angle in rad, or change of log scale
+# minimum residual to store: offset / longest side of the scene's box, angle in rad, or change of log scale
+VISIBLE = 1e-4
 
 
 def apply(draft: Draft, context: Context) -> Draft:
@@ -62,7 +63,7 @@ def residuals_and_dynamics(
         track_poses: Poses of the groups at the knots, relative to the bind state. [G, S, 7]
         pivots: Pivots of the groups, world. [G, 3]
         order: Training row of each row of the scene. [N]
-        extent: Size of the scene, world units.
+        extent: Longest side of the scene's box, world units.
     """
     dynamics = None
     if points.dynamics is not None and np.any(points.dynamics):

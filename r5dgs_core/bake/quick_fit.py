@@ -15,7 +15,7 @@ def scene_of(run: checkpoint.Run) -> Scene:
     Compared with `bake.bake`, slight motion is not checked against the images, and the errors of the poses are unknown.
 
     Args:
-        run: A run folder; its data set is where it was during training.
+        run: A run folder. Its data set must still be in the place recorded by the training.
 
     Raises:
         CheckpointError, DatasetError: A file is missing or damaged.

@@ -63,9 +63,11 @@ class _Kind:
 
 
 _TURN, _PATH = slice(0, 4), slice(4, 7)  # columns of poses
-_ROTATION = _Kind("rotation", _TURN, "offset_rotvec", "spread of its rotations, rad")  # none instead
-_PLACE = _Kind("motion", _PATH, "offset_displacement", "spread of its places, diameters")  # one fixed place instead
-_BEND = _Kind("curved_path", _PATH, "offset_displacement", "distance from a straight path, diameters")  # line instead
+_ROTATION = _Kind("rotation", _TURN, "offset_rotvec", "spread of its rotations, rad")  # simplified to no rotation
+# simplified to one fixed place
+_PLACE = _Kind("motion", _PATH, "offset_displacement", "spread of its places, diameters")
+# simplified to a straight line
+_BEND = _Kind("curved_path", _PATH, "offset_displacement", "distance from a straight path, diameters")
 
 
 @dataclass(frozen=True)
@@ -288,7 +290,10 @@ def _move_followers(scene: Scene, poses: np.ndarray) -> np.ndarray:
 
 
 def _future(poses: np.ndarray, parts: Sequence[_Simplification]) -> np.ndarray:
-    """Return the poses for the fit past t_max, relative to t_max; without noise, even if the images need it. [S, 7]"""
+    """Return the poses for the fit past t_max, relative to t_max.
+
+    Parts that count as noise are left out, even those kept up to t_max. [S, 7]
+    """
     result = poses.copy()
     for part in parts:
         if part.is_noise and part.kind.turns:

@@ -16,7 +16,8 @@ import numpy as np
 from . import cubic_curves, models, rotations
 
 MAX_STEP_RAD = math.radians(120.0)
-MAX_FRAME_TURN_RAD = math.radians(160.0)  # per frame; near half a turn, frames no longer show the direction
+# per frame; near half a turn, the direction of rotation between two frames is ambiguous
+MAX_FRAME_TURN_RAD = math.radians(160.0)
 FEWEST_INTERVALS = 64  # first grid between two kinks
 MOST_INTERVALS = 1 << 15
 FEWEST_KINKS = 16  # lowest limit of the number of kinks

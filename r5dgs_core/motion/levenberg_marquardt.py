@@ -20,7 +20,7 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-10, 1e10
 _TOLERANCE = 1e-5  # predicted gain / cost at which iteration ends
 _TRIAL_STEPS = 2  # number of steps before a hopeless start may end
 _STALLING = 0.05  # share of the weighted squared residuals that a step of a hopeless start must remove
-_NEGLIGIBLE_GAIN = 1e-20  # predicted gain at which iteration ends even if the cost is less
+_NEGLIGIBLE_GAIN = 1e-20  # absolute predicted gain at which iteration ends, for costs near zero
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,10 @@ def parts_of(scene: Scene) -> list[tuple[MotionGroup, Joint]]:
 
 
 def local_knots(scene: Scene, group: MotionGroup) -> se3.Pose:
-    """Poses of a group as `knots`; those of a part relative to its parent, about the joint's point. [S, 4], [S, 3]"""
+    """Poses of a group, as from `knots`; for a part, its poses relative to its parent, about the joint's point.
+
+    [S, 4], [S, 3]
+    """
 
     def world(row: int) -> se3.Pose:
         quats, displacements = knots(scene, slice(row, row + 1))

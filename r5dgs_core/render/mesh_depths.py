@@ -15,8 +15,8 @@ MARGIN = 2  # px by which meshes extend past their outlines; render engines filt
 def draw(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float) -> np.ndarray:
     """Return the depth of the nearest surface at each pixel centre.
 
-    Pixels within `MARGIN` of an outline take the nearest depth around them, so that each pixel that a mesh covers in
-    part has a depth.
+    Empty pixels within `MARGIN` of a mesh take the smallest depth around them, so that each pixel that a mesh partly
+    covers has a depth.
 
     Args:
         camera: The camera.

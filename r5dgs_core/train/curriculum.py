@@ -34,7 +34,11 @@ class Curriculum:
         self._first = first
 
     def grow(self, iteration: int) -> list[tuple[int, int, tuple[int, int]]]:
-        """Add the knots that enter at a step; return each, the direction of its neighbours, and the range before it."""
+        """Add the knots that enter at a step.
+
+        Return for each the knot, the direction of its neighbours (+1 or -1), and the range of knots in training before
+        it was added.
+        """
         reach, found = self._reach(iteration), []
         while self.entered[0] > max(0, self._first - reach):
             found.append((self.entered[0] - 1, +1, self.entered))

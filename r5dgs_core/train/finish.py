@@ -68,7 +68,8 @@ def final_tensors(trainer: Trainer, progress: Progress) -> dict[str, torch.Tenso
             )
             extra |= {"identities": encodings, "classifier.weight": weight, "classifier.bias": bias}
         if trainer.config.identity.hygiene and len(classes) > 1:
-            # After the encodings, which follow the edges of the masks; cleaned labels follow motion, too.
+            # Labels are cleaned after the encodings are trained: encodings follow the edges of the masks, but cleaned
+            # labels also follow motion.
             extra |= _cleaned(trainer, votes, extra["labels"])
     elif trainer.motion.sorts_by_motion and training_needs.sorting(trainer.dataset, trainer.config):
         from . import object_discovery

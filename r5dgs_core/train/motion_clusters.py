@@ -1,6 +1,6 @@
 """Segmentation of point trajectories into rigidly moving parts, without masks.
 
-Points that are neighbours at all times and keep their distances are likely to belong to one body. Small neighbourhoods
+Points that stay close to each other and keep their distances are likely to belong to one body. Small neighbourhoods
 propose rigid motions. The proposal with the largest weight of connected inliers is refitted to them, and they are
 removed, until too few points are left. Then parts that one rigid motion explains are merged, and points near a part
 that move with it are added.
@@ -152,12 +152,13 @@ def _parts(
 
 
 def _features(paths: np.ndarray) -> np.ndarray:
-    """Return points whose distances are the root mean squared distances of the paths over time. [R, S * 3]"""
+    """Return features of the paths: the distance between two features is the root mean squared distance of their
+    paths over time. [R, S * 3]"""
     return paths.reshape(len(paths), -1) / np.sqrt(paths.shape[1])
 
 
 def _graph(features: np.ndarray) -> sparse.csr_matrix:
-    """Adjacency of points that are neighbours at all times. [R, R]"""
+    """Adjacency of points that are close in root mean square distance over time. [R, R]"""
     count = min(NEIGHBOURS + 1, len(features))
     found = KDTree(features).query(features, k=count)
     distance, index = np.asarray(found[0]), np.asarray(found[1])

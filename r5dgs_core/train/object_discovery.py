@@ -164,8 +164,8 @@ def _paths(trainer: Trainer, rows: np.ndarray) -> np.ndarray:
 def needed(trainer: Trainer, labels: np.ndarray) -> np.ndarray:
     """Remove parts whose motion the images do not need: fields also move uniform regions. [N]
 
-    Each part is rendered in motion and in its mean state. A part is kept according to the errors of the pixels that
-    show it in one of the two renderings.
+    Each part is rendered in motion and in its mean state. A part is kept if its motion lowers the error by more than
+    `GAIN` dB over the pixels that show it in at least one of the two renderings.
     """
     count = int(labels.max(initial=-1)) + 1
     errors, parts_of = np.zeros((2, count)), torch.from_numpy(labels)

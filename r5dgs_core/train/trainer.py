@@ -98,7 +98,7 @@ class Trainer:
 
     @property
     def params(self) -> dict[str, Tensor]:
-        """All parameters by name, with those that are not trained."""
+        """All parameters by name, including those that are not trained."""
         return {**self.gaussians.params, **self._others()}
 
     def _others(self) -> dict[str, Tensor]:

@@ -11,8 +11,8 @@ So R(0) = I and d(0) = 0 exactly, and the motion converges to the fitted curve R
 
 A motion may oscillate with angular frequency W: s1 = sin(W tau)/W and s2 = (1 - cos(W tau))/W^2 then replace the
 factors tau and tau^2/2 of a steady motion. W = 0 gives the steady motion exactly. With damping c, s1 and s2 are the
-solutions of s'' = -2 c s' - (W^2 + c^2) (s - rest) with s1' = 1 and s2'' = 1 at tau = 0, where all other values and
-derivatives up to the second are zero.
+solutions of s'' = -2 c s' - (W^2 + c^2) s + k, with k = 2 c for s1 and k = 1 for s2. At tau = 0, s1' = 1 and s2'' = 1;
+s1, s1'', s2 and s2' are zero.
 """
 
 from __future__ import annotations

@@ -21,7 +21,8 @@ _LEAST = 1e-300
 _NEAR = 9  # poses about a bounce that give its first guess
 _PLACES = (0.2, 0.5, 0.8)  # tried times of a bounce between two poses
 _RESTING = 1000.0  # flight number that stands for a body that stays on the floor
-_LOW = 1e-3  # a body stays on the floor once its speed falls to this share of that after bounce 0, times 1 - rho
+# a body stays on the floor once rho^number, its speed relative to that after bounce 0, is at most this times 1 - rho
+_LOW = 1e-3
 
 
 class Bounce(MotionKind):

@@ -11,7 +11,8 @@ from .base import Curve, MotionKind, MotionModel, Rates, clocks
 
 
 class FreeTop(MotionKind):
-    """d_f = v s1 + a s2; R_f of a body that starts with spin w and tumbles without torque, `motion.free_top`.
+    """d_f = v s1 + a s2; R_f is the rotation of a body that starts with spin w and tumbles without torque
+    (`motion.free_top`).
 
     It needs the body's inertia, so `model_selection` tries it separately.
     """

@@ -12,7 +12,7 @@ from ..pose_track import PoseTrack, Window
 from . import first_guesses
 from .base import Block, Curve, MotionKind, MotionModel, Rates
 
-# Tried precessions, as fractions of the mean spin, which does not determine them.
+# Tried parts of the precession along the mean spin, as fractions of it. The change of the spin does not determine them.
 _SHARES = (0.0, 0.5, -0.5, 1.0)
 
 

@@ -1,6 +1,7 @@
 """Rotation centre and axis of kinds whose points move with the velocity field of a twist.
 
-The velocity of a twist at x is v + w x x, with rate a + eps x x. Its centre is the point nearest to the pivot that
+The velocity of a twist at a point y is v + w x y, and its rate a + eps x y. Its centre is the point nearest to the
+pivot that
 moves only along the axis, c = w x v / |w|^2, and the whole velocity field moves with it.
 """
 

@@ -156,7 +156,8 @@ def extent_of(cameras: Sequence[Camera]) -> float:
 def grow(
     gaussians: Gaussians, optimizer: torch.optim.Optimizer, chosen: Tensor, split: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """Clone some Gaussians and split others. After the caller removes the split ones, each has added one Gaussian.
+    """Clone some Gaussians and split others. Once the caller has removed the split ones, each chosen Gaussian has added
+    one to the total.
 
     Args:
         gaussians: Changed in place, including optimizer state; new ones are appended and inherit the motion group.
@@ -226,7 +227,7 @@ def seen_by_one_camera(gaussians: Gaussians, eyes: Sequence[Camera]) -> Tensor:
 
 
 def floaters(gaussians: Gaussians, eyes: Sequence[Camera], distance: float) -> Tensor:
-    """Mask of the `single_view` Gaussians that lie close before a camera.
+    """Mask of the Gaussians of `seen_by_one_camera` that lie close in front of a camera.
 
     Args:
         gaussians: The Gaussians.

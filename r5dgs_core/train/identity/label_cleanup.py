@@ -34,7 +34,9 @@ NEIGHBOURS = 8
 OWN = 4.0  # weight of a Gaussian's own votes relative to its neighbourhood
 MOTION = 0.5  # weight of the group that it moves with relative to its neighbourhood
 DOUBT = 1.0  # votes with a trust of one half, pixels
-UNDECIDED = 0.55  # an object's Gaussian keeps its label above this share of the votes for it and the new label
+# a Gaussian of an object keeps its label if more than this (trusted) share of the votes for its old and new label is
+# for the old one
+UNDECIDED = 0.55
 UNDECIDED_BACKGROUND = 0.45  # the same for Gaussians of the background
 APART = 5.0  # maximum link between members of an object / their typical spacing
 SMALL = 0.05  # share of an object's total opacity above which a part is never an outlier

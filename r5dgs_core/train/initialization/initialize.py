@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 MASKS = "Remedy: object_mask/train/IMAGE.png files"
 SAME_TIME = 0.1  # share of the cameras' median time step within which times are equal
 FEWEST_EYES = 3  # minimum number of cameras to place a scene from the images of one time
-SEEN_AT_ALL = 1e-3  # score of a time at which an object is located but not wholly visible in any view
+SEEN_AT_ALL = 1e-3  # score of a time at which the object has a position, but no view shows all of it
 
 
 @dataclass(frozen=True)

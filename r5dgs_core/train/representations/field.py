@@ -1,9 +1,11 @@
 """Representation `field`: a deformation field for the observed time, and the TRD for extrapolation (5DGS, R5DGS).
 
 Notation: N Gaussians, R of them moved by the networks, T the horizon of the deformation field. Network times are scene
-times, shifted and scaled so that the observed ones lie in [0, 1]; if they already do, they are used as they are.
+times, shifted and scaled so that the observed ones lie in [0, 1]; if they already do and fill at
+least a quarter of it, they are used unchanged.
 
-Within the horizon, a training step draws a start t' = t -+ h; the field moves the Gaussians to t', and the TRD from
+Within the horizon, a share of the training steps (`field.trd_share`) draws a start t' = t -+ h; the field moves the
+Gaussians to t', and the TRD from
 there to t in one step. Past the horizon, the TRD moves them from T to t. The TRD starts at positions without gradient:
 its displacement trains the TRD, the position itself trains the field.
 
@@ -148,7 +150,10 @@ class FieldRepresentation(Representation):
         field_fitting.fit_trd(self.motion, means, groups, trd_steps, self._config.field.twist, draw)
 
     def move(self, gaussians: Gaussians, t: float, draw: torch.Generator | None = None) -> MovedGaussians:
-        """Return the movers at a time: with ``draw`` by a random path of field and TRD, else by `FieldMotion.at`."""
+        """Return the moved Gaussians at a time.
+
+        With ``draw`` (in training) they take a random path through field and TRD, otherwise that of `FieldMotion.at`.
+        """
         rows = self.movers(gaussians)
         before = gaussians.params["means"].detach()[rows]
         deltas = self._train_path(before, t, draw) if draw is not None else self.motion.at(before, t)

@@ -1,6 +1,6 @@
 """Representation `still`: nothing moves, and only the Gaussians are trained.
 
-It is chosen if no camera's image changes from one time to another.
+It is chosen if ``needs.tracks`` is "off", if all images show one time, or if no camera's image changes over time.
 """
 
 from __future__ import annotations

@@ -170,7 +170,8 @@ class TracksRepresentation(Representation):
         return named if self.residuals is None else named | residual.tensors_of(self.residuals)
 
     def restored(self, name: str, tensors: dict[str, Tensor]) -> Representation:
-        """See `Representation.restored`; the run of the checkpoint may have gone on to a field already."""
+        """See `Representation.restored`; the run may already have changed from tracks to a field when the checkpoint
+        was written."""
         if not self._config.train.representation == name == FIELD:
             return super().restored(name, tensors)
         from . import field
