@@ -5,13 +5,37 @@ Notation: V views at the reference time, P candidate points.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ...data import masks
 from ...scene import cameras
 from ..train_views import TrainView
+
+log = logging.getLogger(__name__)
+
+LIMITS = (0.0, 0.1, 0.2, 0.35, 0.5)  # shares of votes against a point that are tried in turn
+CELLS = 60  # cells of a mask, which the object's points should fill
+FILLED = 0.8  # smallest share of a mask's cells that points of the whole object fill
+FEWEST_CELLS = 20  # smaller masks are not compared
+HELPS = 0.1  # gain of this share by which a view is left out
+FEWEST_VIEWS = 2  # minimum number of views that vote against points
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Mask of an object in a view, in cells.
+
+    Attributes:
+        cells: Cell of each point. [P]
+        filled: Cells of the mask.
+    """
+
+    cells: np.ndarray
+    filled: np.ndarray
 
 
 def carve(
@@ -44,34 +68,93 @@ def carve(
     direction = rng.normal(size=(24 * count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     points = center + direction * (1.3 * radius * rng.random((len(direction), 1)) ** (1 / 3))
-    inside = np.zeros(len(points))
-    outside = np.zeros(len(points))
-    seen = np.zeros(len(points))
+    inside, outside, seen = (np.zeros((len(views), len(points)), bool) for _ in range(3))
     colors = np.zeros((len(points), 3))
     usual, pixels = np.zeros(3), 0
-    for view in views:
+    outlines: list[Outline | None] = []
+    for number, view in enumerate(views):
         if view.mask is None or not (marked := view.mask == object_id).any():
+            outlines.append(None)
             continue
         usual += view.image[marked].sum(0) / 255
         pixels += int(marked.sum())
         columns, rows, valid = pixel_indices(view, points)
         ids = np.where(valid, view.mask[rows, columns].astype(np.int64), -1)
-        here = ids == object_id
-        inside += here
-        outside += ids == 0
-        seen += valid & (ids != masks.UNKNOWN)
-        colors += here[:, None] * (view.image[rows, columns] / 255.0)
-    for limit in (0.0, 0.1, 0.2, 0.35, 0.5):
-        good = (inside >= np.maximum(1, 0.5 * seen)) & (outside <= limit * seen)
-        if good.sum() >= min(50, count):
-            break
+        inside[number] = ids == object_id
+        outside[number] = ids == 0
+        seen[number] = valid & (ids != masks.UNKNOWN)
+        colors += inside[number][:, None] * (view.image[rows, columns] / 255.0)
+        outlines.append(_outline(marked, rows, columns))
+    good, hiding = _chosen(inside, outside, seen, outlines, min(50, count))
+    if hiding:
+        log.info("object %d: something hides a part of it in %d of %d views", object_id, len(hiding), len(views))
+    votes = inside.sum(0)
     chosen = np.flatnonzero(good)
     if len(chosen) == 0:
         chosen = np.argsort(np.linalg.norm(points - center, axis=1))[:count]
     chosen = rng.choice(chosen, count, replace=len(chosen) < count)
     mean = usual / pixels if pixels else np.full(3, 0.5)
-    known = inside[chosen, None] > 0
-    return points[chosen], np.where(known, colors[chosen] / np.maximum(inside[chosen, None], 1), mean)
+    known = votes[chosen, None] > 0
+    return points[chosen], np.where(known, colors[chosen] / np.maximum(votes[chosen, None], 1), mean)
+
+
+def _outline(marked: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> Outline:
+    """Divide a mask into about `CELLS` square cells, and find the cell of each point's pixel."""
+    size = max(1, round(float(np.sqrt(marked.sum() / CELLS))))
+    wide = marked.shape[1] // size + 1
+    cells = rows // size * wide + columns // size
+    row, column = np.nonzero(marked)
+    found, area = np.unique(row // size * wide + column // size, return_counts=True)
+    return Outline(cells, found[area >= 0.5 * size * size])
+
+
+def _chosen(
+    inside: np.ndarray, outside: np.ndarray, seen: np.ndarray, outlines: Sequence[Outline | None], enough: int
+) -> tuple[np.ndarray, list[int]]:
+    """Select the points of the object, and the views in which something without an id hides a part of it.
+
+    Points that fill an object fill each of its masks. If they do not, some view votes against points that it cannot
+    see. Views are left out, best one first, while this helps.
+
+    Args:
+        inside, outside, seen: Votes of the views for and against each point, and whether they see its place. [V, P]
+        outlines: Masks of the views; None if a view does not show the object. V
+        enough: Number of points that suffices.
+
+    Returns:
+        The selected points [P] bool, and indices of the views whose votes against points do not count.
+    """
+
+    def select(hiding: Sequence[int]) -> np.ndarray:
+        against, total = outside.copy(), seen.copy()
+        against[hiding], total[hiding] = False, inside[hiding]
+        good = np.zeros(inside.shape[1], bool)
+        for limit in LIMITS:
+            known = total.sum(0)
+            good = (inside.sum(0) >= np.maximum(1, 0.5 * known)) & (against.sum(0) <= limit * known)
+            if good.sum() >= enough:
+                break
+        return good
+
+    def filled(good: np.ndarray) -> float:
+        shares = [
+            np.isin(x.filled, x.cells[good]).mean() for x in outlines if x is not None and len(x.filled) >= FEWEST_CELLS
+        ]
+        return float(min(shares, default=1.0))
+
+    hiding: list[int] = []
+    best = select(hiding)
+    share = filled(best)
+    showing = [number for number, x in enumerate(outlines) if x is not None]
+    while share < FILLED and len(showing) - len(hiding) > FEWEST_VIEWS:
+        trials = {number: select([*hiding, number]) for number in showing if number not in hiding}
+        shares = {number: filled(good) for number, good in trials.items()}
+        number = max(shares, key=shares.__getitem__)
+        if shares[number] < share + HELPS:
+            break
+        hiding.append(number)
+        best, share = trials[number], shares[number]
+    return best, hiding
 
 
 def pixel_indices(view: TrainView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

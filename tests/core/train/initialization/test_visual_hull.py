@@ -94,3 +94,21 @@ def test_views_without_mask_and_points_behind_a_camera_do_not_vote(tiny, posed):
     np.testing.assert_array_equal(carve(blind, 2, center)[0], carve(seen, 2, center)[0])
     _, _, valid = visual_hull.pixel_indices(seen[0], (seen[0].camera.center - 2 * seen[0].camera.forward)[None])
     assert not valid.any()
+
+
+@pytest.mark.parametrize("hidden", [0, 1])
+def test_something_without_an_id_before_the_object_does_not_cut_it_in_other_views(tiny, posed, hidden):
+    seen, t, norm = posed
+    ball = tiny_datasets.BALL
+    center = (tiny.center(ball, t) - norm.origin) / norm.scale
+    mask = seen[hidden].mask.copy()
+    middle = np.nonzero(mask == ball)[1].mean()
+    mask[(mask == ball) & (np.arange(mask.shape[1]) > middle)] = 0
+    screened = [dataclasses.replace(v, mask=mask) if i == hidden else v for i, v in enumerate(seen)]
+
+    def reached(views):
+        points, _ = carve(views, ball, center, count=2000)
+        columns, rows, _ = visual_hull.pixel_indices(seen[hidden], points)
+        return columns.max() - columns.min()
+
+    assert reached(screened) >= 0.9 * reached(seen)
