@@ -324,19 +324,14 @@ def capturing(path: Path, folder: Path):
 
 
 def merging(path: Path, folder: Path):
-    """The compositor merges Gaussians by depth with meshes of Cycles and of EEVEE."""
-    gaussians, meshes = w.main_window().scene, bpy.data.scenes.new("meshes")
+    """Merge with Meshes shows the nearer of the Gaussians and a wall, which Cycles or EEVEE renders."""
+    scene = w.main_window().scene
     with w.inside():
         bpy.ops.r5dgs.use_engine()
         bpy.ops.r5dgs.show_colors_as_trained()
-    camera = gaussians.camera
-    meshes.collection.objects.link(camera)
-    meshes.camera = camera
-    for scene in (gaussians, meshes):
-        scene.view_layers[0].use_pass_z = True
-        render = scene.render
-        render.resolution_x, render.resolution_y, render.resolution_percentage = 160, 120, 100
-    gaussians.render.dither_intensity = 0
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = 160, 120, 100
+    render.dither_intensity = 0
     picture = w.service("engine.render_request")
     with bpy.context.temp_override(window=w.main_window()):
         seen = picture.shown(bpy.context.evaluated_depsgraph_get())
@@ -346,49 +341,32 @@ def merging(path: Path, folder: Path):
     mesh = bpy.data.meshes.new("wall")
     mesh.from_pydata([(x, y, -wall) for x, y in ((-99, -99), (99, -99), (99, 99), (-99, 99))], [], [(0, 1, 2, 3)])
     plane = bpy.data.objects.new("wall", mesh)
-    meshes.collection.objects.link(plane)
-    plane.matrix_world = camera.matrix_world.normalized()
-    combine_by_depth(gaussians, meshes)
-    engines = [item.identifier for item in meshes.render.bl_rna.properties["engine"].enum_items]
-    for engine in ("CYCLES", "BLENDER_EEVEE_NEXT" if "BLENDER_EEVEE_NEXT" in engines else "BLENDER_EEVEE"):
-        meshes.render.engine = engine
-        meshes.cycles.samples = meshes.eevee.taa_render_samples = 1
+    scene.collection.objects.link(plane)
+    plane.matrix_world = scene.camera.matrix_world.normalized()
+    for engine in ("CYCLES", w.service("compat").EEVEE):
+        with w.inside():
+            assert bpy.ops.r5dgs.merge_with_meshes(engine=engine) == {"FINISHED"}
+        meshes = scene.r5dgs_render.meshes
+        assert meshes.render.engine == engine
+        meshes.cycles.samples = meshes.eevee.taa_render_samples = 4
         meshes.cycles.use_denoising = False
         with w.inside():
-            bpy.ops.render.render(scene=gaussians.name)
+            bpy.ops.render.render(scene=scene.name)
         saved = folder / f"{engine}.png"
-        gaussians.render.image_settings.file_format = "PNG"
-        bpy.data.images["Render Result"].save_render(str(saved), scene=gaussians)
+        render.image_settings.file_format = "PNG"
+        bpy.data.images["Render Result"].save_render(str(saved), scene=scene)
         same = np.abs(pixels(bpy.data.images.load(str(saved))) - np.clip(arrays["color"], 0, 1)).max(axis=-1) < 3 / 255
         nearer, farther = solid & (arrays["depth"] < 0.95 * wall), solid & (arrays["depth"] > 1.05 * wall)
         print(
-            f"{engine}: of {nearer.sum()} pixels before the wall {same[nearer].mean():.1%} are the Gaussians', of "
-            f"{farther.sum()} behind it {same[farther].mean():.1%}",
+            f"Merge with Meshes by {engine}: of {nearer.sum()} pixels before the wall {same[nearer].mean():.1%} are "
+            f"the Gaussians', of {farther.sum()} behind it {same[farther].mean():.1%}",
             flush=True,
         )
         assert same[nearer].mean() > 0.8 and same[farther].mean() < 0.05, engine
-    bpy.data.scenes.remove(meshes)
+    with w.inside():
+        assert bpy.ops.r5dgs.stop_merging() == {"FINISHED"}
+    bpy.data.objects.remove(plane)
     yield 0.5
-
-
-def combine_by_depth(first: bpy.types.Scene, second: bpy.types.Scene) -> None:
-    """Set up the first scene's compositor to combine both renders by depth."""
-    if "compositing_node_group" in first.bl_rna.properties:  # Blender 5
-        tree = first.compositing_node_group = bpy.data.node_groups.new("merge", "CompositorNodeTree")
-        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-        output = tree.nodes.new("NodeGroupOutput").inputs[0]
-    else:
-        first.use_nodes = True
-        tree = first.node_tree
-        tree.nodes.clear()
-        output = tree.nodes.new("CompositorNodeComposite").inputs["Image"]
-    combine = tree.nodes.new("CompositorNodeZcombine")
-    for index, scene in enumerate((first, second)):
-        layers = tree.nodes.new("CompositorNodeRLayers")
-        layers.scene = scene
-        tree.links.new(layers.outputs["Image"], combine.inputs[2 * index])
-        tree.links.new(layers.outputs["Depth"], combine.inputs[2 * index + 1])
-    tree.links.new(combine.outputs[0], output)
 
 
 def selecting(path: Path, folder: Path):

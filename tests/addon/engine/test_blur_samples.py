@@ -180,31 +180,66 @@ def extents(image):
     return np.array(found)
 
 
+def start_moving(root):
+    """Move the dots to the right with constant velocity, and choose a frame between the keys."""
+    scene = root.users_scene[0]
+    scene.r5dgs_render.sky, scene.r5dgs_render.samples = False, 64
+    for frame, place in ((0, -0.3), (10, 0.3)):
+        root.location.x = place
+        root.keyframe_insert("location", frame=frame)
+    for curve in motions.curves(root).values():
+        for key in curve.keyframe_points:
+            key.interpolation = "LINEAR"
+    scene.frame_set(5)
+
+
+def use_blur(scene, kind):
+    """Switch on the blur by "lens" or "shutter", or none."""
+    dof = scene.camera.data.dof
+    dof.use_dof, scene.render.use_motion_blur = kind == "lens", kind == "shutter"
+    dof.focus_distance, dof.aperture_fstop, scene.render.motion_blur_shutter = 5.0, 0.05, 8.0
+
+
+def added(kind, sharp, blurred):
+    """Extents of the blur alone, pixels."""
+    width = 4.0 if kind == "lens" else math.sqrt(12)  # of a disk and of a line, in standard deviations
+    return width * np.sqrt(np.maximum(blurred**2 - sharp**2, 0))
+
+
 @pytest.mark.heavy
 @pytest.mark.parametrize("kind", ("lens", "shutter"))
 def test_blur_is_as_wide_as_in_cycles(blender, dots, tmp_path, kind):
     scene, found = blender.context.scene, {}
-    scene.r5dgs_render.sky = False
-    scene.r5dgs_render.samples, scene.cycles.samples, scene.cycles.use_denoising = 64, 64, False
+    scene.cycles.samples, scene.cycles.use_denoising = 64, False
     scene.cycles.pixel_filter_type, scene.cycles.device = "BOX", "CPU"
-    for frame, place in ((0, -0.3), (10, 0.3)):
-        dots.location.x = place
-        dots.keyframe_insert("location", frame=frame)
-    for curve in motions.curves(dots).values():
-        for key in curve.keyframe_points:
-            key.interpolation = "LINEAR"
-    scene.frame_set(5)
+    start_moving(dots)
     for engine in ("R5DGS", "CYCLES"):
         scene.render.engine = engine
-        for name, used in (("sharp", False), ("blurred", True)):
-            dof = scene.camera.data.dof
-            dof.use_dof, scene.render.use_motion_blur = used and kind == "lens", used and kind == "shutter"
-            dof.focus_distance, dof.aperture_fstop, scene.render.motion_blur_shutter = 5.0, 0.05, 8.0
+        for name in ("sharp", "blurred"):
+            use_blur(scene, kind if name == "blurred" else "")
             found[engine, name] = extents(render(blender, tmp_path, f"{engine}_{name}"))
-    width = 4.0 if kind == "lens" else math.sqrt(12)  # of a disk and of a line, in standard deviations
-    ours, cycles = (
-        width * np.sqrt(np.maximum(found[engine, "blurred"] ** 2 - found[engine, "sharp"] ** 2, 0))
-        for engine in ("R5DGS", "CYCLES")
-    )
+    ours, cycles = (added(kind, found[engine, "sharp"], found[engine, "blurred"]) for engine in ("R5DGS", "CYCLES"))
     assert cycles[0].max() > 8
     np.testing.assert_allclose(ours, cycles, atol=1.0)
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("kind", ("lens", "shutter"))
+def test_meshes_and_gaussians_of_a_merged_picture_are_blurred_alike(blender, dots, tmp_path, kind):
+    scene = blender.context.scene
+    for mesh in (child for child in dots.children if child.type == "MESH"):
+        mesh.location.z += 0.36 * mesh.location.y  # 72 px above its dot
+    scene.camera.data.shift_y, scene.render.resolution_y = 0.25, 160
+    start_moving(dots)
+    assert blender.ops.r5dgs.merge_with_meshes() == {"FINISHED"}
+    meshes = scene.r5dgs_render.meshes
+    meshes.cycles.samples, meshes.cycles.use_denoising = 64, False
+    meshes.cycles.pixel_filter_type, meshes.cycles.device = "BOX", "CPU"
+    found = {}
+    for name in ("sharp", "blurred"):
+        use_blur(scene, kind if name == "blurred" else "")
+        image = render(blender, tmp_path, name)
+        found[name] = [extents(half) for half in (image[:80], image[80:])]
+    of_meshes, of_gaussians = (added(kind, *pair) for pair in zip(found["sharp"], found["blurred"], strict=True))
+    assert of_meshes[0].max() > 8
+    np.testing.assert_allclose(of_gaussians, of_meshes, atol=1.0)
