@@ -52,6 +52,14 @@ def environment(python: str = "") -> dict[str, str]:
     return result
 
 
+def own_numba() -> str:
+    """Return where Blender's own Python has numba from: "bundled" wheels, "installed", or "" if it has none."""
+    spec = importlib.machinery.PathFinder.find_spec("numba")
+    if spec is None or not spec.origin:
+        return ""
+    return "bundled" if ".local" in Path(spec.origin).parts else "installed"
+
+
 def is_own(python: str) -> bool:
     """Return True for the path of Blender's own Python."""
     return bool(python and sys.executable) and Path(python) == Path(sys.executable)

@@ -19,7 +19,7 @@ from bpy.props import IntProperty, StringProperty
 from .. import __package__ as base_package
 from ..r5dgs_core import errors, user_settings
 from . import find_python
-from .ui import worker_status
+from .ui import status_bar, worker_status
 
 ENVIRONMENT = "R5DGS_PYTHON"
 ENCODER_ENVIRONMENT = "R5DGS_TEXT_ENCODER"
@@ -82,8 +82,9 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
             layout.label(text=f"Overridden by {ENVIRONMENT}: {os.environ[ENVIRONMENT]}", icon="INFO")
         elif not self.worker_python and (named := _of_user_settings()):
             layout.label(text=f"From 'r5dgs config --user': {named}", icon="INFO")
-        elif not self.worker_python and self.found_python:
-            layout.label(text=f"Found: {self.found_python}", icon="INFO")
+        elif not self.worker_python:
+            text, icon = _search_result(self.found_python)
+            status_bar.wrapped(layout, context, text, icon)
         layout.prop(self, "worker_timeout")
         layout.prop(self, "text_encoder")
         if os.environ.get(ENCODER_ENVIRONMENT):
@@ -93,6 +94,17 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         if os.environ.get(TRUSTED_ENVIRONMENT):
             layout.label(text=f"Also {TRUSTED_ENVIRONMENT}: {os.environ[TRUSTED_ENVIRONMENT]}", icon="INFO")
         worker_status.draw(layout, context)
+
+
+def _search_result(found: str) -> tuple[str, str]:
+    """Text and icon about the Python that the search found, "" before a search or if it found none."""
+    numba, version = find_python.own_numba(), f"Python {sys.version_info[0]}.{sys.version_info[1]}"
+    if find_python.is_own(found) or (numba and not found):
+        return f"Blender's own {version} with {numba} numba", "CHECKMARK"
+    lacking = "" if numba else f"; this build of the extension has no numba wheel for {version}"
+    if found:
+        return f"Found: {found}{lacking or ', which also has torch'}", "INFO"
+    return f"No Python with numba found yet{lacking}; the first render searches for one", "ERROR"
 
 
 def get() -> "R5DGS_AP_preferences | None":

@@ -237,8 +237,10 @@ class Worker:
             self._answers.put((header, arrays))
 
     def _hear(self, event: dict[str, Any]) -> None:
-        notice = COMPILING if event["event"] == "compiling" else ""
-        if notice:
+        notice = COMPILING if event["event"] in ("compiling", "progress") else ""
+        if event["event"] == "progress":
+            notice += f", step {event['step']:d} of {event['steps']:d}"
+        if event["event"] == "compiling":
             log.warning("R5DGS worker: %s", notice)
         if event["event"] == "failed":
             log.warning("R5DGS worker: the rasterizer could not be prepared: %s", event.get("text", "no reason given"))

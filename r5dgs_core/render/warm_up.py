@@ -30,6 +30,19 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
         Elapsed time in seconds.
     """
     start = time.perf_counter()
+    for name, stage in _stages(gradients):
+        if progress is not None:
+            progress(name)
+        stage()
+    return time.perf_counter() - start
+
+
+def count(gradients: bool = True) -> int:
+    """Number of stages of `warm_up`."""
+    return len(_stages(gradients))
+
+
+def _stages(gradients: bool) -> list[tuple[str, Callable[[], object]]]:
     stages: list[tuple[str, Callable[[], object]]] = [
         *(("splats", _splats), ("static layer", _static_layer)),
         *(("colors", _colors), ("sky", _sky), ("meshes", _meshes)),
@@ -39,11 +52,7 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
             *(("weights of segments", _segment_weights), ("gradients of splats", _splat_gradients)),
             ("gradients of colors", _color_gradients),
         ]
-    for name, stage in stages:
-        if progress is not None:
-            progress(name)
-        stage()
-    return time.perf_counter() - start
+    return stages
 
 
 def _inputs(row: Array) -> tuple[Array, Array, Array, Array, Array]:

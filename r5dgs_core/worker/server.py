@@ -13,6 +13,7 @@ loaded in a background thread; render requests block until it finishes. If kerne
 an id are sent between responses:
 
     <- {"event": "compiling", "text": "rasterizer: compiling ...", "arrays": []}
+    <- {"event": "progress", "text": "static layer", "step": 2, "steps": 5, "arrays": []}
     <- {"event": "ready", "seconds": 7.9, "arrays": []}
     <- {"event": "failed", "text": "LoweringError: ...", "arrays": []}     (instead of "ready")
 """

@@ -14,7 +14,8 @@ class WarmUpThread:
     """Background thread that loads or compiles the rasterizer's kernels.
 
     Args:
-        on_event: Called from that thread with an event when compilation starts, and when it is done or has failed.
+        on_event: Called from that thread with an event when compilation starts, at each later stage, and when it is
+            done or has failed.
     """
 
     def __init__(self, on_event: Callable[[dict[str, Any]], None]):
@@ -43,9 +44,22 @@ class WarmUpThread:
             from ..render import warm_up
         except (ImportError, errors.ConfigError):  # the next render request reports it
             return
+        begun, step = False, 0
+
+        def announce(text: str) -> None:
+            nonlocal begun
+            begun = True
+            self._on_event({"event": "compiling", "text": text})
+
+        def progress(stage: str) -> None:
+            nonlocal step
+            step += 1
+            if begun:
+                self._on_event({"event": "progress", "text": stage, "step": step, "steps": warm_up.count(False)})
+
         try:
-            with compilation.announcing(lambda text: self._on_event({"event": "compiling", "text": text})):
-                over = {"event": "ready", "seconds": round(warm_up.warm_up(gradients=False), 2)}
+            with compilation.announcing(announce):
+                over = {"event": "ready", "seconds": round(warm_up.warm_up(gradients=False, progress=progress), 2)}
         except Exception as error:  # the next render request raises the same error; the traceback goes to the log
             traceback.print_exc()
             over = {"event": "failed", "text": f"{type(error).__name__}: {error}"}

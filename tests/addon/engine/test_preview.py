@@ -433,6 +433,7 @@ for line in sys.stdin:
     request = json.loads(line)
     if request["command"] == "warm":
         say({"event": "compiling", "text": "compiling"})
+        say({"event": "progress", "text": "colors", "step": 3, "steps": 5})
         os.read(os.open(os.environ["GATE"], os.O_RDONLY), 1)
         say({"event": "ready", "seconds": 1.0})
     say({"id": request["id"], "ok": True, "result": {"missing": []}})
@@ -448,9 +449,10 @@ def test_waiting_for_kernel_compilation_shows_a_notice(
     assert worker.notice() == ""
     job = worker.start([("rendering", "warm", {})])
     with open(tmp_path / "gate", "w"):  # from here on the worker waits for the end of this block
-        patience.wait_until(worker.notice)
+        patience.wait_until(lambda: "step" in worker.notice())
         assert "rasterizer" in worker.notice() and job.doing == worker.notice()
-        assert worker.notice() in caplog.text
+        text, _, step = worker.notice().rpartition(", ")
+        assert text in caplog.text and step == "step 3 of 5"
         window = Window(importlib.import_module("r5dgs.operators.preview").R5DGS_OT_preview, job)
         window.send("TIMER")
         assert worker.notice() in window.said[-1]

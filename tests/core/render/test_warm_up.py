@@ -130,6 +130,9 @@ def warm_ups(cold, cache):
 
 def test_a_cold_worker_announces_compilation_in_the_background(cold):
     said = [header.get("event", header.get("id")) for header in cold]
+    steps = [header["step"] for header in cold if header.get("event") == "progress"]
+    assert len(steps) > 1 and steps == list(range(steps[0], warm_up.count(gradients=False) + 1))
+    said = [number for number in said if number != "progress"]
     assert sorted(map(str, said)) == ["0", "1", "2", "3", "compiling", "ready"]
     assert said[0] == 0 and said.index(1) < said.index("ready") < said.index(2) < said.index(3)
     assert said.index("compiling") < said.index("ready")

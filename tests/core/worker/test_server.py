@@ -252,7 +252,7 @@ def test_the_rasterizer_is_compiled_on_request():
 
 @pytest.mark.parametrize("compiled", [3, 0])
 def test_an_announced_warm_up_that_fails_reports_the_reason(monkeypatch, capsys, compiled):
-    def fail(gradients):
+    def fail(gradients, progress):
         if compiled:
             compilation._watch.announce(compilation.NOTICE)
         raise OSError("no space left")
