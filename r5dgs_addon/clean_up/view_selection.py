@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 FRONT = 0.5  # a Gaussian is in front if the Gaussians before it let at least this share of its light through
+_DEPTH_BITS, _LEAST_DEPTH_BITS = 32, 20  # resolution of depths in sorting
 _FINEST = 4.0  # smallest cell in which Gaussians hide each other, in pixels
 
 
@@ -51,7 +52,7 @@ def in_lasso(pixels: np.ndarray, path: np.ndarray) -> np.ndarray:
         return inside
     low, high = path.min(0), path.max(0)
     near = np.flatnonzero(within(pixels, low, high))
-    near = near[np.argsort(pixels[near, 1], kind="stable")]
+    near = near[np.argsort(pixels[near, 1])]
     x, y, parity = pixels[near, 0], pixels[near, 1], np.zeros(len(near), bool)
     for (x0, y0), (x1, y1) in zip(path, np.roll(path, -1, axis=0), strict=True):
         if y0 == y1:
@@ -100,15 +101,35 @@ def is_in_front(pixels: np.ndarray, depths: np.ndarray, opacities: np.ndarray, s
     if not len(seen):
         return front
     cell = max(_FINEST, 2 * float(np.median(sizes[seen])))
-    places = np.floor(pixels[seen] / cell)
-    places -= places.min(0)
-    keys = places @ (1, places[:, 0].max() + 1)
-    ahead = depths[seen] - depths[seen].min()
-    order = np.argsort(keys + ahead / (ahead.max() * (1 + 1e-6) + 1e-300))  # by cell, then by depth
-    covered = np.minimum(np.pi * (2 * sizes[seen]) ** 2 / cell**2, 1.0) * opacities[seen]
+    columns, rows = (np.floor(pixels[seen, axis] / cell).astype(np.int64) for axis in (0, 1))
+    columns -= columns.min()
+    keys = (rows - rows.min()) * (columns.max() + 1) + columns
+    order = _by_cell_and_depth(keys, depths[seen])
+    covered = np.minimum((np.pi * 4 / cell**2) * np.square(sizes[seen]), 1.0) * opacities[seen]
     light = np.log1p(-np.minimum(covered, 0.999))[order]
     before = np.cumsum(light) - light
-    starts = np.flatnonzero(np.diff(keys[order], prepend=keys[order[0]] - 1))
+    ordered = keys[order]
+    starts = np.flatnonzero(np.diff(ordered, prepend=ordered[0] - 1))
     before -= np.repeat(before[starts], np.diff(starts, append=len(order)))
     front[seen[order]] = before >= np.log(FRONT) - 1e-9
     return front
+
+
+def _by_cell_and_depth(keys: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """Rows sorted by cell, then by depth.
+
+    Cell, depth and row are packed into one integer, if they fit, because sorting values is faster than sorting rows.
+
+    Args:
+        keys: Cells, from 0. [n]
+        depths: Depths. [n]
+    """
+    row_bits, key_bits = len(keys).bit_length(), int(keys.max()).bit_length()
+    depth_bits = min(63 - row_bits - key_bits, _DEPTH_BITS)
+    if depth_bits < _LEAST_DEPTH_BITS:
+        return np.lexsort((depths, keys))
+    ahead = depths - depths.min()
+    steps = (ahead * ((1 << depth_bits) - 1) / max(float(ahead.max()), 1e-300)).astype(np.int64)
+    packed = (((keys << depth_bits) | steps) << row_bits) | np.arange(len(keys))
+    packed.sort()
+    return packed & ((1 << row_bits) - 1)

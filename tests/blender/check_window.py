@@ -355,14 +355,16 @@ def merging(path: Path, folder: Path):
         saved = folder / f"{engine}.png"
         render.image_settings.file_format = "PNG"
         bpy.data.images["Render Result"].save_render(str(saved), scene=scene)
-        same = np.abs(pixels(bpy.data.images.load(str(saved))) - np.clip(arrays["color"], 0, 1)).max(axis=-1) < 3 / 255
+        same = (
+            np.abs(pixels(bpy.data.images.load(str(saved))) - np.clip(arrays["color"], 0, 1)).max(axis=-1) < 8 / 255
+        )  # Gaussians reach through the wall
         nearer, farther = solid & (arrays["depth"] < 0.95 * wall), solid & (arrays["depth"] > 1.05 * wall)
         print(
             f"Merge with Meshes by {engine}: of {nearer.sum()} pixels before the wall {same[nearer].mean():.1%} are "
             f"the Gaussians', of {farther.sum()} behind it {same[farther].mean():.1%}",
             flush=True,
         )
-        assert same[nearer].mean() > 0.8 and same[farther].mean() < 0.05, engine
+        assert same[nearer].mean() > 0.95 and same[farther].mean() < 0.05, engine
     with w.inside():
         assert bpy.ops.r5dgs.stop_merging() == {"FINISHED"}
     bpy.data.objects.remove(plane)
