@@ -68,11 +68,7 @@ def run_lookup(
     """
     if out is not None:
         input_paths.check_scene_output(out)
-    encoder = encoder or user_settings.read().get("encoder")
-    if encoder is None:
-        raise errors.UsageError(
-            "lookup: name an encoder with --encoder DIR, or once with 'r5dgs config --user set encoder DIR'"
-        )
+    encoder = _chosen_encoder(encoder)
     input_paths.check_scene(path)
     from ...language import build_table
     from ...language.encoders import registry
@@ -102,6 +98,16 @@ def run_lookup(
     if progress_kind != "json":
         _print_summary(made, target, opened)
     return made.scene
+
+
+def _chosen_encoder(given: str | None) -> str:
+    """Return the given encoder, or else that of the user's settings."""
+    encoder = given or user_settings.read().get("encoder")
+    if encoder is None:
+        raise errors.UsageError(
+            "lookup: name an encoder with --encoder DIR, or once with 'r5dgs config --user set encoder DIR'"
+        )
+    return encoder
 
 
 def _print_summary(made: SceneWithTable, path: Path, encoder: Encoder) -> None:
