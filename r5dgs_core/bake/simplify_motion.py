@@ -38,6 +38,11 @@ LOSS = 0.03  # maximum loss of PSNR on the training views by all simplifications
 SHAPE = 0.5  # share of shape in a rotation's effect on the images, below which it only fits colours (passing shadows)
 CLEARLY = 3.0  # change / allowed change above which one view per cluster decides
 LARGEST = 0.05  # spread (rad or diameters) above which motion is kept without comparing images
+_SPREADS = {
+    "rotation": "spread of its rotations, rad",
+    "motion": "spread of its places, diameters",
+    "curved_path": "distance from a straight path, diameters",
+}
 
 
 @dataclass(frozen=True)

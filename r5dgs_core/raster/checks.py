@@ -11,6 +11,13 @@ from ..scene import cameras
 from ..scene.cameras import Camera
 from .arrays import Array, array_namespace, device_of, is_float, is_whole, like, to_host
 
+_MOST_LABEL = (1 << 31) - 1  # ids are int32
+# Bounds of inputs with a limited range, and the remedy.
+_RANGES: dict[str, tuple[float, float, str]] = {
+    "scales": (0.0, math.inf, "pass exp(log_scales)"),
+    "opacities": (0.0, 1.0, "pass sigmoid(opacity_logits)"),
+}
+
 
 def check_splats(means, quats, scales, opacities, channels, camera, background, labels) -> None:
     """Raise ValueError or TypeError for the first input with an invalid type, shape, dtype, device or value."""
@@ -85,13 +92,6 @@ def check_raw(gaussians: Any, colors: Any, features: Any) -> None:
             raise ValueError(f"{name}: expected {wanted}, found {values[at].item()} at index {at}")
 
 
-# Bounds of inputs with a limited range, and the remedy.
-_RANGES: dict[str, tuple[float, float, str]] = {
-    "scales": (0.0, math.inf, "pass exp(log_scales)"),
-    "opacities": (0.0, 1.0, "pass sigmoid(opacity_logits)"),
-}
-
-
 def check_kind(name: str, value: Any, xp: Any) -> None:
     """Raise TypeError unless a value is an array if ``xp`` is numpy, or a tensor if it is torch."""
     if not isinstance(value, np.ndarray if xp is np else xp.Tensor):
@@ -126,9 +126,6 @@ def check_background(background: Any, means: Array, camera: Camera, depth: int) 
             "divided by 255 for 8-bit colours"
         )
     _check_device("background", background, means)
-
-
-_MOST_LABEL = (1 << 31) - 1  # ids are int32
 
 
 def _check_labels(labels: Any, means: Array) -> None:

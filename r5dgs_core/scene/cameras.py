@@ -12,6 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+# Rotation from a data set's world axes to Blender's (right-handed, Z up), applied once, on the root empty.
+WORLD_TO_BLENDER = {
+    "blender": np.eye(3),
+    "colmap": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "opengl": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+}
 FARTHEST = 1e15  # maximum coordinate; its square is within the range of float32
 MOST_PIXELS = 1 << 16  # maximum image side
 _MOST_FOCAL = 1e12  # pixels; the smallest focal length is its reciprocal
@@ -218,11 +224,3 @@ def pixel_rays(camera: Camera) -> np.ndarray:
     u = (x - k[0, 2] - k[0, 1] * v) / k[0, 0]
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ camera.T_cam_world[:3, :3]
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
-# Rotation from a data set's world axes to Blender's (right-handed, Z up), applied once, on the root empty.
-WORLD_TO_BLENDER = {
-    "blender": np.eye(3),
-    "colmap": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    "opengl": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-}
