@@ -39,7 +39,7 @@ def measure(scene: Scene, ground_truth: GroundTruth | None) -> tuple[list[Row], 
     pose_task.fit_all(scene, bodies, tuple(names[:1]))  # the first fit loads and compiles
     later = bodies[0].times == bodies[0].times[-1]
     rows = []
-    for label, chosen in [*((_label(n), family) for n, family in families.items()), (f"{_label(len(names))}", None)]:
+    for label, chosen in [*((_label(n), family) for n, family in families.items()), (_label(len(names)), None)]:
         fitted = pose_task.fit_all(scene, bodies, chosen)
         models = [pose_task.model_of(body, fit) for body, fit in zip(bodies, fitted.fits, strict=True)]
         taus = bodies[0].times[later] - scene.t_max

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import io
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -166,7 +165,7 @@ def by_task(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 def kinds_of(rows: Sequence[Row]) -> list[str]:
     """Return the kinds of error of the rows, in order of appearance."""
-    return list(dict.fromkeys(itertools.chain(row.error_kind for row in rows)))
+    return list(dict.fromkeys(row.error_kind for row in rows))
 
 
 def from_dicts(rows: Sequence[dict[str, Any]]) -> list[Row]:

@@ -57,13 +57,8 @@ def psnr_pooled(errors: Sequence[float]) -> float:
     return psnr_of_mse(float(np.mean(errors))) if len(errors) else math.nan
 
 
-def ssim(image: np.ndarray, truth: np.ndarray) -> float:
-    """Return the structural similarity as in 3D Gaussian Splatting: the mean of `ssim_map`, 1 for equal images."""
-    return float(ssim_map(image, truth).mean())
-
-
 def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the structural similarity of the windows around each pixel.
+    """Return the structural similarity of the windows around each pixel; its mean is that of 3D Gaussian Splatting.
 
     Window 11 x 11, Gaussian of sigma 1.5, zero padding, constants 0.01 and 0.03. Packages that pad by reflection or
     crop the border give other means (differences up to 0.007).
