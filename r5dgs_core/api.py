@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .motion import rotations
+from .motion import se3
 from .playback.scene_player import Player
 from .scene import scene_file
 from .scene.cameras import Camera
@@ -46,8 +46,7 @@ def poses(scene: Scene, t: float, mode: str = "rigid") -> dict[str, np.ndarray]:
         matrix = np.eye(4)
         if item.id in bodies:
             group = bodies[item.id]
-            matrix[:3, :3] = rotations.quats_to_rotmats(quats[group.id])
-            matrix[:3, 3] = group.pivot + displacements[group.id] - matrix[:3, :3] @ group.pivot
+            matrix = se3.pose_to_matrix(group.pivot, quats[group.id], displacements[group.id])
         if item.id > 0:
             found[item.name] = matrix
     return found

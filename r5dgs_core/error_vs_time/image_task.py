@@ -11,6 +11,7 @@ import numpy as np
 from .. import timing
 from ..data.dataset import Dataset, View
 from ..evaluation import evaluate, ground_truth_poses
+from ..motion import se3
 from ..playback import scene_player
 from ..render import scene_renderer
 from ..scene.scene import Scene
@@ -139,7 +140,7 @@ def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[e
             if body.group.role == "body" and not body.turn_seen:
                 displacements[body.group.id] = body.path[k] - body.group.pivot
             elif body.group.role == "body":
-                q, d = ground_truth_poses.pose(body.group.pivot, body.motion[k])
+                q, d = se3.matrix_to_pose(body.group.pivot, body.motion[k])
                 quats[body.group.id], displacements[body.group.id] = q, d
         for group in scene.groups:
             if group.follows is not None and group.follow_matrix is not None:

@@ -12,7 +12,7 @@ import numpy as np
 from .. import timing
 from ..data.dataset import GroundTruth
 from ..evaluation import ground_truth_poses, metrics
-from ..motion import free_top, models, rigid_fit
+from ..motion import free_top, models, rigid_fit, se3
 from ..motion_fit import candidates, model_selection, noise
 from ..playback import group_dynamics, modes, scene_player
 from ..scene.scene import MotionGroup, Scene
@@ -172,9 +172,7 @@ def model_of(body: ground_truth_poses.Body, fit: model_selection.Fit | None) -> 
 def model_motion(body: ground_truth_poses.Body, model: models.MotionModel, taus: np.ndarray) -> np.ndarray:
     """Return the motion of a body by a model at times past t_max. [H, 4, 4]"""
     quats, displacements = models.evaluate(model, taus)
-    return np.stack(
-        [ground_truth_poses.matrix(body.group.pivot, q, d) for q, d in zip(quats, displacements, strict=True)]
-    )
+    return np.stack([se3.pose_to_matrix(body.group.pivot, q, d) for q, d in zip(quats, displacements, strict=True)])
 
 
 def _group_motion(
@@ -183,9 +181,7 @@ def _group_motion(
     """Return the motion of the bodies' groups in a mode. [B, H, 4, 4]"""
     found = [player.group_poses(float(t)) for t in times]
     groups = [body.group for body in bodies]
-    return np.stack(
-        [np.stack([ground_truth_poses.matrix(g.pivot, q[g.id], d[g.id]) for q, d in found]) for g in groups]
-    )
+    return np.stack([np.stack([se3.pose_to_matrix(g.pivot, q[g.id], d[g.id]) for q, d in found]) for g in groups])
 
 
 def _member_motion(
@@ -201,7 +197,7 @@ def _member_motion(
         means = player.frame(float(t)).means.astype(np.float64)
         for i, (body, (rows, weights)) in enumerate(zip(bodies, members, strict=True)):
             fit = rigid_fit.fit_rigid(scene.gaussians.means[rows].astype(np.float64), means[rows], weights)
-            result[i, k] = ground_truth_poses.matrix(body.group.pivot, fit.quat, fit.displacement_at(body.group.pivot))
+            result[i, k] = se3.pose_to_matrix(body.group.pivot, fit.quat, fit.displacement_at(body.group.pivot))
     return result
 
 

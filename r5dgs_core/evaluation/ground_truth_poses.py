@@ -14,7 +14,7 @@ import numpy as np
 from scipy import optimize
 
 from ..data.dataset import GroundTruth
-from ..motion import rotations
+from ..motion import se3
 from ..playback import scene_player
 from ..scene.scene import MotionGroup, Scene
 from . import metrics
@@ -58,6 +58,7 @@ def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> t
     """Return the motion groups of a scene whose true motion is known.
 
     Args:
+        scene: The scene.
         ground_truth: True poses. Discovered objects of a scene are matched to the true ones by position.
         every: Return all bodies of an object instead of only the one with most of its Gaussians.
 
@@ -91,23 +92,7 @@ def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> t
 def motion(scene: Scene, groups: Sequence[MotionGroup], times: np.ndarray) -> np.ndarray:
     """Return the motion of groups as maps from the bind state to the world. G groups, [T] -> [G, T, 4, 4]"""
     poses = [scene_player.group_poses(scene, float(t)) for t in times]
-    return np.stack([np.stack([matrix(group.pivot, q[group.id], d[group.id]) for q, d in poses]) for group in groups])
-
-
-def matrix(pivot: np.ndarray, quat: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Return the map from the bind state to the world: x -> p + R (x - p) + d. [4, 4]"""
-    result = np.eye(4)
-    result[:3, :3] = rotations.quats_to_rotmats(quat)
-    pivot = np.asarray(pivot, np.float64)
-    result[:3, 3] = pivot + displacement - result[:3, :3] @ pivot
-    return result
-
-
-def pose(pivot: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Invert `matrix`: return unit wxyz [..., 4] and displacement of the pivot [..., 3] of maps [..., 4, 4]."""
-    pivot = np.asarray(pivot, np.float64)
-    turned = np.einsum("...ij,j->...i", motion[..., :3, :3], pivot)
-    return rotations.rotmats_to_quats(motion[..., :3, :3]), turned + motion[..., :3, 3] - pivot
+    return np.stack([np.stack([se3.pose_to_matrix(g.pivot, q[g.id], d[g.id]) for q, d in poses]) for g in groups])
 
 
 def _renumbered(scene: Scene, ground_truth: GroundTruth) -> GroundTruth:

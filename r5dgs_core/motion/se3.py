@@ -62,10 +62,29 @@ def compose(second: Pose, first: Pose) -> Pose:
     )
 
 
-def invert(pose: Pose) -> Pose:
-    """Inverse pose. ([..., 4], [..., 3])"""
-    back = rotations.conjugate(pose[0])
-    return back, -rotations.rotate(back, pose[1])
+def pose_to_matrix(pivot: np.ndarray, quat: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+    """Map x -> p + R (x - p) + d of a pose about a pivot p, in homogeneous coordinates, numpy only.
+
+    Args:
+        pivot: The pivot p. [3]
+        quat: Rotation R, wxyz. [4]
+        displacement: Displacement d of the pivot. [3]
+
+    Returns:
+        The map. [4, 4] float64
+    """
+    result = np.eye(4)
+    result[:3, :3] = rotations.quats_to_rotmats(quat)
+    pivot = np.asarray(pivot, np.float64)
+    result[:3, 3] = pivot + displacement - result[:3, :3] @ pivot
+    return result
+
+
+def matrix_to_pose(pivot: np.ndarray, matrix: np.ndarray) -> Pose:
+    """Inverse of `pose_to_matrix`: unit wxyz [..., 4] and displacements of the pivot [..., 3] of maps [..., 4, 4]."""
+    pivot = np.asarray(pivot, np.float64)
+    turned = np.einsum("...ij,j->...i", matrix[..., :3, :3], pivot)
+    return rotations.rotmats_to_quats(matrix[..., :3, :3]), turned + matrix[..., :3, 3] - pivot
 
 
 def differences(a: Pose, b: Pose, length: float, angle: float) -> np.ndarray:
