@@ -57,10 +57,13 @@ def write(
     """Render views of a data set and write the contact sheet.
 
     Args:
+        scene: The scene.
+        dataset: Its data set.
         path: PNG file to write.
         views: Columns of the sheet; `choose_views` if None.
         mode: Playback mode past t_max.
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
+        backend: Rasterizer.
     """
     views = choose_views(dataset) if views is None else views
     renderings = [render(scene, view.camera, view.t, mode, backend=backend) for view in views]

@@ -76,9 +76,12 @@ def evaluate(
     """Measure a scene on the held-out views of a data set.
 
     Args:
+        scene: The scene.
+        dataset: Its data set.
         modes: Playback modes past t_max, from `scene_player.modes`.
         splits: Splits to measure.
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
+        backend: Rasterizer.
         train: Cost of training: "seconds", "iterations", "gaussians".
         progress: Called with the number of measured images and the total.
 
@@ -131,9 +134,11 @@ def measure(
     """Measure pictures of a scene whose Gaussians are moved by a function.
 
     Args:
+        scene: The scene.
         views: Cameras, times and true images.
-        move: Returns the scene's Gaussians.
+        move: Returns the scene's Gaussians from a time and an origin.
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
+        backend: Rasterizer.
         measured: Called after each image.
 
     Returns:

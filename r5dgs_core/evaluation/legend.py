@@ -42,9 +42,11 @@ def draw(
     """Draw the legend of a scene.
 
     Args:
+        scene: The scene.
         standpoint: Camera and time.
         mode: Playback mode past t_max.
         longest: Pixels along the longer side; those of the camera, but at least `LONGEST`, if None.
+        backend: Rasterizer.
 
     Returns:
         The picture with a strip below that lists all objects. [h, w, 3] uint8

@@ -67,8 +67,10 @@ def measure(
     """Render a scene from some views and measure its objects.
 
     Args:
+        scene: The scene.
         views: Cameras and times; views of a data set are compared with their masks.
         mode: Playback mode past t_max.
+        backend: Rasterizer.
 
     Returns:
         One row per object of the scene's table.
@@ -162,6 +164,7 @@ def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:
     """Return the rows as a terminal table.
 
     Args:
+        scene: The scene.
         rows: Rows of `measure`.
         views: Number of views that were rendered.
     """
