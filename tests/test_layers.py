@@ -136,7 +136,7 @@ LATE_IMPORTS = {
     # numba is optional, and torch is for gradients and odd dtypes.
     "raster.cpu.backend": {
         "raster.torch_backend",
-        *("raster.compilation", "raster.cpu.autograd", "raster.cpu.forward"),
+        *("raster.thread_pool", "raster.cpu.autograd", "raster.cpu.forward"),
         *("raster.cpu.sky", "raster.cpu.static_layer"),
     },
     # scipy is slow to import.

@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from torch.nn.functional import interpolate
 
-from r5dgs_core.raster import compilation, rasterize
+from r5dgs_core.raster import rasterize, thread_pool
 from r5dgs_core.scene import spherical_harmonics
 from r5dgs_core.scene.cameras import Camera
 
@@ -138,8 +138,8 @@ def measure(name: str, variants: Sequence[Variant], repeats: int) -> list[Point]
     print(f"{name}: drawing the truth in float64, alpha_min 1e-4, transmittance_min 1e-8", flush=True)
     truth = drawers.make(Variant("", "ideal", IDEAL, backend="reference", dtype=torch.float64))()
     contenders: list[timing.Contender] = []
-    threads = compilation.threads()
-    compilation.set_threads(1)
+    threads = thread_pool.threads()
+    thread_pool.set_threads(1)
     try:
         for variant in variants:
             label = {"setting": variant.setting}
@@ -161,7 +161,7 @@ def measure(name: str, variants: Sequence[Variant], repeats: int) -> list[Point]
             for variant, contender in zip(variants, contenders, strict=True)
         ]
     finally:
-        compilation.set_threads(threads)
+        thread_pool.set_threads(threads)
         for contender in contenders:
             if isinstance(contender, polynomials.Remote):
                 contender.close()

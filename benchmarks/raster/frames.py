@@ -26,7 +26,7 @@ import torch
 
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.playback import scene_player
-from r5dgs_core.raster import RenderOutput, compilation
+from r5dgs_core.raster import RenderOutput, thread_pool
 from r5dgs_core.render import incremental_renderer, posed_scene, scene_renderer
 from r5dgs_core.scene import row_runs
 from r5dgs_core.scene.cameras import Camera
@@ -196,7 +196,7 @@ def main(arguments: list[str] | None = None) -> None:
             options.count, options.bodies, sh_degree, sky_degree, camera, kind=options.kind, share=options.share
         )
         for threads in map(int, options.threads.split(",")):
-            compilation.set_threads(threads)
+            thread_pool.set_threads(threads)
             torch.set_num_threads(threads)
             rows.append(
                 {

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from r5dgs_core.raster import compilation, shade
+from r5dgs_core.raster import shade, thread_pool
 from r5dgs_core.scene import cameras, spherical_harmonics
 from r5dgs_core.scene.cameras import Camera
 
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.json and not options.json.parent.is_dir():
         parser.error(f"--json: no folder {options.json.parent}")
-    compilation.set_threads(1)
+    thread_pool.set_threads(1)
     rows = []
     print(" ".join(f"{column:>16}" for column in COLUMNS))
     for degree in (1, 2, 3):

@@ -96,12 +96,12 @@ class Remote(timing.Contender):
 
 def _serve(connection: Connection, coefficients: tuple[float, ...], make_run: Callable[[], Callable]) -> None:
     """Process requests until the other end closes."""
-    from r5dgs_core.raster import compilation
+    from r5dgs_core.raster import thread_pool
     from r5dgs_core.raster.cpu.simd import float32x16
 
     float32x16._EXP2 = coefficients
     torch.set_num_threads(1)
-    compilation.set_threads(1)
+    thread_pool.set_threads(1)
     contender = timing.Contender({}, make_run())
     while True:
         try:

@@ -271,14 +271,14 @@ def _compare_images(peer: ModuleType, workload: Workload) -> str:
 
 @contextmanager
 def _rasterizer_threads(count: int) -> Iterator[None]:
-    from r5dgs_core.raster import compilation
+    from r5dgs_core.raster import thread_pool
 
-    before = compilation.threads()
-    compilation.set_threads(count)
+    before = thread_pool.threads()
+    thread_pool.set_threads(count)
     try:
         yield
     finally:
-        compilation.set_threads(before)
+        thread_pool.set_threads(before)
 
 
 def _choose(options: argparse.Namespace) -> list[Callable[[], Workload]]:

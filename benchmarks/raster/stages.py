@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from r5dgs_core.raster import compilation
+from r5dgs_core.raster import thread_pool
 
 PACKAGES = ("r5dgs_core.raster.", "r5dgs_core.render.")
 
@@ -35,7 +35,7 @@ def measure(run: Callable[[], object], repeats: int) -> dict[str, float]:
 
 @contextmanager
 def _watch() -> Iterator[dict[str, float]]:
-    """Record milliseconds by kernel while the context lasts, by wrapping the kernels and `compilation.run` in their
+    """Record milliseconds by kernel while the context lasts, by wrapping the kernels and `thread_pool.run` in their
     modules.
     """
     spent: dict[str, float] = defaultdict(float)
@@ -57,7 +57,7 @@ def _watch() -> Iterator[dict[str, float]]:
         timed.timed_kernel = function  # type: ignore[attr-defined]
         return timed
 
-    runners = {compilation.run, compilation.run_parts}
+    runners = {thread_pool.run, thread_pool.run_parts}
     replaced = []
     for module in [m for name, m in sys.modules.items() if name.startswith(PACKAGES)]:
         for name, value in list(vars(module).items()):

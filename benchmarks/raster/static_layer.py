@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from r5dgs_core.raster import compilation, rasterize_splats
+from r5dgs_core.raster import rasterize_splats, thread_pool
 from r5dgs_core.raster.cpu.projection import TILE
 from r5dgs_core.raster.cpu.static_layer import StaticLayer
 
@@ -35,7 +35,7 @@ def measure(name: str, share: float, threads: int, repeats: int) -> dict:
     order = torch.argsort(distances)
     count = round(share * len(order))
     moving, still = ([t[rows].contiguous() for t in inputs] for rows in (order[:count], order[count:]))
-    compilation.set_threads(threads)
+    thread_pool.set_threads(threads)
     start = time.perf_counter()
     backdrop = StaticLayer(*still, camera)
     build_ms = 1e3 * (time.perf_counter() - start)

@@ -133,6 +133,6 @@ def training_settings(
 def use_threads(count: int | None) -> None:
     """Set the number of threads of the kernels; None keeps NUMBA_NUM_THREADS, or else all usable cores."""
     if count is not None:
-        from ..raster import compilation
+        from ..raster import thread_pool
 
-        compilation.set_threads(count)
+        thread_pool.set_threads(count)

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..motion import rotations
-from ..raster.compilation import run
 from ..raster.cpu import blend_before_depths, forward, projection, tiles
 from ..raster.settings import RasterSettings
+from ..raster.thread_pool import run
 from ..scene import cameras, spherical_harmonics
 from ..scene.cameras import Camera
 from ..scene.instance import Instance

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..raster import compilation
+from ..raster import thread_pool
 
 
 def versions() -> dict[str, str]:
@@ -44,6 +44,6 @@ def describe() -> dict[str, Any]:
         "system": platform.platform(),
         "processor": processor,
         "cores": usable,
-        "raster_threads": compilation.threads(),
+        "raster_threads": thread_pool.threads(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }

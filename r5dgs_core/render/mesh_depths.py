@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from ..raster.compilation import helper, kernel, run
+from ..raster.compilation import helper, kernel
+from ..raster.thread_pool import run
 from ..scene.cameras import Camera
 
 MARGIN = 2  # px by which meshes extend past their outlines; render engines filter pixels over up to 1.5 px

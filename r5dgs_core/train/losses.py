@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..raster import compilation as kernels
+from ..raster import thread_pool
 
 _OFFSETS = np.arange(11) - 5
 _WINDOW = np.exp(-(_OFFSETS**2) / (2 * 1.5**2))
@@ -48,9 +49,9 @@ class _Photometric(torch.autograd.Function):
         slopes = np.empty((3, *shape), np.float32)
         sums = np.empty((height, 2), np.float64)
         gradient = np.empty(shape, np.float32)
-        kernels.run(_moments, height, x, y, WINDOW, moments)
-        kernels.run(_compare, height, x, y, WINDOW, moments, slopes, sums)
-        kernels.run(_gather, height, x, y, WINDOW, slopes, np.float32(ssim_weight), gradient)
+        thread_pool.run(_moments, height, x, y, WINDOW, moments)
+        thread_pool.run(_compare, height, x, y, WINDOW, moments, slopes, sums)
+        thread_pool.run(_gather, height, x, y, WINDOW, slopes, np.float32(ssim_weight), gradient)
         similarity, difference = sums.sum(0) / x.size
         ctx.gradient = torch.from_numpy(gradient.reshape(height, width, 3))
         return image.new_tensor((1 - ssim_weight) * difference + ssim_weight * (1 - similarity))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from r5dgs_core.raster import compilation
+from r5dgs_core.raster import thread_pool
 
 ROOT = Path(__file__).parents[2]
 
@@ -18,7 +18,7 @@ def importing(monkeypatch):
 
     Afterwards these modules are forgotten, and the numbers of threads are what they were.
     """
-    before = compilation.threads(), torch.get_num_threads()
+    before = thread_pool.threads(), torch.get_num_threads()
     monkeypatch.syspath_prepend(str(ROOT))
     hidden = _forget()
     try:
@@ -26,7 +26,7 @@ def importing(monkeypatch):
     finally:
         _forget()
         sys.modules.update(hidden)
-        compilation.set_threads(before[0])
+        thread_pool.set_threads(before[0])
         torch.set_num_threads(before[1])
 
 

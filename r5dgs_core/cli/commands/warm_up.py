@@ -39,7 +39,7 @@ def run_warm_up(*, progress_kind: str) -> dict[str, Any]:
     from ...progress import make
 
     try:
-        from ...raster import compilation
+        from ...raster import compilation, kernel_cache
         from ...train import warm_up
     except ImportError as error:
         raise errors.BackendError(f"warm-up: {sys.executable} lacks '{error.name}'; install r5dgs again") from error
@@ -49,7 +49,7 @@ def run_warm_up(*, progress_kind: str) -> dict[str, Any]:
         compilation.announcing(lambda text: progress({"event": "notice", "text": text})),
     ):
         seconds = warm_up.warm_up(lambda stage: progress({"event": "prepare", "text": stage}))
-        folder = compilation.cache_folder()
+        folder = kernel_cache.cache_folder()
         compiled = compilation.compiled()
         result = {"seconds": round(seconds, 2), "compiled": compiled, "folder": None if folder is None else str(folder)}
         if progress_kind == "json":

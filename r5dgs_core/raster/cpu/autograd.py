@@ -10,8 +10,8 @@ import torch
 
 from ..arrays import to_array
 from ..backend import ViewPoses
-from ..compilation import run
 from ..settings import RasterStats
+from ..thread_pool import run
 from . import blend_backward, forward, projection, sh_kernels
 
 _EMPTY = np.empty((0, 0), np.float32)

@@ -23,7 +23,7 @@ class CpuBackend(Backend):
 
     def hardware(self) -> str:
         """See `Backend.hardware`."""
-        from ..compilation import threads
+        from ..thread_pool import threads
 
         return f"CPU, {threads()} threads" if threads() > 1 else "CPU, 1 thread"
 
@@ -91,7 +91,7 @@ class CpuBackend(Backend):
 
     def sky(self, sh: np.ndarray, camera: Camera) -> np.ndarray:
         """See `Backend.sky`."""
-        from ..compilation import run
+        from ..thread_pool import run
         from .sky import draw_sky
 
         rays = camera.T_cam_world[:3, :3].T @ np.linalg.inv(camera.intrinsics)

@@ -13,8 +13,8 @@ import numpy as np
 
 from ...scene.cameras import Camera
 from ..backend import ViewPoses
-from ..compilation import run
 from ..settings import RasterSettings, frustum_slopes
+from ..thread_pool import run
 from . import blend, projection, sh_kernels
 from . import segments as cpu_segments
 from . import tiles as cpu_tiles

@@ -14,8 +14,8 @@ import numpy as np
 from ...scene.cameras import Camera
 from .. import checks
 from ..arrays import Array, like, to_array
-from ..compilation import run
 from ..settings import RasterSettings, SplatImage
+from ..thread_pool import run
 from . import blend, forward, projection
 from . import tiles as cpu_tiles
 

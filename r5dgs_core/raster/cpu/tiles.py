@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 
-from ..compilation import helper, kernel, run_parts, threads
+from ..compilation import helper, kernel
+from ..thread_pool import run_parts, threads
 from .projection import (
     BOX_DIGIT,
     BOX_MARGIN,

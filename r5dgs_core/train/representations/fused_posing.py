@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ...model.group_poses import GroupPoses, at_rest
 from ...raster import compilation as kernels
+from ...raster import thread_pool
 
 CHUNKS = 16
 
@@ -119,7 +120,7 @@ class _Pose(torch.autograd.Function):
         n = len(arrays[0])
         out = [np.empty((n, 3), np.float32), np.empty((n, 4), np.float32), np.empty((n, 3), np.float32)]
         out += [np.empty(n, np.float32), np.empty((n, 3), np.float32)]
-        kernels.run(_forward, CHUNKS, *arrays, ids_array, centers_array, *out)
+        thread_pool.run(_forward, CHUNKS, *arrays, ids_array, centers_array, *out)
         ctx.saved = (arrays, ids_array, centers_array, out)
         return tuple(torch.from_numpy(a) for a in out)
 
@@ -132,7 +133,7 @@ class _Pose(torch.autograd.Function):
         group_grads = np.zeros((CHUNKS, groups, 16), np.float64)
         light_grad = np.zeros((CHUNKS, 3), np.float64)
         inputs = (*arrays, ids, centers, out[2], out[3], *upstream)
-        kernels.run(_backward, CHUNKS, *inputs, *result, group_grads, light_grad)
+        thread_pool.run(_backward, CHUNKS, *inputs, *result, group_grads, light_grad)
         total = group_grads.sum(0)
         tensors = [torch.from_numpy(a) for a in result]
         return (

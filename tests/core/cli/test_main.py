@@ -26,7 +26,7 @@ from r5dgs_core.data import dataset as datasets
 from r5dgs_core.evaluation import evaluate, scene_summary
 from r5dgs_core.motion.history import Band, History
 from r5dgs_core.playback import modes
-from r5dgs_core.raster import compilation
+from r5dgs_core.raster import thread_pool
 from r5dgs_core.scene import scene_file
 from r5dgs_core.time_left import TimedProgress
 from r5dgs_core.train import checkpoint
@@ -534,16 +534,16 @@ def test_a_query_that_finds_nothing_is_status_1(made, capsys):
 
 
 def test_steps_and_seed_reach_the_run_and_threads_leave_its_bits(tiny, tmp_path):
-    states, before = [], compilation.threads()
+    states, before = [], thread_pool.threads()
     try:
         for threads in (1, 2):
             folder = tmp_path / str(threads)
             given = ["--iterations", "4", "--seed", "7", "--threads", str(threads), "--progress", "none"]
             assert main.main(["train", str(tiny.root), "--out", str(folder), *OPTIONS, *given]) == 0
-            assert compilation.threads() == threads
+            assert thread_pool.threads() == threads
             states.append(checkpoint.load(folder))
     finally:
-        compilation.set_threads(before)
+        thread_pool.set_threads(before)
     settled = checkpoint.open_run(folder).config.train
     assert (settled.iterations, settled.seed, states[0].iteration) == (4, 7, 4)
     assert all((states[0].tensors[name] == tensor).all() for name, tensor in states[1].tensors.items())

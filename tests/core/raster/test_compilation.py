@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from r5dgs_core.raster import compilation
+from r5dgs_core.raster import compilation, kernel_cache
 
 pytestmark = pytest.mark.heavy
 
@@ -32,9 +32,9 @@ print(double(21), sum(double.stats.cache_hits.values()), sum(double.stats.cache_
 
 @pytest.fixture(autouse=True)
 def forget():
-    compilation._cache_folder.cache_clear()
+    kernel_cache.folder_of.cache_clear()
     yield
-    compilation._cache_folder.cache_clear()
+    kernel_cache.folder_of.cache_clear()
 
 
 def blocked(tmp_path: Path) -> Path:
@@ -71,10 +71,10 @@ def test_a_home_that_cannot_be_written_moves_the_cache_to_an_own_temporary_folde
 
 
 def test_the_users_choice_and_the_users_cache_come_first(tmp_path, monkeypatch):
-    monkeypatch.setattr(compilation, "_user_cache", lambda: tmp_path / "user")
-    assert Path(compilation._cache_folder("")).parent == tmp_path / "user"
-    assert Path(compilation._cache_folder(str(tmp_path / "chosen"))).parent == tmp_path / "chosen"
-    assert Path(compilation._cache_folder(str(blocked(tmp_path) / "deeper"))).parent == tmp_path / "user"
+    monkeypatch.setattr(kernel_cache, "_user_cache", lambda: tmp_path / "user")
+    assert Path(kernel_cache.folder_of("")).parent == tmp_path / "user"
+    assert Path(kernel_cache.folder_of(str(tmp_path / "chosen"))).parent == tmp_path / "chosen"
+    assert Path(kernel_cache.folder_of(str(blocked(tmp_path) / "deeper"))).parent == tmp_path / "user"
 
 
 def test_the_first_compilation_is_announced_once_and_loading_is_never_announced(tmp_path):
@@ -84,7 +84,7 @@ def test_the_first_compilation_is_announced_once_and_loading_is_never_announced(
 
 TOLD = """
 import gc, threading, numba
-from r5dgs_core.raster import compilation
+from r5dgs_core.raster import compilation, kernel_cache
 from r5dgs_core.raster.compilation import helper, kernel
 
 told = []
@@ -131,7 +131,7 @@ def test_only_kernel_compilations_are_announced(tmp_path):
 def test_without_a_cache_folder_every_process_announces_compilation(tmp_path):
     script = TOY.replace(
         "from r5dgs_core",
-        "import r5dgs_core.raster.compilation as c\nc._bases = lambda _: iter(())\nfrom r5dgs_core",
+        "import r5dgs_core.raster.kernel_cache as c\nc._bases = lambda _: iter(())\nfrom r5dgs_core",
         1,
     )
     complaints = [run_toy(tmp_path, script).stderr.splitlines() for _ in range(2)]
@@ -174,12 +174,12 @@ def imported_from_the_core(path, tree):
 
 
 def test_kernels_depend_only_on_their_own_file_and_the_shared_sources():
-    shared = set(compilation.shared_sources())
+    shared = set(kernel_cache.shared_sources())
     found = dict(modules_with_kernels())
     assert len(found) > 8 and CORE / "train" / "losses.py" in found
     for path, tree in found.items():
         strange = set(imported_from_the_core(path, tree)) - shared
-        assert not strange, f"{path.name} imports {strange}, which compilation._SHARED lacks"
+        assert not strange, f"{path.name} imports {strange}, which kernel_cache._SHARED lacks"
     # Constants of `scene.spherical_harmonics`.
     assert CORE / "scene" / "spherical_harmonics.py" in shared
 
@@ -194,12 +194,12 @@ def test_a_kernel_is_compiled_again_after_a_change_of_its_file(tmp_path):
 
 def test_a_changed_source_has_another_cache_folder(tmp_path, monkeypatch):
     source = tmp_path / "constants.py"
-    monkeypatch.setattr(compilation, "shared_sources", lambda: [source])
+    monkeypatch.setattr(kernel_cache, "shared_sources", lambda: [source])
     folders = []
     for text in ("C0 = 1", "C0 = 2", "C0 = 1"):
         source.write_text(text)
-        compilation._cache_folder.cache_clear()
-        folders.append(compilation._cache_folder(str(tmp_path)))
+        kernel_cache.folder_of.cache_clear()
+        folders.append(kernel_cache.folder_of(str(tmp_path)))
     assert folders[0] == folders[2] != folders[1]
 
 
@@ -218,26 +218,26 @@ def test_a_new_cache_folder_replaces_old_unused_ones(tmp_path):
         os.utime(tmp_path / name, 2 * (time.time() - weeks * week,))
     used = tmp_path / "r5dgs-bbbbbbbbbbbb"
     os.utime(used)
-    folder = Path(compilation._cache_folder(str(tmp_path)))
+    folder = Path(kernel_cache.folder_of(str(tmp_path)))
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {*ages, folder.name} - {"r5dgs-0123456789ab"}
 
 
 def test_using_a_cache_folder_renews_it_and_removes_nothing(tmp_path):
-    folder = Path(compilation._cache_folder(str(tmp_path)))
+    folder = Path(kernel_cache.folder_of(str(tmp_path)))
     old = tmp_path / "r5dgs-0123456789ab"
     old.mkdir()
     for path in (old, folder):
         os.utime(path, (0, 0))
-    compilation._cache_folder.cache_clear()
-    assert compilation._cache_folder(str(tmp_path)) == str(folder)
+    kernel_cache.folder_of.cache_clear()
+    assert kernel_cache.folder_of(str(tmp_path)) == str(folder)
     assert old.exists() and time.time() - folder.stat().st_mtime < 3600
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners of files are a POSIX matter")
 @pytest.mark.parametrize("kind", ["writable by others", "a link", "a file"])
 def test_a_temporary_folder_that_others_could_fill_is_not_used(tmp_path, monkeypatch, kind):
-    monkeypatch.setattr(compilation.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(kernel_cache.tempfile, "gettempdir", lambda: str(tmp_path))
     folder = tmp_path / f"r5dgs-{os.getuid()}"
     if kind == "a link":
         (tmp_path / "elsewhere").mkdir()
@@ -247,14 +247,14 @@ def test_a_temporary_folder_that_others_could_fill_is_not_used(tmp_path, monkeyp
     else:
         folder.mkdir()
         folder.chmod(0o777)
-    assert compilation._own_temporary() is None
+    assert kernel_cache._own_temporary() is None
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners of files are a POSIX matter")
 @pytest.mark.parametrize("kind", ["of another user", "writable by others", "a link", "below a folder of another user"])
 def test_compiled_code_that_others_can_replace_is_not_used(tmp_path, monkeypatch, caplog, kind):
     chosen, own = tmp_path / "chosen", tmp_path / "own"
-    folder = Path(compilation._cache_folder(str(chosen)))
+    folder = Path(kernel_cache.folder_of(str(chosen)))
     assert folder.parent == chosen and folder.stat().st_mode & 0o077 == 0
     stranger = folder if kind == "of another user" else chosen if kind.startswith("below") else None
     if kind == "writable by others":
@@ -268,9 +268,9 @@ def test_compiled_code_that_others_can_replace_is_not_used(tmp_path, monkeypatch
 
     monkeypatch.setattr(Path, "lstat", lambda path: owned(os.lstat(path), path))
     monkeypatch.setattr(Path, "stat", lambda path, **_: owned(os.stat(path), path))
-    monkeypatch.setattr(compilation, "_user_cache", lambda: own)
-    compilation._cache_folder.cache_clear()
-    assert Path(compilation._cache_folder(str(chosen))).parent == own
+    monkeypatch.setattr(kernel_cache, "_user_cache", lambda: own)
+    kernel_cache.folder_of.cache_clear()
+    assert Path(kernel_cache.folder_of(str(chosen))).parent == own
     (told,) = [record.getMessage() for record in caplog.records]
     assert str(folder) in told and "\n" not in told
 
@@ -285,8 +285,8 @@ def test_an_invalid_number_of_threads_is_an_error_of_one_line(tmp_path, value):
 
 
 def test_without_a_cache_folder_nothing_is_cached_and_one_warning_is_logged(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(compilation, "_user_cache", lambda: blocked(tmp_path))
-    monkeypatch.setattr(compilation, "_own_temporary", lambda: None)
+    monkeypatch.setattr(kernel_cache, "_user_cache", lambda: blocked(tmp_path))
+    monkeypatch.setattr(kernel_cache, "_own_temporary", lambda: None)
     with caplog.at_level("WARNING"):
         kernels = [compilation.kernel(function) for function in (lambda x: 2 * x, lambda x: 3 * x)]
     assert [kernel(21) for kernel in kernels] == [42, 63]
@@ -300,7 +300,7 @@ def test_a_missing_home_folder_is_no_error(tmp_path, monkeypatch):
 
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.delenv("LOCALAPPDATA", raising=False)
-    monkeypatch.setattr(compilation.Path, "home", staticmethod(unknown))
-    monkeypatch.setattr(compilation.tempfile, "gettempdir", lambda: str(tmp_path))
-    assert compilation._user_cache() is None
-    assert Path(compilation._cache_folder("")).is_relative_to(tmp_path)
+    monkeypatch.setattr(kernel_cache.Path, "home", staticmethod(unknown))
+    monkeypatch.setattr(kernel_cache.tempfile, "gettempdir", lambda: str(tmp_path))
+    assert kernel_cache._user_cache() is None
+    assert Path(kernel_cache.folder_of("")).is_relative_to(tmp_path)

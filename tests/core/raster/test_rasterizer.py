@@ -16,10 +16,10 @@ from r5dgs_core.raster import (
     RasterSettings,
     RasterStats,
     backends,
-    compilation,
     rasterize,
     rasterize_splats,
     rasterizer,
+    thread_pool,
 )
 from r5dgs_core.raster.cpu import blend, blend_backward, forward, projection, tiles
 from r5dgs_core.render import warm_up
@@ -195,15 +195,15 @@ def test_gaussians_off_the_frustum_keep_their_gradients():
 
 def test_results_do_not_depend_on_the_number_of_threads():
     scene, view = splats(9000, 3, seed=10, radius_px=3.0), camera(150, 130, 160.0)
-    before, background = compilation.threads(), torch.tensor([0.1, 0.5, 0.9])
+    before, background = thread_pool.threads(), torch.tensor([0.1, 0.5, 0.9])
     try:
         results = []
         for count in (1, 2, 3):
-            compilation.set_threads(count)
+            thread_pool.set_threads(count)
             result, gradients, stats = draw(scene, view, "cpu", background)
             results.append([result.image, result.alpha, result.depth, *gradients.values(), stats.grad_norm])
     finally:
-        compilation.set_threads(before)
+        thread_pool.set_threads(before)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
@@ -216,13 +216,13 @@ def test_rows_are_sorted_by_depth_and_then_by_row_on_any_number_of_threads(seed)
     radii = random.integers(0, 2, 30_000).astype(np.float32)
     expected = np.argsort(depths, kind="stable")
     expected = expected[radii[expected] > 0]
-    before = compilation.threads()
+    before = thread_pool.threads()
     try:
         for count in (1, 2, 3):
-            compilation.set_threads(count)
+            thread_pool.set_threads(count)
             np.testing.assert_array_equal(tiles.sort_by_depth(depths, radii), expected)
     finally:
-        compilation.set_threads(before)
+        thread_pool.set_threads(before)
 
 
 def test_two_python_threads_can_draw_at_once():
@@ -254,8 +254,8 @@ def test_every_kernel_is_compiled_once_for_all_inputs():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forking is a POSIX matter")
 def test_a_forked_child_draws_too():
     scene, view = [t.float() for t in splats(9000, 3, seed=10, radius_px=3.0)], camera(150, 130, 160.0)
-    before = compilation.threads()
-    compilation.set_threads(2)
+    before = thread_pool.threads()
+    thread_pool.set_threads(2)
     try:
         expected = rasterize_splats(*scene, view).image
         context = multiprocessing.get_context("fork")
@@ -266,7 +266,7 @@ def test_a_forked_child_draws_too():
         assert receiver.recv() == expected.numpy().tobytes()
         child.join()
     finally:
-        compilation.set_threads(before)
+        thread_pool.set_threads(before)
 
 
 # Laws of gradients

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.raster import backends, compilation, rasterize, rasterizer, shade
+from r5dgs_core.raster import backends, rasterize, rasterizer, shade, thread_pool
 from r5dgs_core.raster.cpu import forward
 from r5dgs_core.render import posed_scene
 from r5dgs_core.scene import spherical_harmonics
@@ -91,15 +91,15 @@ def test_coefficients_may_be_given_in_two_parts(count):
 
 def test_results_do_not_depend_on_the_number_of_threads():
     tensors, where = draw(9001, 16)
-    before, results = compilation.threads(), []
+    before, results = thread_pool.threads(), []
     try:
         for threads in (1, 2, 3):
-            compilation.set_threads(threads)
+            thread_pool.set_threads(threads)
             value, gradients = differentiate(lambda **t: shade.seen_colors(**t, **where), tensors)
             sky = shade.sky(tensors["sh"][0].numpy(), scenes.orbit_camera(0.3, 90, 300))
             results.append([value, *gradients.values(), torch.from_numpy(sky)])
     finally:
-        compilation.set_threads(before)
+        thread_pool.set_threads(before)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 

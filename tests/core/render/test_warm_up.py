@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.raster import compilation
+from r5dgs_core.raster import compilation, kernel_cache
 from r5dgs_core.render import warm_up
 from r5dgs_core.scene import scene_file
 from r5dgs_core.train import warm_up as train_warm_up
@@ -26,7 +26,7 @@ USE_EVERYTHING = """
 import sys
 from pathlib import Path
 import numpy as np
-from r5dgs_core.raster import compilation
+from r5dgs_core.raster import compilation, kernel_cache
 from r5dgs_core.render import scene_renderer, incremental_renderer
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
@@ -85,7 +85,7 @@ def scene_path(tmp_path_factory):
 def cache(tmp_path_factory):
     """A copy of the kernels of this machine without one that pictures need and one that only training needs."""
     train_warm_up.warm_up(lambda stage: None)
-    source = compilation.cache_folder()
+    source = kernel_cache.cache_folder()
     folder = tmp_path_factory.mktemp("cache")
     shutil.copytree(source, folder / source.name)
     for name in ("tiles.merge_pairs", "losses._moments"):

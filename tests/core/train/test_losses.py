@@ -7,7 +7,7 @@ import torch.nn.functional as F
 
 from r5dgs_core.model.tracks import Tracks
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster import compilation as kernels
+from r5dgs_core.raster import thread_pool
 from r5dgs_core.train import losses
 
 
@@ -127,17 +127,17 @@ def test_the_gradient_scales_with_the_incoming_gradient():
 
 def test_threads_do_not_change_the_loss():
     x, y = pair(37, 29)
-    before = kernels.threads()
+    before = thread_pool.threads()
     results = []
     try:
         for threads in (1, 2, 5):
-            kernels.set_threads(threads)
+            thread_pool.set_threads(threads)
             leaf = x.clone().requires_grad_(True)
             loss = losses.photometric(leaf, y, 0.2)
             loss.backward()
             results.append((loss.detach(), leaf.grad))
     finally:
-        kernels.set_threads(before)
+        thread_pool.set_threads(before)
     for loss, gradient in results[1:]:
         assert torch.equal(loss, results[0][0]) and torch.equal(gradient, results[0][1])
 

@@ -5,7 +5,7 @@ import torch
 
 from r5dgs_core.model.tracks import GroupPoses
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster import compilation as kernels
+from r5dgs_core.raster import thread_pool
 from r5dgs_core.train.representations import fused_posing
 
 NAMES = ("means", "quats", "log_scales", "logits", "colors", "shading", "light", "group_quats", "rotmats", "shifts")
@@ -71,17 +71,17 @@ def test_values_and_every_gradient_are_those_of_plain_autograd(n):
 
 def test_results_do_not_depend_on_the_number_of_threads():
     values, ids, centers = inputs(1000)
-    before = kernels.threads()
+    before = thread_pool.threads()
     results = []
     try:
         for threads in (1, 2, 3, 8):
-            kernels.set_threads(threads)
+            thread_pool.set_threads(threads)
             leaves = {k: v.clone().requires_grad_(True) for k, v in values.items()}
             splats = fused(leaves, ids, centers)
             weighted_sum(splats).backward()
             results.append([getattr(splats, n).detach() for n in OUTPUTS] + [leaves[n].grad for n in NAMES])
     finally:
-        kernels.set_threads(before)
+        thread_pool.set_threads(before)
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):
             assert torch.equal(a, b)
