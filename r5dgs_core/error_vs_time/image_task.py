@@ -16,6 +16,7 @@ from ..playback import scene_player
 from ..render import scene_renderer
 from ..scene.scene import Scene
 from .report_rows import Row
+from .task import Goal, Measured, Panel, Request, Task, decibels
 
 KINDS = ("psnr", "psnr_objects", "ssim", "flip", "lpips", "miou")
 FRAMES = 6  # timed views
@@ -170,3 +171,36 @@ def _times(
         split = {"ms_motion": motion.ms(clock), "ms_raster": raster.ms(clock)}
         columns[mode] = {**split, **(motion + raster).columns(clock)}
     return columns
+
+
+def _measure(request: Request) -> Measured:
+    options = {"clock": request.clock, "backend": request.backend, "progress": request.count}
+    return measure(request.scene, request.data, request.splits, request.rounds, **options)
+
+
+def _beyond_true_poses(rows: Sequence[Row], pick: Row) -> str:
+    """Return the comparison with true poses, which appearance learned with a wrong track may surpass."""
+    for row in rows:
+        if row.method == ORACLE and row.error_kind == pick.error_kind:
+            side = "above" if pick.error > row.error else "below"
+            return f"; {abs(pick.error - row.error):.2f} dB {side} true poses ({row.error:.2f} dB)"
+    return ""
+
+
+TASK = Task(
+    "images",
+    "Images: pictures of each mode against true images",
+    _measure,
+    Panel(
+        "psnr",
+        "error of pixels, 8-bit levels (rms)",
+        lambda row, scene: f"Modes on {row.count} images of {row.setting}: motion + rasterization",
+        lambda row: row.mode,
+        floor=1e-3,
+        reference=ORACLE,
+        reference_name="with true poses",
+    ),
+    Goal("psnr", 0.3, decibels, lambda row: row.mode, remark=_beyond_true_poses),
+    needs_data=True,
+    counts=True,
+)

@@ -22,6 +22,7 @@ from ..motion import models, point_dynamics, rotations, se3, twist_propagation
 from ..playback import residuals
 from ..scene.scene import MotionGroup, Scene
 from .report_rows import Row, spread
+from .task import Goal, Panel, Task, method_and_setting, percent
 
 STEPS = (1, 2, 4, 8, 16, 32, 64)
 FINE_STEPS = 4096
@@ -254,3 +255,32 @@ def _of_points(scene: Scene, tau: float, rounds: int, clock: str) -> list[Row]:
             Row(error_kind="rotation", **spread(angles), **shared),
         ]
     return rows
+
+
+def _line_name(series: tuple[str, str]) -> str:
+    mode, method = series
+    return f"{method}, fitted model" if mode == "rigid/fitted" else method
+
+
+TASK = Task(
+    "dynamics",
+    "Dynamics: integrators against a fine reference",
+    lambda request: measure(request.scene, request.tau, request.rounds, request.clock),
+    Panel(
+        "position",
+        "position error, % of the object's size",
+        lambda row, scene: (
+            f"Integrating {row.count} groups to {scene['horizon']['tau']:.3g} past t_max: error against a "
+            "fine reference (numbers: steps)"
+        ),
+        lambda row: row.setting.removesuffix(" steps").removesuffix(" step"),
+        floor=1e-13,
+        factor=100.0,
+        series=lambda row: (row.mode, row.method),
+        in_line=lambda row: row.setting.endswith(("step", "steps")),
+        line_name=_line_name,
+        label_size=7,
+    ),
+    Goal("position", 1e-4, percent, method_and_setting),
+    over_objects=True,
+)

@@ -11,20 +11,10 @@ from typing import Any
 import numpy as np
 
 from ..evaluation import label_placement
-from . import family_task, image_task, report_rows, tables
+from . import report_rows, tables, tasks
 from .report_rows import Row
+from .task import Panel, Task
 
-# Per task: plotted kind of error, axis label, and factor on the values.
-_SHOWN = {
-    "dynamics": ("position", "position error, % of the object's size", 100.0),
-    "poses": ("position", "position error, % of the object's size", 100.0),
-    "family": ("position", "position error, % of the object's size", 100.0),
-    "images": ("psnr", "error of pixels, 8-bit levels (rms)", 1.0),
-    "raster": ("difference", "difference to the finest picture, 8-bit levels (rms)", 1.0),
-    "training": ("psnr@val", "error of pixels of held-out views, 8-bit levels (rms)", 1.0),
-}
-# Smaller errors are drawn at the floor.
-_FLOOR = {"dynamics": 1e-13, "poses": 1e-4, "family": 1e-4, "images": 1e-3, "raster": 1e-4, "training": 1e-3}
 # Colors distinguishable with any color vision (Okabe and Ito 2008).
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F7F7F", "#000000")
 _FRONT = "#B00020"
@@ -57,12 +47,8 @@ def png(report: dict[str, Any], name: str) -> bytes:
 
     scene = next(scene for scene in report["scenes"] if scene["name"] == name)
     groups = report_rows.by_task([row for row in report_rows.from_dicts(report["rows"]) if row.scene == name])
-    panels = {task: found for task, rows in groups.items() if (found := _points(task, rows))}
-    oracle = {
-        row.task: _pixel_error(row.error)
-        for row in groups.get("images", [])
-        if row.method == image_task.ORACLE and row.error_kind == "psnr"
-    }
+    panels = {task: found for task, rows in groups.items() if (found := _points(tasks.BY_NAME[task], rows))}
+    references = {name: error for name, rows in groups.items() if (error := _reference(name, rows)) is not None}
     columns = min(2, max(1, len(panels)))
     lines = max(1, math.ceil(len(panels) / 2))
     figure = Figure(figsize=(9.2 * columns, 6.9 * lines), dpi=_DPI, layout="constrained")
@@ -79,34 +65,41 @@ def png(report: dict[str, Any], name: str) -> bytes:
         figure.text(0.5, 0.5, "nothing could be timed", ha="center")
     grid = figure.subplots(lines, columns, squeeze=False).ravel() if panels else []
     drawn = []
-    for axes, (task, points) in zip(grid, panels.items(), strict=False):
-        _draw(axes, task, points, scene)
-        if task in oracle:
-            axes.axhline(oracle[task], color="0.35", linestyle="--", linewidth=1, zorder=0)
-        drawn.append((axes, task, points))
+    for axes, (name, points) in zip(grid, panels.items(), strict=False):
+        _draw(axes, tasks.BY_NAME[name], points, scene)
+        if name in references:
+            axes.axhline(references[name], color="0.35", linestyle="--", linewidth=1, zorder=0)
+        drawn.append((axes, name, points))
     for axes in grid[len(panels) :]:
         axes.set_axis_off()
     canvas.draw()  # computes the layout, so that pixel positions are known
     figure.set_layout_engine("none")
-    for axes, task, points in drawn:
-        _name(axes, canvas.get_renderer(), task, points, oracle.get(task))
+    for axes, name, points in drawn:
+        _name(axes, canvas.get_renderer(), tasks.BY_NAME[name].panel, points, references.get(name))
     buffer = io.BytesIO()
     canvas.print_png(buffer)
     return buffer.getvalue()
 
 
-def _points(task: str, rows: Sequence[Row]) -> list[_Point]:
-    kind, _, factor = _SHOWN[task]
-    shown = [row for row in rows if row.error_kind == kind and math.isfinite(row.ms) and math.isfinite(row.error)]
-    series = list(dict.fromkeys(_series(row) for row in shown))
+def _reference(name: str, rows: Sequence[Row]) -> float | None:
+    """Return the pixel error of the reference method of a task, or None."""
+    panel = tasks.BY_NAME[name].panel
+    found = [row.error for row in rows if row.method == panel.reference and row.error_kind == panel.kind]
+    return _pixel_error(found[-1]) if found else None
+
+
+def _points(task: Task, rows: Sequence[Row]) -> list[_Point]:
+    panel = task.panel
+    shown = [row for row in rows if row.error_kind == panel.kind and math.isfinite(row.ms) and math.isfinite(row.error)]
+    series = list(dict.fromkeys(panel.series(row) for row in shown))
     points = []
     for row in shown:
         values = (row.error, row.error_min, row.error_max)
-        drawn = [_pixel_error(v) if row.kind.more_is_better else factor * v for v in values]
-        y, low, high = (max(v, _FLOOR[task]) if math.isfinite(v) else math.nan for v in drawn)
-        color = _COLORS[series.index(_series(row)) % len(_COLORS)]
-        scale = 1e-3 if task in tables.SECONDS else 1.0
-        points.append(_Point(scale * row.ms, y, min(low, high), max(low, high), row, _name_of(row), color))
+        drawn = [_pixel_error(v) if row.kind.more_is_better else panel.factor * v for v in values]
+        y, low, high = (max(v, panel.floor) if math.isfinite(v) else math.nan for v in drawn)
+        color = _COLORS[series.index(panel.series(row)) % len(_COLORS)]
+        scale = 1e-3 if task.in_seconds else 1.0
+        points.append(_Point(scale * row.ms, y, min(low, high), max(low, high), row, panel.name(row), color))
     return points
 
 
@@ -115,40 +108,14 @@ def _pixel_error(psnr: float) -> float:
     return 255 * 10 ** (-psnr / 20)
 
 
-def _series(row: Row) -> tuple[str, str]:
-    """Return the key of rows with the same color: mode and method in "dynamics", else the base of the mode."""
-    if row.task == "dynamics":
-        return row.mode, row.method
-    if row.task == "raster":
-        return row.mode, row.setting.split()[0]
-    if row.task in ("training", "family"):
-        return row.mode, row.method if row.task == "training" else ""
-    base = row.mode.split("/")[0]
-    return base, "models" if row.mode == "rigid/fitted" else ""
-
-
-def _name_of(row: Row) -> str:
-    if row.task == "raster":
-        return row.setting
-    if row.task == "images":
-        return row.mode
-    if row.task == "training":
-        return row.setting.removeprefix("step ")
-    if row.task == "family":
-        return row.setting if row.setting == family_task.WHOLE else row.method.split()[0]
-    if row.task == "poses":
-        return row.method if row.mode == "rigid/fitted" else f"mode {row.mode}"
-    return row.setting.removesuffix(" steps").removesuffix(" step")
-
-
-def _draw(axes: Any, task: str, points: Sequence[_Point], scene: dict[str, Any]) -> None:
-    _, label, _ = _SHOWN[task]
-    first = points[0].row
-    axes.set(xscale="log", yscale="log", xlabel=_time_label(task, first.clock), ylabel=label)
-    axes.set_title(_title(task, first, scene), fontsize=11, loc="left")
-    if task in ("dynamics", "training", "family"):
-        for series in dict.fromkeys(_series(p.row) for p in points):
-            some = [p for p in points if _series(p.row) == series and _in_line(p.row)]
+def _draw(axes: Any, task: Task, points: Sequence[_Point], scene: dict[str, Any]) -> None:
+    panel, first = task.panel, points[0].row
+    time_label = f"{tables.CLOCKS[first.clock]} of {panel.subject}"
+    axes.set(xscale="log", yscale="log", xlabel=time_label, ylabel=panel.label)
+    axes.set_title(panel.title(first, scene), fontsize=11, loc="left")
+    if panel.in_line is not None:
+        for series in dict.fromkeys(panel.series(p.row) for p in points):
+            some = [p for p in points if panel.series(p.row) == series and panel.in_line(p.row)]
             color = next(iter(some), points[0]).color
             axes.plot([p.x for p in some], [p.y for p in some], "-", color=color, alpha=0.5, linewidth=1)
     for p in points:
@@ -172,32 +139,8 @@ def _draw(axes: Any, task: str, points: Sequence[_Point], scene: dict[str, Any])
     _ticks(axes)
     if first.kind.more_is_better:
         _decibel_axis(axes)
-    if any(p.y == _FLOOR[task] for p in points):
-        axes.text(
-            0.99, 0.01, f"lowest line: {_FLOOR[task]:g} or less", transform=axes.transAxes, ha="right", fontsize=8
-        )
-
-
-def _time_label(task: str, clock: str) -> str:
-    subject = {"training": "training, s", "family": "the fits of all objects, ms"}.get(task, "a frame, ms")
-    return f"{tables.CLOCKS[clock]} of {subject}"
-
-
-def _title(task: str, first: Row, scene: dict[str, Any]) -> str:
-    return {
-        "dynamics": f"Integrating {first.count} groups to {scene['horizon']['tau']:.3g} past t_max: error against a "
-        "fine reference (numbers: steps)",
-        "poses": f"Predicted poses of {first.count} objects at the last time: median error against the truth",
-        "family": f"Choosing the motion model of {first.count} objects (numbers: candidates): median error at the end",
-        "images": f"Modes on {first.count} images of {first.setting}: motion + rasterization",
-        "raster": f"Thresholds of the rasterizer ({first.count} pictures)",
-        "training": f"Training ({first.method}; numbers: steps)",
-    }[task]
-
-
-def _in_line(row: Row) -> bool:
-    """Return True if a row is a point of its series' line."""
-    return row.task != "dynamics" or row.setting.endswith(("step", "steps"))
+    if any(p.y == panel.floor for p in points):
+        axes.text(0.99, 0.01, f"lowest line: {panel.floor:g} or less", transform=axes.transAxes, ha="right", fontsize=8)
 
 
 def _decibel_axis(axes: Any) -> None:
@@ -225,26 +168,22 @@ def _ticks(axes: Any) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def _name(axes: Any, renderer: Any, task: str, points: Sequence[_Point], oracle: float | None) -> None:
+def _name(axes: Any, renderer: Any, panel: Panel, points: Sequence[_Point], reference: float | None) -> None:
     """Label the lines first, then points on the front, then other points while there is room."""
     frame = axes.get_window_extent(renderer)
     places = axes.transData.transform([(p.x, p.y) for p in points])
     markers = np.concatenate([places - 4, places + 4], axis=1)
     texts: list[tuple[np.ndarray, str, str, bool, float]] = []  # position, text, color, on the front, size
-    if oracle is not None:
-        height = axes.transData.transform((points[0].x, oracle))[1]
-        texts.append((np.array([frame.x1 - 60, height]), "with true poses", "0.35", False, 8.5))
-    if task == "dynamics":
-        for series in dict.fromkeys(_series(p.row) for p in points):
-            last = max(i for i, p in enumerate(points) if _series(p.row) == series)
-            mode, method = series
-            name = f"{method}, fitted model" if mode == "rigid/fitted" else method
-            texts.append((places[last], name, points[last].color, False, 9.5))
+    if reference is not None:
+        height = axes.transData.transform((points[0].x, reference))[1]
+        texts.append((np.array([frame.x1 - 60, height]), panel.reference_name, "0.35", False, 8.5))
+    if panel.line_name is not None:
+        for series in dict.fromkeys(panel.series(p.row) for p in points):
+            last = max(i for i, p in enumerate(points) if panel.series(p.row) == series)
+            texts.append((places[last], panel.line_name(series), points[last].color, False, 9.5))
     for i in sorted(range(len(points)), key=lambda i: not points[i].row.pareto):
         p = points[i]
-        texts.append(
-            (places[i], p.name, _FRONT if p.row.pareto else p.color, p.row.pareto, 7 if task == "dynamics" else 8.5)
-        )
+        texts.append((places[i], p.name, _FRONT if p.row.pareto else p.color, p.row.pareto, panel.label_size))
     sizes = []
     for _, text, _, bold, size in texts:
         probe = axes.text(0, 0, text, fontsize=size, fontweight="bold" if bold else "normal")

@@ -17,6 +17,7 @@ from ..motion_fit import candidates, model_selection, noise
 from ..playback import group_dynamics, modes, scene_player
 from ..scene.scene import MotionGroup, Scene
 from .report_rows import Row, spread
+from .task import Goal, Panel, Task, percent
 
 MODELS = tuple(candidates.BY_NAME)  # fitted one at a time
 ALONE = "for all objects"  # setting of a row of one model; the best of them is known only afterwards
@@ -273,3 +274,29 @@ def _band(
         note=f"{inside} of {count} errors inside (bodies x times){width}",
     )
     return [row], []
+
+
+TASK = Task(
+    "poses",
+    "Poses: predicted object poses at the last time against the truth",
+    lambda request: measure(request.scene, request.data.ground_truth, request.rounds, request.clock),
+    Panel(
+        "position",
+        "position error, % of the object's size",
+        lambda row, scene: f"Predicted poses of {row.count} objects at the last time: median error against the truth",
+        lambda row: row.method if row.mode == "rigid/fitted" else f"mode {row.mode}",
+        floor=1e-4,
+        factor=100.0,
+    ),
+    Goal(
+        "position",
+        1e-3,
+        percent,
+        lambda row: f"{row.mode}, {row.method}",
+        worst_object=True,
+        selectable=lambda row: row.setting != ALONE,
+    ),
+    needs_data=True,
+    over_objects=True,
+    names_worst=True,
+)

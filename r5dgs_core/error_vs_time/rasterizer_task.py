@@ -16,6 +16,7 @@ from ..render import scene_renderer
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from .report_rows import Row, spread
+from .task import Goal, Measured, Panel, Request, Task, levels
 
 FINEST = {"alpha_min": 1e-4, "transmittance_min": 1e-30}
 SETTINGS: tuple[dict[str, float], ...] = (
@@ -104,3 +105,24 @@ def _name(changes: dict[str, float]) -> str:
         for key, value in changes.items()
     ]
     return ", ".join(parts) or "3DGS (alpha 1/255, stop 0.0001)"
+
+
+def _measure(request: Request) -> Measured:
+    views = () if request.dataset is None else request.dataset.views(request.splits[0])
+    return measure(request.scene, views, request.rounds, clock=request.clock, backend=request.backend)
+
+
+TASK = Task(
+    "raster",
+    "Rasterizer: thresholds against the finest picture",
+    _measure,
+    Panel(
+        "difference",
+        "difference to the finest picture, 8-bit levels (rms)",
+        lambda row, scene: f"Thresholds of the rasterizer ({row.count} pictures)",
+        lambda row: row.setting,
+        floor=1e-4,
+        series=lambda row: (row.mode, row.setting.split()[0]),
+    ),
+    Goal("difference", 0.5, levels, lambda row: row.setting),
+)

@@ -6,6 +6,7 @@ a scene are combined into medians with their spread.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -20,21 +21,9 @@ from ..data.dataset import Dataset
 from ..errors import ConfigError
 from ..render import machine
 from ..scene.scene import Scene
-from . import (
-    family_task,
-    image_task,
-    integrator_task,
-    pareto_plot,
-    pose_task,
-    rasterizer_task,
-    recommendation,
-    report_rows,
-    run_spread,
-    scene_groups,
-    tables,
-    training_task,
-)
+from . import pareto_plot, recommendation, report_rows, run_spread, scene_groups, tables, task_names, tasks
 from .report_rows import Row
+from .task import Measured, Request, Task
 
 JSON_FILE, CSV_FILE, MARKDOWN_FILE, PLOT_FILE = "report.json", "report.csv", "report.md", "report.png"
 ROUNDS = 7
@@ -46,14 +35,14 @@ class Options:
     """Scope and settings of a measurement.
 
     Attributes:
-        tasks: Tasks from `report_rows.TASKS`.
+        tasks: Tasks from `task_names.TASKS`.
         splits: Splits whose images are compared; the first one determines the Pareto front.
         rounds: Timing rounds, over which medians and quartiles are taken.
         clock: "wall", or "cpu" for processor time, which is less sensitive to other load.
         backend: Rasterizer.
     """
 
-    tasks: Sequence[str] = report_rows.TASKS
+    tasks: Sequence[str] = task_names.TASKS
     splits: Sequence[str] = ("test",)
     rounds: int = ROUNDS
     clock: str = "wall"
@@ -100,14 +89,17 @@ def measure(
     options = options or Options()
     tau, why = horizon(scene, dataset)
     rows: list[Row] = []
-    absent = [f"{task}: not requested" for task in report_rows.TASKS if task not in options.tasks]
-    for task in (task for task in report_rows.TASKS if task in options.tasks):
-        if task != "images":
-            progress({"event": "report", "text": task})
-        if task == "training":
-            measured, missing = training_task.measure(place if place and place.is_dir() else None, _final(rows))
-        else:
-            measured, missing = _measure_task(task, scene, dataset, tau, options, progress)
+
+    def count(done: int, total: int) -> None:
+        progress({"event": "images", "done": done, "total": total})
+
+    scope = (tuple(options.splits), options.rounds, options.clock, options.backend)
+    request = Request(scene, dataset, place, tau, *scope, count)
+    absent = [f"{task}: not requested" for task in task_names.TASKS if task not in options.tasks]
+    for task in (task for name, task in tasks.BY_NAME.items() if name in options.tasks):
+        if not task.counts:
+            progress({"event": "report", "text": task.name})
+        measured, missing = _measure_task(task, dataclasses.replace(request, rows=tuple(rows)))
         rows += measured
         absent += missing
     busy = _busy(rows)
@@ -129,9 +121,10 @@ def measure(
     return RunMeasurement(name, scene_groups.identity(scene.name, scene.provenance), facts, absent, rows)
 
 
-def _final(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of the images of the trained scene as it is played by default."""
-    return [row for row in rows if row.task == "images" and row.mode == "rigid" and row.method != image_task.ORACLE]
+def _measure_task(task: Task, request: Request) -> Measured:
+    if task.needs_data and request.dataset is None:
+        return [], [f"{task.name}: no data set was given, so there is nothing to compare with"]
+    return task.measure(request)
 
 
 def collect(measured: Sequence[RunMeasurement], options: Options) -> dict[str, Any]:
@@ -164,34 +157,6 @@ def collect(measured: Sequence[RunMeasurement], options: Options) -> dict[str, A
         "rows": [row.to_dict() for row in rows],
         "recommendations": recommendations,
     }
-
-
-def _measure_task(
-    task: str,
-    scene: Scene,
-    dataset: Dataset | None,
-    tau: float,
-    options: Options,
-    progress: Callable[[dict[str, Any]], None],
-) -> tuple[list[Row], list[str]]:
-    """Return the rows of a task and the reasons for missing ones; ``tau`` is the horizon, other arguments `measure`."""
-
-    def count(done: int, total: int) -> None:
-        progress({"event": "images", "done": done, "total": total})
-
-    splits, rounds, clock, backend = options.splits, options.rounds, options.clock, options.backend
-    if task == "dynamics":
-        return integrator_task.measure(scene, tau, rounds, clock)
-    if task == "raster":
-        views = () if dataset is None else dataset.views(splits[0])
-        return rasterizer_task.measure(scene, views, rounds, clock=clock, backend=backend)
-    if dataset is None:
-        return [], [f"{task}: no data set was given, so there is nothing to compare with"]
-    if task == "poses":
-        return pose_task.measure(scene, dataset.ground_truth, rounds, clock)
-    if task == "family":
-        return family_task.measure(scene, dataset.ground_truth)
-    return image_task.measure(scene, dataset, splits, rounds, clock=clock, backend=backend, progress=count)
 
 
 def _busy(rows: Sequence[Row]) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-TASKS = ("dynamics", "poses", "family", "images", "raster", "training")
+from . import task_names
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Row:
     """One error of one method, and its time: of one run, or the median of several runs of a scene.
 
     Attributes:
-        task: Task, from `TASKS`.
+        task: Task, from `task_names.TASKS`.
         mode: Playback mode ("rigid/fitted"), or the kind of motion that is integrated.
         method: Integrator, motion model or rasterizer.
         setting: Settings of the method, such as steps or thresholds.
@@ -158,8 +158,8 @@ def to_csv(rows: Sequence[Row]) -> str:
 
 
 def by_task(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Return the non-empty lists of rows by task, in the order of `TASKS`."""
-    found = {task: [row for row in rows if row.task == task] for task in TASKS}
+    """Return the non-empty lists of rows by task, in the order of `task_names.TASKS`."""
+    found = {task: [row for row in rows if row.task == task] for task in task_names.TASKS}
     return {task: some for task, some in found.items() if some}
 
 

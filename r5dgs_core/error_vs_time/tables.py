@@ -9,24 +9,14 @@ from typing import Any
 
 from .. import terminal
 from ..bench.tables import Sheet, to_rich
-from . import report_rows
+from . import report_rows, tasks
 from .report_rows import Row
+from .task import Task
 
 ABSENT = "-"
 FRONT = "*"
 CLOCKS = {"wall": "wall time", "cpu": "processor time over all threads"}
 SHORT_CLOCKS = {"wall": "wall", "cpu": "processor"}
-SECONDS = ("training",)  # tasks whose times are shown in seconds
-NAMED = ("poses", "family")  # tasks whose worst object is shown by name
-_MEASURED = {"dynamics", *NAMED}  # tasks whose errors are medians over objects
-_TITLES = {
-    "dynamics": "Dynamics: integrators against a fine reference",
-    "poses": "Poses: predicted object poses at the last time against the truth",
-    "family": "Family: poses at the last time against the number of candidates and the time of the fits",
-    "images": "Images: pictures of each mode against true images",
-    "raster": "Rasterizer: thresholds against the finest picture",
-    "training": "Training: held-out views against the time of training",
-}
 _HEADS = {
     "position": "position, % of size",
     "rotation": "rotation, deg",
@@ -64,9 +54,9 @@ def sheets(report: dict[str, Any]) -> list[Sheet]:
     for scene in report["scenes"]:
         own = [row for row in every if row.scene == scene["name"]]
         suffix = f" ({scene['name']}{_runs(scene)})"
-        for task, rows in report_rows.by_task(own).items():
+        for name, rows in report_rows.by_task(own).items():
             now = [row for row in rows if not row.error_kind.partition("@")[2].startswith("t=")]
-            found.append(_sheet(task, now, suffix))
+            found.append(_sheet(tasks.BY_NAME[name], now, suffix))
             if len(now) < len(rows):
                 found.append(_horizon(rows, suffix))
     return found
@@ -118,7 +108,7 @@ def _recommendations(report: dict[str, Any]) -> list[str]:
     return [f"{r['scene']}: {r['text']}" if several else r["text"] for r in report["recommendations"]]
 
 
-def _sheet(task: str, rows: Sequence[Row], suffix: str) -> Sheet:
+def _sheet(task: Task, rows: Sequence[Row], suffix: str) -> Sheet:
     kinds = report_rows.kinds_of(rows)
     lines: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
@@ -137,12 +127,12 @@ def _sheet(task: str, rows: Sequence[Row], suffix: str) -> Sheet:
     caption = f"{FRONT} on the Pareto front: no method that is better beyond the noise is as fast; lower is better"
     better = [_head(kind) for kind in kinds if report_rows.KINDS[kind.partition("@")[0]].more_is_better]
     caption += f", except for {', '.join(better)}" if better else ""
-    caption += "; medians over objects, worst in brackets" if task in _MEASURED else ""
+    caption += "; medians over objects, worst in brackets" if task.over_objects else ""
     caption += "; medians over runs, range in square brackets" if any(row.runs > 1 for row in rows) else ""
     if notes:
         caption += ". " + ". ".join(notes)
     head = ("mode", "method", "setting", *(_head(kind) for kind in kinds), *(column.label for column in columns))
-    return Sheet(_TITLES[task] + suffix, head, (tuple(cells),), caption, words=3)
+    return Sheet(task.title + suffix, head, (tuple(cells),), caption, words=3)
 
 
 @dataclass(frozen=True)
@@ -154,9 +144,9 @@ class _Column:
     text: Callable[[Row], str]
 
 
-def _columns(task: str, rows: Sequence[Row]) -> list[_Column]:
+def _columns(task: Task, rows: Sequence[Row]) -> list[_Column]:
     """Return the columns of times, labelled with their clock and unit."""
-    unit, factor = ("s", 1e-3) if task in SECONDS else ("ms", 1.0)
+    unit, factor = ("s", 1e-3) if task.in_seconds else ("ms", 1.0)
     clock = SHORT_CLOCKS[rows[0].clock]
 
     def column(label: str, name: str) -> _Column:
@@ -172,7 +162,7 @@ def _columns(task: str, rows: Sequence[Row]) -> list[_Column]:
 
         return _Column(label, lambda row: getattr(row, high), text)
 
-    quartiles = [] if task in (*SECONDS, "family") else [span(f"{clock} quartiles", "ms_low", "ms_high")]
+    quartiles = [span(f"{clock} quartiles", "ms_low", "ms_high")] if task.has_quartiles else []
     return [
         column(f"wall {unit}", "ms_wall"),
         column(f"processor {unit}", "ms_cpu"),
@@ -222,8 +212,9 @@ def _error(row: Row | None) -> str:
     text = form(row.error)
     if math.isfinite(row.error_min):
         text += f" [{form(row.error_min)}..{form(row.error_max)}]"
-    if row.task in _MEASURED and math.isfinite(row.error_worst):
-        name = f" {row.worst_name}" if row.task in NAMED and row.worst_name else ""
+    task = tasks.BY_NAME[row.task]
+    if task.over_objects and math.isfinite(row.error_worst):
+        name = f" {row.worst_name}" if task.names_worst and row.worst_name else ""
         text += f" ({form(row.error_worst)}{name})"
     return text + (f" {FRONT}" if row.pareto else "")
 

@@ -9,7 +9,9 @@ from typing import Any
 
 from ..train import step_log
 from ..train.checkpoint import LOG_FILE, RUN_FILE
+from . import image_task
 from .report_rows import Row
+from .task import Goal, Measured, Panel, Request, Task, decibels, method_and_setting
 
 
 def measure(folder: Path | None, test: Sequence[Row] = ()) -> tuple[list[Row], list[str]]:
@@ -72,3 +74,29 @@ def _row(event: dict[str, Any], label: str, clock: str, kind: str, psnr: float, 
         clock=clock,
         note=note,
     )
+
+
+def _measure(request: Request) -> Measured:
+    played = [row for row in request.rows if row.task == image_task.TASK.name and row.mode == "rigid"]
+    folder = request.place if request.place and request.place.is_dir() else None
+    return measure(folder, [row for row in played if row.method != image_task.ORACLE])
+
+
+TASK = Task(
+    "training",
+    "Training: held-out views against the time of training",
+    _measure,
+    Panel(
+        "psnr@val",
+        "error of pixels of held-out views, 8-bit levels (rms)",
+        lambda row, scene: f"Training ({row.method}; numbers: steps)",
+        lambda row: row.setting.removeprefix("step "),
+        floor=1e-3,
+        subject="training, s",
+        series=lambda row: (row.mode, row.method),
+        in_line=lambda row: True,
+    ),
+    Goal("psnr@val", 0.3, decibels, method_and_setting),
+    in_seconds=True,
+    has_quartiles=False,
+)

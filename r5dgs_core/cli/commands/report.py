@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ... import errors, input_paths, terminal
+from ...error_vs_time import task_names
 from .. import inputs, options
 from ..exit_status import ExitStatus
 
@@ -21,7 +22,6 @@ LONG = (
 EXAMPLE = "RUN [RUN ...] --out report"
 PAGE = "user/report.md"
 
-TASKS = ("dynamics", "poses", "family", "images", "raster", "training")  # of `error_vs_time.report_rows`
 SPLITS = ("train", "val", "test")  # of `data.dataset`
 
 
@@ -30,8 +30,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     paths = "run folders or .r5dgs files; a data set applies to those before it (default: the run's own)"
     p.add_argument("paths", type=Path, nargs="*", metavar="RUN|SCENE|DATA", help=paths)
     p.add_argument("--out", type=Path, metavar="DIR", help="output folder for report.json, .csv, .md and .png")
-    tasks = f"tasks to measure, of {', '.join(TASKS)} (default: all)"
-    p.add_argument("--tasks", nargs="+", choices=TASKS, metavar="TASK", help=tasks)
+    tasks = f"tasks to measure, of {', '.join(task_names.TASKS)} (default: all)"
+    p.add_argument("--tasks", nargs="+", choices=task_names.TASKS, metavar="TASK", help=tasks)
     splits = "splits whose images are compared, of val, test (default: test)"
     p.add_argument("--splits", nargs="+", choices=SPLITS, metavar="SPLIT", help=splits)
     p.add_argument("--repeats", type=options.at_least(1), metavar="N", help="timing rounds (default: 7)")
@@ -106,19 +106,20 @@ def run_report(
     """
     _check_targets(targets)
     input_paths.check_output_folder("--out", out)
-    from ...error_vs_time import report, report_rows, tables
+    from ...error_vs_time import report, tables
+    from ...error_vs_time.tasks import BY_NAME
     from ...progress import make
 
     options.use_threads(threads)
     settings = report.Options(
-        tuple(tasks or report_rows.TASKS), tuple(splits or ("test",)), rounds or report.ROUNDS, clock
+        tuple(tasks or task_names.TASKS), tuple(splits or ("test",)), rounds or report.ROUNDS, clock
     )
     measured = []
     with make(progress_kind) as progress:
         for target, data in targets:
             progress({"event": "prepare", "text": str(target)})
             scene, dataset = inputs.open_target(target, data)
-            if dataset is None and tasks and set(tasks) <= {"images", "poses", "family"}:
+            if dataset is None and tasks and all(BY_NAME[name].needs_data for name in tasks):
                 given = " ".join(tasks)
                 remedy = f"r5dgs report {target} DATA --out {out}"
                 raise errors.ConfigError(f"--tasks {given}: require the data set: {remedy}")

@@ -14,13 +14,15 @@ from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images
 from r5dgs_core.error_vs_time import (
-    family_task,
+    candidate_count_task,
     image_task,
     integrator_task,
     pose_task,
     rasterizer_task,
     report_rows,
     tables,
+    task_names,
+    tasks,
 )
 from r5dgs_core.error_vs_time import report as error_vs_time_report
 from r5dgs_core.evaluation import ground_truth_poses
@@ -223,9 +225,9 @@ def test_poses_and_matrices_are_inverse():
 
 
 def test_a_larger_family_takes_longer_and_the_worst_object_is_named(scene, data):
-    rows, _ = family_task.measure(scene, data.ground_truth)
+    rows, _ = candidate_count_task.measure(scene, data.ground_truth)
     found = pick(rows, error_kind="position")
-    assert [row.setting for row in found][-1] == family_task.WHOLE and found[0].method == "1 candidate"
+    assert [row.setting for row in found][-1] == candidate_count_task.WHOLE and found[0].method == "1 candidate"
     names = {o.name for o in scene.objects}
     assert all(row.worst_name in names and row.clock == "cpu" and row.ms > 0 for row in found)
     assert found[-1].error_worst < found[0].error_worst  # a body at rest is no candidate for the others
@@ -289,7 +291,7 @@ def test_the_report_is_written_for_programs_and_people(report, field, tmp_path):
     by_name = {path.name: path for path in paths}
     assert json.loads(by_name["report.json"].read_text()) == report
     table = list(csv.DictReader(by_name["report.csv"].open()))
-    assert len(table) == len(report["rows"]) and {row["task"] for row in table} == {*report_rows.TASKS} - {"training"}
+    assert len(table) == len(report["rows"]) and {row["task"] for row in table} == {*task_names.TASKS} - {"training"}
     text = by_name["report.md"].read_text()
     for word in (
         "Magnus-4",
@@ -310,6 +312,10 @@ def test_every_mode_is_shown_past_t_max_and_one_before(report, field):
     assert {row.mode for row in pick(rows, method="playback", error_kind="psnr")} == set(scene_player.modes(field))
     assert {row.mode for row in pick(rows, error_kind="psnr@val")} == {"rigid"}
     assert any("all modes are the same up to t_max" in text for text in report["scenes"][0]["absent"])
+
+
+def test_the_tasks_have_the_names_and_the_order_of_the_command_line():
+    assert tuple(tasks.BY_NAME) == task_names.TASKS
 
 
 def test_every_task_has_a_front(report):

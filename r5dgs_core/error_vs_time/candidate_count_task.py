@@ -10,6 +10,7 @@ from ..motion_fit import candidates
 from ..scene.scene import Scene
 from . import pose_task
 from .report_rows import Row
+from .task import Goal, Panel, Task, method_and_setting, percent
 
 SIZES = (1, 2, 4, 8, 12, 16)  # smaller families, before the whole one
 WHOLE = "whole family and breaks"
@@ -61,3 +62,28 @@ def measure(scene: Scene, ground_truth: GroundTruth | None) -> tuple[list[Row], 
 
 def _label(size: int) -> str:
     return f"{size} candidate{'s' * (size > 1)}"
+
+
+TASK = Task(
+    "family",
+    "Family: poses at the last time against the number of candidates and the time of the fits",
+    lambda request: measure(request.scene, request.data.ground_truth),
+    Panel(
+        "position",
+        "position error, % of the object's size",
+        lambda row, scene: (
+            f"Choosing the motion model of {row.count} objects (numbers: candidates): median error at the end"
+        ),
+        lambda row: row.setting if row.setting == WHOLE else row.method.split()[0],
+        floor=1e-4,
+        factor=100.0,
+        subject="the fits of all objects, ms",
+        series=lambda row: (row.mode, ""),
+        in_line=lambda row: True,
+    ),
+    Goal("position", 1e-3, percent, method_and_setting, worst_object=True),
+    needs_data=True,
+    over_objects=True,
+    names_worst=True,
+    has_quartiles=False,
+)

@@ -1,0 +1,5 @@
+"""Names of the tasks of the report, in its order. Only needs the standard library, for the command line."""
+
+from __future__ import annotations
+
+TASKS = ("dynamics", "poses", "family", "images", "raster", "training")
