@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-CLOCKS = ("wall", "cpu")
+CLOCKS = {"wall": "wall time", "cpu": "processor time over all threads"}
+SHORT_CLOCKS = {"wall": "wall", "cpu": "processor"}
 SAMPLE_MS = 4.0  # minimum duration of a turn, milliseconds; shorter calls are repeated
 MOST_CALLS = 1000  # maximum calls per turn
 PATIENCE_MS = 30_000.0  # time of a contender's turns after which it takes at most `ENOUGH`

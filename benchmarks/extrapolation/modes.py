@@ -58,7 +58,7 @@ def measure(folder: Path, split: str) -> dict[str, Any]:
         print(f"{folder}: no oracle: {why}")
     else:
         ways[ORACLE] = oracle
-    found = {name: evaluate.measure(scene, views, move) for name, move in ways.items()}
+    found = {name: evaluate.measure_views(scene, views, move) for name, move in ways.items()}
     return {
         "run": folder.name,
         "scene": scene.name,

@@ -78,7 +78,7 @@ def scene_row(scene: Scene, dataset: Dataset) -> dict[str, float]:
     oracle, why = image_task.true_move(scene, dataset, [view.t for view in dataset.test])
     assert oracle is not None, why
     plan = {"val": (dataset.val, play), "test": (dataset.test, play), "oracle": (dataset.test, oracle)}
-    return {name: float(evaluate.measure(scene, views, move)["psnr"]) for name, (views, move) in plan.items()}
+    return {name: float(evaluate.measure_views(scene, views, move)["psnr"]) for name, (views, move) in plan.items()}
 
 
 def measure(data: Path, settings: config.Config) -> dict[str, Any]:

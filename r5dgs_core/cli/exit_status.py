@@ -18,7 +18,7 @@ class ExitStatus(enum.IntEnum):
     INTERRUPTED = 130  # stopped by Ctrl-C or SIGTERM
 
 
-def of(error: BaseException) -> ExitStatus:
+def status_of(error: BaseException) -> ExitStatus:
     """Return the exit status for an exception."""
     if isinstance(error, errors.Interrupted | KeyboardInterrupt):
         return ExitStatus.INTERRUPTED

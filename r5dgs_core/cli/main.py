@@ -30,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _explain(error: BaseException, args: argparse.Namespace) -> ExitStatus:
     """Print the error for the user; returns the exit status."""
-    status = exit_status.of(error)
+    status = exit_status.status_of(error)
     if isinstance(error, BrokenPipeError):  # stdout was closed (for example by `head`); discard further output
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     elif status == ExitStatus.DEFECT:

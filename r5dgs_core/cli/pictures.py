@@ -12,7 +12,7 @@ from ..playback import modes
 from . import inputs, options
 
 if TYPE_CHECKING:
-    from ..render.viewpoints import Standpoint
+    from ..render.viewpoints import Viewpoint
     from ..scene.scene import Scene
 
 SIZES = (16, 8192)  # smallest and largest picture, pixels along the longer side
@@ -28,7 +28,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     options.add_threads(p)
 
 
-def chosen(args: argparse.Namespace) -> dict[str, Any]:
+def values_of(args: argparse.Namespace) -> dict[str, Any]:
     """Return the values of the options, by the names of the arguments of `draw`, with ``threads``."""
     return {"camera": args.camera, "t": args.time, "mode": args.mode, "size": args.size, "threads": args.threads}
 
@@ -60,7 +60,7 @@ def draw(
     mode: str = "rigid",
     size: int | None = None,
     context: bool = False,
-) -> Standpoint:
+) -> Viewpoint:
     """Write a picture of some objects.
 
     Args:
@@ -87,16 +87,16 @@ def draw(
     empty = [item.name for item in scene.objects if item.id in object_ids and item.count == 0]
     if empty and len(empty) == len(object_ids):
         raise errors.ConfigError(f"--render {out}: {', '.join(empty)}: no Gaussians, so there is nothing to draw")
-    standpoint = best_standpoint(scene, object_ids, camera, t, mode)
-    view = standpoint.camera if size is None else viewpoints.sized(standpoint.camera, size)
+    viewpoint = best_viewpoint(scene, object_ids, camera, t, mode)
+    view = viewpoint.camera if size is None else viewpoints.resized(viewpoint.camera, size)
     drawn = highlight.highlight if context else highlight.isolate
-    images.write_png(out, drawn(scene, object_ids, view, standpoint.t, mode))
-    return standpoint
+    images.write_png(out, drawn(scene, object_ids, view, viewpoint.t, mode))
+    return viewpoint
 
 
-def best_standpoint(
+def best_viewpoint(
     scene: Scene, object_ids: Collection[int], camera: str | None, t: float | None, mode: str
-) -> Standpoint:
+) -> Viewpoint:
     """Return the camera and the time that show the objects best; a given camera or time is kept."""
     from ..render import viewpoints
 

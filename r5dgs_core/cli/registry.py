@@ -41,7 +41,7 @@ class Command(Protocol):
         """Run the command; None stands for success.
 
         Raises:
-            R5dgsError: An error that the user can resolve; `exit_status.of` has its status.
+            R5dgsError: An error that the user can resolve; `exit_status.status_of` has its status.
         """
         ...
 

@@ -79,7 +79,7 @@ def measure(
         name = "" if number == 0 else f"@{split}"
         times = _times(scene, views, {k: m for k, m in plan.items() if k != ORACLE}, rounds, backend, clock)
         for mode, move in plan.items():
-            found = evaluate.measure(scene, views, move, backend=backend, measured=count)
+            found = evaluate.measure_views(scene, views, move, backend=backend, measured=count)
             missing |= dict.fromkeys(kind for kind in KINDS if found[kind] is None)
             label: dict[str, Any] = {"mode": mode, "method": "playback"}
             if mode == ORACLE:  # not a selectable method, so neither timed nor on the Pareto front

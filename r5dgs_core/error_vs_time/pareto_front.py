@@ -61,15 +61,15 @@ def losses(one: Line, other: Line) -> list[float]:
 def is_better(one: Line, other: Line) -> bool:
     """Return True if the mean difference of the errors exceeds the noise.
 
-    The noise is the range of the difference over the runs. Differences below `Kind.least` and `Kind.least_share` never
-    count; with a single run, they are the only estimate of the noise.
+    The noise is the range of the difference over the runs. Differences below `Kind.min_difference` and
+    `Kind.min_relative_difference` never count; with a single run, they are the only estimate of the noise.
     """
     found = losses(other, one)
     if not found:
         return False
     kind = next(iter(one.values())).kind
     size = max(abs(row.error) for line in (one, other) for row in line.values())
-    noise = max(max(found) - min(found), kind.least, kind.least_share * size)
+    noise = max(max(found) - min(found), kind.min_difference, kind.min_relative_difference * size)
     return sum(found) / len(found) > noise
 
 

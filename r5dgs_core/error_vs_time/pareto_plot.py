@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from .. import timing
 from ..evaluation import label_placement
-from . import report_rows, tables, tasks
+from . import report_rows, tasks
 from .report_rows import Row
 from .task import Panel, Task
 
@@ -110,7 +111,7 @@ def _pixel_error(psnr: float) -> float:
 
 def _draw(axes: Any, task: Task, points: Sequence[_Point], scene: dict[str, Any]) -> None:
     panel, first = task.panel, points[0].row
-    time_label = f"{tables.CLOCKS[first.clock]} of {panel.subject}"
+    time_label = f"{timing.CLOCKS[first.clock]} of {panel.subject}"
     axes.set(xscale="log", yscale="log", xlabel=time_label, ylabel=panel.label)
     axes.set_title(panel.title(first, scene), fontsize=11, loc="left")
     if panel.in_line is not None:

@@ -7,16 +7,15 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from .. import timing
 from . import pareto_front, run_spread, tasks
 from .pareto_front import Line
 from .report_rows import Row
 from .run_spread import Key
 from .task import Goal, Task
 
-CLOCKS = {"wall": "wall", "cpu": "processor"}
 
-
-def of(rows: Sequence[Row], lines: Mapping[Key, Line]) -> list[dict[str, Any]]:
+def recommend(rows: Sequence[Row], lines: Mapping[Key, Line]) -> list[dict[str, Any]]:
     """Return a recommendation for each task with timed rows of one scene.
 
     The fastest method whose mean loss against the best is at most `Goal.slack` is recommended. Poses and families are
@@ -68,7 +67,7 @@ def _judged(row: Row, line: Line, goal: Goal) -> tuple[Row, Line]:
     if not goal.worst_object:
         return row, line
     worst = {run: dataclasses.replace(r, error=r.error_worst) for run, r in line.items()}
-    return dataclasses.replace(run_spread.median(list(worst.values())), scene=row.scene), worst
+    return dataclasses.replace(run_spread.combine_rows(list(worst.values())), scene=row.scene), worst
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -91,4 +90,4 @@ def _text(task: Task, pick: Row, best: Row, loss: float, own: Mapping[int, Line]
 
 def _time(task: Task, row: Row) -> str:
     value = f"{row.ms / 1e3:.3g} s" if task.in_seconds else f"{row.ms:.3g} ms"
-    return f"{value} ({CLOCKS[row.clock]})"
+    return f"{value} ({timing.SHORT_CLOCKS[row.clock]})"

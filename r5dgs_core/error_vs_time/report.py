@@ -141,7 +141,7 @@ def collect(measured: Sequence[RunMeasurement], options: Options) -> dict[str, A
         several = len(runs) > 1
         combined = run_spread.combine([run.rows for run in runs], name)
         rows += combined
-        recommendations += recommendation.of(combined, run_spread.lines([run.rows for run in runs]))
+        recommendations += recommendation.recommend(combined, run_spread.lines([run.rows for run in runs]))
         absent = dict.fromkeys(text for run in runs for text in run.absent)
         listed = [
             {"place": run.place, **run.facts} | ({"rows": [row.to_dict() for row in run.rows]} if several else {})

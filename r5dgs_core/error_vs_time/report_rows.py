@@ -24,28 +24,30 @@ class Kind:
     Attributes:
         label: Label for users.
         more_is_better: True if larger values are better, as for PSNR.
-        least: Minimum difference that counts, in the unit of the error.
-        least_share: Minimum difference that counts, as a share of the larger error.
+        min_difference: Minimum difference that counts, in the unit of the error.
+        min_relative_difference: Minimum difference that counts, as a share of the larger error.
     """
 
     label: str
     more_is_better: bool = False
-    least: float = 0.0
-    least_share: float = 0.0
+    min_difference: float = 0.0
+    min_relative_difference: float = 0.0
 
 
 # Differences below the last printed digit, or due to rounding, do not count.
 KINDS = {
-    "position": Kind("position error, share of the object's size", least=1e-9, least_share=0.01),
-    "rotation": Kind("rotation error, degrees", least=1e-7, least_share=0.01),
-    "outside_band": Kind("share of true errors outside the 95 % band", least=1e-3),
-    "psnr": Kind("PSNR, dB", more_is_better=True, least=0.01),
-    "psnr_objects": Kind("PSNR on object pixels, dB", more_is_better=True, least=0.01),
-    "ssim": Kind("SSIM", more_is_better=True, least=1e-4),
-    "flip": Kind("FLIP", least=1e-4),
-    "lpips": Kind("LPIPS", least=1e-4),
-    "miou": Kind("mIoU", more_is_better=True, least=1e-3),
-    "difference": Kind("difference to the finest picture, 8-bit levels (rms)", least=1e-3, least_share=0.01),
+    "position": Kind("position error, share of the object's size", min_difference=1e-9, min_relative_difference=0.01),
+    "rotation": Kind("rotation error, degrees", min_difference=1e-7, min_relative_difference=0.01),
+    "outside_band": Kind("share of true errors outside the 95 % band", min_difference=1e-3),
+    "psnr": Kind("PSNR, dB", more_is_better=True, min_difference=0.01),
+    "psnr_objects": Kind("PSNR on object pixels, dB", more_is_better=True, min_difference=0.01),
+    "ssim": Kind("SSIM", more_is_better=True, min_difference=1e-4),
+    "flip": Kind("FLIP", min_difference=1e-4),
+    "lpips": Kind("LPIPS", min_difference=1e-4),
+    "miou": Kind("mIoU", more_is_better=True, min_difference=1e-3),
+    "difference": Kind(
+        "difference to the finest picture, 8-bit levels (rms)", min_difference=1e-3, min_relative_difference=0.01
+    ),
 }
 
 

@@ -41,22 +41,24 @@ def combine(runs: Sequence[Sequence[Row]], scene: str = "") -> list[Row]:
         groups.setdefault((key[0], key[-1]), {})[key] = line
     best = set().union(*(pareto_front.front(group) for group in groups.values()))
     return [
-        dataclasses.replace(median(list(line.values())), scene=scene, pareto=key in best)
+        dataclasses.replace(combine_rows(list(line.values())), scene=scene, pareto=key in best)
         for key, line in by_key.items()
     ]
 
 
-def median(rows: Sequence[Row]) -> Row:
+def combine_rows(rows: Sequence[Row]) -> Row:
     """Return the medians over the runs of one row, with the worst object of all runs."""
     if len(rows) == 1:
         return rows[0]
-    values: dict[str, Any] = {name: _of([getattr(row, name) for row in rows], np.median) for name in _MEDIANS}
+    values: dict[str, Any] = {
+        name: _finite_statistic([getattr(row, name) for row in rows], np.median) for name in _MEDIANS
+    }
     worst = (min if rows[0].kind.more_is_better else max)(
         rows, key=lambda row: row.error_worst if math.isfinite(row.error_worst) else 0.0
     )
     for name in ("error", "ms"):
-        values[f"{name}_min"] = _of([getattr(row, name) for row in rows], np.min)
-        values[f"{name}_max"] = _of([getattr(row, name) for row in rows], np.max)
+        values[f"{name}_min"] = _finite_statistic([getattr(row, name) for row in rows], np.min)
+        values[f"{name}_max"] = _finite_statistic([getattr(row, name) for row in rows], np.max)
     note = " / ".join(dict.fromkeys(row.note for row in rows if row.note))
     clock = rows[0].clock if len({row.clock for row in rows}) == 1 else "wall"
     return dataclasses.replace(
@@ -70,7 +72,7 @@ def median(rows: Sequence[Row]) -> Row:
     )
 
 
-def _of(values: Sequence[float], statistic: Any) -> float:
+def _finite_statistic(values: Sequence[float], statistic: Any) -> float:
     """Return a statistic of the finite values, NaN if there are none."""
     known = [value for value in values if math.isfinite(value)]
     return float(statistic(known)) if known else math.nan

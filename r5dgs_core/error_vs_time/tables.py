@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .. import terminal
+from .. import terminal, timing
 from ..bench.tables import Sheet, to_rich
 from . import report_rows, tasks
 from .report_rows import Row
@@ -15,8 +15,6 @@ from .task import Task
 
 ABSENT = "-"
 FRONT = "*"
-CLOCKS = {"wall": "wall time", "cpu": "processor time over all threads"}
-SHORT_CLOCKS = {"wall": "wall", "cpu": "processor"}
 _HEADS = {
     "position": "position, % of size",
     "rotation": "rotation, deg",
@@ -88,7 +86,7 @@ def markdown(report: dict[str, Any]) -> str:
     machine = report["machine"]
     parts.append(
         f"## Method\n\nMedians of {report['rounds']} rounds in which all methods took turns; fronts by "
-        f"{CLOCKS[report['clock']]}. On {machine['processor']}, "
+        f"{timing.CLOCKS[report['clock']]}. On {machine['processor']}, "
         f"{machine['cores']} usable cores, {machine['raster_threads']} threads of the rasterizer, "
         f"GPU: {machine['gpu'] or 'none'}. Docs: docs/user/report.md.\n"
     )
@@ -147,7 +145,7 @@ class _Column:
 def _columns(task: Task, rows: Sequence[Row]) -> list[_Column]:
     """Return the columns of times, labelled with their clock and unit."""
     unit, factor = ("s", 1e-3) if task.in_seconds else ("ms", 1.0)
-    clock = SHORT_CLOCKS[rows[0].clock]
+    clock = timing.SHORT_CLOCKS[rows[0].clock]
 
     def column(label: str, name: str) -> _Column:
         def value(row: Row) -> float:

@@ -105,7 +105,7 @@ def evaluate(
                 if progress is not None:
                     progress(done, total)
 
-            result["splits"][split][mode] = measure(
+            result["splits"][split][mode] = measure_views(
                 scene,
                 views,
                 scene_player.Player(scene, mode).frame,
@@ -122,7 +122,7 @@ def evaluate(
     return result
 
 
-def measure(
+def measure_views(
     scene: Scene,
     views: Sequence[datasets.View],
     move: Move,
@@ -147,9 +147,11 @@ def measure(
     background = truth_background(scene) if background is None else background
     tally = _Tally([item.id for item in scene.objects if item.id > 0])
     for view in (views[0], views[-1]) if views else ():
-        draw(scene, view.camera, view.t, move, backend=backend)  # compiles kernels and fills caches before timing
+        render_timed(
+            scene, view.camera, view.t, move, backend=backend
+        )  # compiles kernels and fills caches before timing
     for view in views:
-        rendering = draw(scene, view.camera, view.t, move, backend=backend)
+        rendering = render_timed(scene, view.camera, view.t, move, backend=backend)
         later = is_later(scene, view.t)
         tally.add(rendering, datasets.load_image(view, background), datasets.load_mask(view), later)
         if measured is not None:
@@ -171,11 +173,11 @@ def write(evaluation: dict[str, Any], path: Path) -> Path:
 
 
 def render(scene: Scene, camera: Camera, t: float, mode: str = "rigid", *, backend: str = "auto") -> Rendering:
-    """Render color and object ids of a scene at a time; see `draw`."""
-    return draw(scene, camera, t, scene_player.Player(scene, mode).frame, backend=backend)
+    """Render color and object ids of a scene at a time; see `render_timed`."""
+    return render_timed(scene, camera, t, scene_player.Player(scene, mode).frame, backend=backend)
 
 
-def draw(scene: Scene, camera: Camera, t: float, move: Move, *, backend: str = "auto") -> Rendering:
+def render_timed(scene: Scene, camera: Camera, t: float, move: Move, *, backend: str = "auto") -> Rendering:
     """Render color and object ids of a scene moved by a function, and measure the time in milliseconds.
 
     The id of a pixel is the classifier's prediction for the blended identities if the scene has both, else the object

@@ -33,7 +33,7 @@ _DARK, _LIGHT, _FAINT = "#101014", "#ffffff", "#8c8c94"
 
 def draw(
     scene: Scene,
-    standpoint: viewpoints.Standpoint,
+    viewpoint: viewpoints.Viewpoint,
     mode: str = "rigid",
     *,
     longest: int | None = None,
@@ -43,7 +43,7 @@ def draw(
 
     Args:
         scene: The scene.
-        standpoint: Camera and time.
+        viewpoint: Camera and time.
         mode: Playback mode past t_max.
         longest: Pixels along the longer side; those of the camera, but at least `LONGEST`, if None.
         backend: Rasterizer.
@@ -51,12 +51,12 @@ def draw(
     Returns:
         The picture with a strip below that lists all objects. [h, w, 3] uint8
     """
-    camera = standpoint.camera
+    camera = viewpoint.camera
     longest = max(camera.width, camera.height, LONGEST) if longest is None else longest
-    camera = viewpoints.sized(camera, longest)
-    shown = evaluate.render(scene, camera, standpoint.t, mode, backend=backend)
-    future = evaluate.is_later(scene, standpoint.t)
-    when = f"t = {standpoint.t:.4g}, past t_max = {scene.t_max:.4g}" if future else f"t = {standpoint.t:.4g}"
+    camera = viewpoints.resized(camera, longest)
+    shown = evaluate.render(scene, camera, viewpoint.t, mode, backend=backend)
+    future = evaluate.is_later(scene, viewpoint.t)
+    when = f"t = {viewpoint.t:.4g}, past t_max = {scene.t_max:.4g}" if future else f"t = {viewpoint.t:.4g}"
     return annotate(scene, shown.color, shown.ids, f"{scene.name}, camera {camera.name or '-'}, {when}")
 
 

@@ -122,7 +122,7 @@ def confusion(
     return np.bincount(flat.ravel(), minlength=(count + 1) ** 2).reshape(count + 1, count + 1)
 
 
-def ious(counts: np.ndarray) -> np.ndarray:
+def iou_table(counts: np.ndarray) -> np.ndarray:
     """Return the intersection over union of every true with every predicted id, 0 if both are absent. [M, M]
 
     Args:
@@ -133,7 +133,7 @@ def ious(counts: np.ndarray) -> np.ndarray:
     return common / np.maximum(true[:, None] + predicted[None, :] - common, 1)
 
 
-def iou_of_rest(counts: np.ndarray) -> float:
+def background_iou(counts: np.ndarray) -> float:
     """Return the IoU of the background, the pixels outside all ids; NaN if truth and prediction have none.
 
     Args:
@@ -159,10 +159,10 @@ def miou(counts: np.ndarray) -> float:
         The mean; NaN if the truth has none of the ids.
     """
     shown = present(counts)
-    return float(np.diag(ious(counts))[shown].mean()) if shown.any() else math.nan
+    return float(np.diag(iou_table(counts))[shown].mean()) if shown.any() else math.nan
 
 
-def matched(counts: np.ndarray) -> dict[int, int]:
+def match_ids(counts: np.ndarray) -> dict[int, int]:
     """Return the one-to-one map from true to predicted ids with the largest sum of IoU (Hungarian method).
 
     Args:
@@ -172,16 +172,16 @@ def matched(counts: np.ndarray) -> dict[int, int]:
         Column of each row that is present in the truth; rows without overlap with a remaining column are missing.
     """
     shown = np.flatnonzero(present(counts))
-    table = ious(counts)[shown]
+    table = iou_table(counts)[shown]
     rows, columns = optimize.linear_sum_assignment(table, maximize=True)
     return {int(shown[i]): int(j) for i, j in zip(rows, columns, strict=True) if table[i, j] > 0}
 
 
 def miou_matched(counts: np.ndarray) -> float:
-    """Return the mean IoU as in `miou`, with predicted ids mapped by `matched`."""
+    """Return the mean IoU as in `miou`, with predicted ids mapped by `match_ids`."""
     shown = present(counts)
-    table = ious(counts)
-    total = sum(float(table[i, j]) for i, j in matched(counts).items())
+    table = iou_table(counts)
+    total = sum(float(table[i, j]) for i, j in match_ids(counts).items())
     return total / int(shown.sum()) if shown.any() else math.nan
 
 

@@ -69,13 +69,13 @@ class Overlap:
         """
         if not self.images:
             return dict.fromkeys(KEYS)
-        table, present = metrics.ious(self.counts), metrics.present(self.counts)
-        chosen = metrics.matched(self.counts)
+        table, present = metrics.iou_table(self.counts), metrics.present(self.counts)
+        chosen = metrics.match_ids(self.counts)
         rows = np.flatnonzero(present).tolist()
         return {
             "miou": _finite(metrics.miou(self.counts)),
             "miou_matched": _finite(metrics.miou_matched(self.counts)),
-            "iou_background": _finite(metrics.iou_of_rest(self.counts)),
+            "iou_background": _finite(metrics.background_iou(self.counts)),
             "iou_objects": {str(self.ids[k]): float(table[k, k]) for k in rows},
             "iou_objects_matched": {str(self.ids[k]): float(table[k, chosen[k]]) if k in chosen else 0.0 for k in rows},
             "id_map": {str(self.ids[k]): self.ids[chosen[k]] if k in chosen else None for k in rows},

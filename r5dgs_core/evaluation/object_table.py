@@ -62,7 +62,7 @@ class ObjectRow:
 
 
 def measure(
-    scene: Scene, views: Sequence[datasets.View | viewpoints.Standpoint], mode: str = "rigid", *, backend: str = "auto"
+    scene: Scene, views: Sequence[datasets.View | viewpoints.Viewpoint], mode: str = "rigid", *, backend: str = "auto"
 ) -> list[ObjectRow]:
     """Render a scene from some views and measure its objects.
 
@@ -80,7 +80,7 @@ def measure(
     pixels = {item.id: 0 for item in scene.objects}
     seen = dict.fromkeys(pixels, 0)
     for view in views:
-        ids = evaluate.draw(scene, view.camera, view.t, player.frame, backend=backend).ids
+        ids = evaluate.render_timed(scene, view.camera, view.t, player.frame, backend=backend).ids
         for object_id, count in zip(*(found.tolist() for found in np.unique(ids, return_counts=True)), strict=True):
             pixels[object_id] = pixels.get(object_id, 0) + count
             seen[object_id] = seen.get(object_id, 0) + 1
@@ -112,14 +112,14 @@ def measure(
     return rows
 
 
-def own_views(scene: Scene) -> list[viewpoints.Standpoint]:
+def own_views(scene: Scene) -> list[viewpoints.Viewpoint]:
     """Return views of the scene's own cameras at distinct observed times, or overviews if it stores no cameras."""
     first = float(scene.tracks.times[0])
     cameras = viewpoints.spread(scene.cameras, MOST_VIEWS) or [viewpoints.overview(scene)] * 3
     # Golden-ratio steps keep camera order and time order uncorrelated.
     shares = (0.5 + 0.6180339887 * np.arange(len(cameras))) % 1.0
     times = first + shares * (scene.t_max - first)
-    return [viewpoints.Standpoint(camera, float(t)) for camera, t in zip(cameras, times, strict=True)]
+    return [viewpoints.Viewpoint(camera, float(t)) for camera, t in zip(cameras, times, strict=True)]
 
 
 def confidences(scene: Scene) -> dict[int, float]:

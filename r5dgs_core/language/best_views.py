@@ -63,9 +63,9 @@ def find(
         At most `VIEWS` per object, the best first; an empty list for objects that no camera shows.
     """
     seen: dict[int, list[tuple[Sighting, np.ndarray]]] = {object_id: [] for object_id in object_ids}
-    places, player = _standpoints(scene), scene_player.Player(scene)
+    places, player = _viewpoints(scene), scene_player.Player(scene)
     for done, at in enumerate(places):
-        small = viewpoints.sized(at.camera, _LOOK)
+        small = viewpoints.resized(at.camera, _LOOK)
         ids = scene_renderer.render(player, small, at.t, backend=backend).ids
         for object_id in object_ids:
             mask = ids == object_id
@@ -96,13 +96,13 @@ def crops(
     return (alone[..., :3] * alpha + _GRAY * (1 - alpha)).astype(np.float32), context
 
 
-def _standpoints(scene: Scene) -> list[viewpoints.Standpoint]:
+def _viewpoints(scene: Scene) -> list[viewpoints.Viewpoint]:
     some = viewpoints.spread(scene.cameras, _CAMERAS) or [viewpoints.overview(scene)]
     times = np.unique(np.linspace(scene.tracks.times[0], scene.t_max, _TIMES))
-    return [viewpoints.Standpoint(camera, float(t)) for t in times for camera in some]
+    return [viewpoints.Viewpoint(camera, float(t)) for t in times for camera in some]
 
 
-def _sighting(at: viewpoints.Standpoint, small: Camera, mask: np.ndarray) -> Sighting:
+def _sighting(at: viewpoints.Viewpoint, small: Camera, mask: np.ndarray) -> Sighting:
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     scale = at.camera.width / small.width
     left, right = scale * columns[0], scale * (columns[-1] + 1)
@@ -117,7 +117,7 @@ def _sighting(at: viewpoints.Standpoint, small: Camera, mask: np.ndarray) -> Sig
 
 def _unhidden(scene: Scene, object_id: int, sighting: Sighting, mask: np.ndarray, backend: str) -> float:
     """Share of an object's pixels that are not occluded."""
-    small = viewpoints.sized(sighting.camera, _LOOK)
+    small = viewpoints.resized(sighting.camera, _LOOK)
     alone = highlight.isolate(scene, [object_id], small, sighting.t, backend=backend)[..., 3] > 0.5
     return float((mask & alone).sum() / max(alone.sum(), 1))
 

@@ -67,7 +67,7 @@ def render(
     return layer
 
 
-def of_sky(scenes: Sequence[Scene], instances: Sequence[Instance], posed: PosedScene, camera: Camera) -> np.ndarray:
+def sky_mask(scenes: Sequence[Scene], instances: Sequence[Instance], posed: PosedScene, camera: Camera) -> np.ndarray:
     """Return a mask of the Gaussians that represent the sky; meshes are always in front of them.
 
     These are background or unassigned Gaussians with the colour of the sky behind them that are faint, or farther from

@@ -23,7 +23,7 @@ from ..scene.scene import NEAR_PLANE, Scene
 from . import coverage, posed_scene, scene_renderer
 
 OWN_SKY = Sky()  # of the first scene
-WORTH_A_LAYER = 0.7  # maximum share of moving Gaussians; above it, the static layer costs more than it saves
+MAX_MOVING_SHARE = 0.7  # maximum share of moving Gaussians; above it, the static layer costs more than it saves
 
 
 class IncrementalRenderer:
@@ -40,9 +40,9 @@ class IncrementalRenderer:
         self.ms_motion = 0.0
         self._lock = threading.Lock()
         self._scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
-        self._gathered = posed_scene.gather(self._scenes)
+        self._joined = posed_scene.join_scenes(self._scenes)
         self._shown: tuple | None = None  # camera, background, ranges and tints of the last frame
-        self._places: list[np.ndarray] = []  # first pose of each instance
+        self._pose_keys: list[np.ndarray] = []  # first pose of each instance
         self._moving: set[int] = set()
         self._static_layer: StaticLayer | None = None
         self._backend = backends.on_cpu()
@@ -80,7 +80,7 @@ class IncrementalRenderer:
                 return self._render(instances, camera, sky, near, distance)
             except ValueError:
                 self._shown = None
-                posed_scene.pose_instances(self._gathered, instances)  # raises again, with the caller's numbering
+                posed_scene.pose_instances(self._joined, instances)  # raises again, with the caller's numbering
                 raise
 
     def coverage(
@@ -134,12 +134,12 @@ class IncrementalRenderer:
         if any(one.holdout for one in instances):
             self._shown = None
             return self._render_all(instances, camera, sky, settings, distance)
-        shown = (view, behind, tuple((one.scene, one.start, one.count, _look(one)) for one in instances))
+        shown = (view, behind, tuple((one.scene, one.start, one.count, _tint_key(one)) for one in instances))
         if shown != self._shown:
             self._shown, self._static_layer, self._moving = shown, None, set()
-            self._places = [self._place(instance) for instance in instances]
+            self._pose_keys = [self._pose_key(instance) for instance in instances]
             return self._render_all(instances, camera, sky, settings, distance)
-        left = {i for i, one in enumerate(instances) if not np.array_equal(self._place(one), self._places[i])}
+        left = {i for i, one in enumerate(instances) if not np.array_equal(self._pose_key(one), self._pose_keys[i])}
         if not left <= self._moving:
             self._moving |= left
             self._static_layer = None
@@ -156,10 +156,10 @@ class IncrementalRenderer:
         depth = _mean(picture.image[..., 3], picture.alpha) if distance else picture.depth
         return RenderOutput(picture.image[..., :3], picture.alpha, depth, None, picture.ids)
 
-    def _place(self, instance: Instance) -> np.ndarray:
+    def _pose_key(self, instance: Instance) -> np.ndarray:
         """Pose of an instance: its matrix, its world matrix, and its time if it has residuals. [33]"""
         world = np.eye(4) if instance.world is None else instance.world
-        t = np.array([instance.t if posed_scene.bends(self._gathered, instance) else np.inf], np.float64)
+        t = np.array([instance.t if posed_scene.has_residuals(self._joined, instance) else np.inf], np.float64)
         return np.concatenate([np.ravel(instance.matrix), np.ravel(world), t]).astype(np.float64)
 
     def _near(self, instances: Sequence[Instance]) -> float:
@@ -176,14 +176,14 @@ class IncrementalRenderer:
             return None
         if not 0 <= sky.scene < len(self._scenes):
             raise ValueError(f"sky: expected a scene below {len(self._scenes)}, got {sky.scene}")
-        scene, turned = self._scenes[sky.scene], scene_renderer.in_world_of(camera, sky.matrix)
+        scene, turned = self._scenes[sky.scene], scene_renderer.sky_camera(camera, sky.matrix)
         return np.asarray(scene_renderer.behind(scene, turned), np.float32)
 
     def _wants_static_layer(self, instances: Sequence[Instance], still: list[int], moving: list[int]) -> bool:
         if not self._backend.has_static_layer:
             return False
         moved, kept = (sum(instances[i].count for i in part) for part in (moving, still))
-        return kept > 0 and moved <= WORTH_A_LAYER * (moved + kept)
+        return kept > 0 and moved <= MAX_MOVING_SHARE * (moved + kept)
 
     def _make_static_layer(
         self,
@@ -251,7 +251,7 @@ class IncrementalRenderer:
 
     def _pose(self, instances: Sequence[Instance]) -> posed_scene.PosedScene:
         start = time.perf_counter()
-        posed = posed_scene.pose_instances(self._gathered, instances)
+        posed = posed_scene.pose_instances(self._joined, instances)
         self.ms_motion += 1e3 * (time.perf_counter() - start)
         return posed
 
@@ -267,7 +267,7 @@ def _mean(blended: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return np.divide(blended, alpha, out=np.zeros_like(blended), where=alpha > 0)
 
 
-def _look(instance: Instance) -> tuple | None:
+def _tint_key(instance: Instance) -> tuple | None:
     return None if instance.tint is None else tuple(instance.tint)
 
 

@@ -48,7 +48,7 @@ class JoinedScenes:
     harmonics_turn: tuple[bool, ...]
 
 
-def gather(scenes: Sequence[Scene]) -> JoinedScenes:
+def join_scenes(scenes: Sequence[Scene]) -> JoinedScenes:
     """Concatenate the Gaussians of scenes. A single scene is not copied."""
     lit = any(scene.shading is not None for scene in scenes)
     bases = max((scene.gaussians.sh.shape[1] for scene in scenes), default=1)
@@ -163,7 +163,7 @@ def pose_instances(scene: Scene | JoinedScenes, instances: Sequence[Instance]) -
     the map, relative to the scene's own world.
 
     Args:
-        scene: One scene, or several from `gather`.
+        scene: One scene, or several from `join_scenes`.
         instances: Ranges and their maps.
 
     Returns:
@@ -172,7 +172,7 @@ def pose_instances(scene: Scene | JoinedScenes, instances: Sequence[Instance]) -
     Raises:
         ValueError: A range leaves its scene, a matrix is singular or not finite, or a tint is negative.
     """
-    given = scene if isinstance(scene, JoinedScenes) else gather([scene])
+    given = scene if isinstance(scene, JoinedScenes) else join_scenes([scene])
     ranges = [_rows(given, index, instance) for index, instance in enumerate(instances)]
     total = sum(instance.count for instance in instances)
     means, quats, log_scales = (np.empty((total, width), np.float32) for width in (3, 4, 3))
@@ -227,7 +227,7 @@ def _rotation(instance: Instance, index: int, linear: np.ndarray, light: np.ndar
 
 
 @dataclass(frozen=True)
-class _Bent:
+class _ResidualRows:
     """Gaussians with residuals, in the bind state: rows in the `JoinedScenes` arrays [R], indices within the part [R],
     offsets [R, 3], resulting rotations, unit wxyz [R, 4], residual rotations [R, 4] and residuals of the log scales
     [R, 3]."""
@@ -240,7 +240,7 @@ class _Bent:
     growths: np.ndarray
 
 
-def bends(given: JoinedScenes, instance: Instance) -> bool:
+def has_residuals(given: JoinedScenes, instance: Instance) -> bool:
     """Return True if an instance contains Gaussians with residuals."""
     if instance.t is None or not 0 <= instance.scene < len(given.residuals):
         return False
@@ -248,7 +248,7 @@ def bends(given: JoinedScenes, instance: Instance) -> bool:
     return bool(np.searchsorted(rows, instance.start) < np.searchsorted(rows, instance.start + instance.count))
 
 
-def _bent(given: JoinedScenes, instance: Instance, part: slice | np.ndarray) -> _Bent | None:
+def _bent(given: JoinedScenes, instance: Instance, part: slice | np.ndarray) -> _ResidualRows | None:
     if instance.t is None:
         return None
     residuals = given.residuals[instance.scene]()
@@ -266,7 +266,7 @@ def _bent(given: JoinedScenes, instance: Instance, part: slice | np.ndarray) -> 
         return None
     offsets, turns, growths = (values[:, which] for values in found)
     turned = quaternion_columns.multiply(turns.astype(np.float32), residuals.bind_quats[:, which])
-    return _Bent(known[which], places, offsets.T, np.ascontiguousarray(turned.T), turns.T, growths.T)
+    return _ResidualRows(known[which], places, offsets.T, np.ascontiguousarray(turned.T), turns.T, growths.T)
 
 
 def _parts(

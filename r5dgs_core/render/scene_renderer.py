@@ -81,7 +81,7 @@ def sky(scene: Scene, camera: Camera) -> np.ndarray:
     return shade.sky(scene.background_sh, camera)
 
 
-def in_world_of(camera: Camera, matrix: np.ndarray) -> Camera:
+def sky_camera(camera: Camera, matrix: np.ndarray) -> Camera:
     """Transform a camera into another world, for viewing directions only.
 
     Args:

@@ -18,7 +18,7 @@ REPEATS = 7
 
 
 @dataclass(frozen=True)
-class Trial:
+class SpeedTestResult:
     """Result of a speed test.
 
     Attributes:
@@ -34,7 +34,7 @@ class Trial:
     device: str
 
 
-def run() -> Trial:
+def run() -> SpeedTestResult:
     """Time the rasterization of a ball of Gaussians, after compilation."""
     random = np.random.default_rng(0)
     directions = random.normal(size=(GAUSSIANS, 3))
@@ -53,4 +53,4 @@ def run() -> Trial:
     draw = functools.partial(rasterize_splats, places, turns, axes, opacities, values, camera)
     times = timing.take({"picture": draw}, REPEATS)["picture"]
     hardware = backends.choose("auto", places).hardware()
-    return Trial(times.ms(), GAUSSIANS, (SIZE, SIZE), hardware)
+    return SpeedTestResult(times.ms(), GAUSSIANS, (SIZE, SIZE), hardware)

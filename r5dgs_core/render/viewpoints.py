@@ -18,7 +18,7 @@ from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from . import scene_renderer
 
-LOOK = 160  # longest side of the small pictures, pixels
+THUMBNAIL_SIDE = 160  # longest side of the small pictures, pixels
 MOST_CAMERAS = 16  # maximum number of cameras to try
 NOTICED = 5e-4  # minimum share of the picture that counts as visible
 
@@ -26,7 +26,7 @@ Item = TypeVar("Item")
 
 
 @dataclasses.dataclass(frozen=True)
-class Standpoint:
+class Viewpoint:
     """A camera at a time.
 
     Attributes:
@@ -57,7 +57,7 @@ def named(scene: Scene, which: str) -> Camera:
     raise errors.ConfigError(f"--camera {which}: expected 0 to {last}, or a name of a camera: {shown}{more}")
 
 
-def candidates(scene: Scene, camera: str | None = None, t: float | None = None) -> list[Standpoint]:
+def candidates(scene: Scene, camera: str | None = None, t: float | None = None) -> list[Viewpoint]:
     """List viewpoints to choose from.
 
     Args:
@@ -78,17 +78,17 @@ def candidates(scene: Scene, camera: str | None = None, t: float | None = None) 
         some = [overview(scene)]
     first = float(scene.tracks.times[0])
     times = np.unique([scene.t_max, 0.5 * (first + scene.t_max), first])[::-1].tolist() if t is None else [float(t)]
-    return [Standpoint(view, when) for when in times for view in some]
+    return [Viewpoint(view, when) for when in times for view in some]
 
 
 def best(
     scene: Scene,
-    among: Sequence[Standpoint],
+    among: Sequence[Viewpoint],
     object_ids: Collection[int],
     mode: str = "rigid",
     *,
     backend: str = "auto",
-) -> Standpoint:
+) -> Viewpoint:
     """Return the viewpoint that shows most of some objects: as many as possible first, then large and uncut ones.
 
     Args:
@@ -101,7 +101,7 @@ def best(
     if len(among) == 1:
         return among[0]
     player = scene_player.Player(scene, mode)
-    scores = [_score(player, standpoint, object_ids, backend) for standpoint in among]
+    scores = [_score(player, viewpoint, object_ids, backend) for viewpoint in among]
     return among[max(range(len(among)), key=lambda k: scores[k])]
 
 
@@ -111,7 +111,7 @@ def spread(items: Sequence[Item], most: int) -> list[Item]:
     return [items[int(k)] for k in at]
 
 
-def sized(camera: Camera, longest: int) -> Camera:
+def resized(camera: Camera, longest: int) -> Camera:
     """Resize a camera so that its longer side has ``longest`` pixels."""
     scale = longest / max(camera.width, camera.height)
     return axes.resize(camera, max(round(scale * camera.width), 1), max(round(scale * camera.height), 1))
@@ -138,10 +138,10 @@ def overview(scene: Scene) -> Camera:
 
 
 def _score(
-    player: scene_player.Player, standpoint: Standpoint, object_ids: Collection[int], backend: str
+    player: scene_player.Player, viewpoint: Viewpoint, object_ids: Collection[int], backend: str
 ) -> tuple[int, float]:
     """Number of visible objects, and sum of the square roots of their shares, halved for those at the border."""
-    ids = scene_renderer.render(player, sized(standpoint.camera, LOOK), standpoint.t, backend=backend).ids
+    ids = scene_renderer.render(player, resized(viewpoint.camera, THUMBNAIL_SIDE), viewpoint.t, backend=backend).ids
     border = np.concatenate([ids[0], ids[-1], ids[:, 0], ids[:, -1]])
     count, quality = 0, 0.0
     for object_id in object_ids:

@@ -56,5 +56,5 @@ def _front(
     posed, settings = stage.posed(instances, wanted.near)
     depths = mesh_depths.draw(wanted.camera, meshes.vertices, meshes.triangles, settings.near_plane)
     return front_layer.render(
-        posed, wanted.camera, depths, settings, front_layer.of_sky(scenes, instances, posed, wanted.camera)
+        posed, wanted.camera, depths, settings, front_layer.sky_mask(scenes, instances, posed, wanted.camera)
     )

@@ -30,7 +30,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
-    run_objects(args.target, args.data, legend=args.legend, as_json=args.json, **pictures.chosen(args))
+    run_objects(args.target, args.data, legend=args.legend, as_json=args.json, **pictures.values_of(args))
 
 
 def run_objects(
@@ -70,10 +70,10 @@ def run_objects(
     options.use_threads(threads)
     scene, dataset = inputs.open_target(target, data)
     inputs.check_mode(mode, scene, target)
-    standpoint = None
+    viewpoint = None
     if legend is not None:
         object_ids = [item.id for item in scene.objects if item.id > 0]
-        standpoint = pictures.best_standpoint(scene, object_ids, camera, t, mode)
+        viewpoint = pictures.best_viewpoint(scene, object_ids, camera, t, mode)
     if dataset is None:
         views: list[Any] = object_table.own_views(scene)
     else:
@@ -88,11 +88,11 @@ def run_objects(
         outlook = object_table.outlook_table(scene, rows)
         if outlook is not None:
             console.print(outlook)
-    if legend is not None and standpoint is not None:
+    if legend is not None and viewpoint is not None:
         from ...data import images
         from ...evaluation import legend as legends
 
-        images.write_png(legend, legends.draw(scene, standpoint, mode, longest=size))
+        images.write_png(legend, legends.draw(scene, viewpoint, mode, longest=size))
         if not as_json:
-            print(f"written: {legend} (camera {standpoint.camera.name}, t = {standpoint.t:g})")
+            print(f"written: {legend} (camera {viewpoint.camera.name}, t = {viewpoint.t:g})")
     return result

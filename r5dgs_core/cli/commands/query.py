@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> ExitStatus | None:
     """Run the command."""
     given = {"encoder": args.encoder, "threshold": args.threshold, "as_json": args.json}
     given |= {"render": args.render, "context": args.context}
-    return None if run_query(args.file, args.text, **given, **pictures.chosen(args)) else ExitStatus.NEGATIVE
+    return None if run_query(args.file, args.text, **given, **pictures.values_of(args)) else ExitStatus.NEGATIVE
 
 
 def run_query(
@@ -92,9 +92,9 @@ def run_query(
     if render is None or not found:
         return found
     options.use_threads(threads)
-    standpoint = pictures.draw(scene, [match.object_id for match in found], render, context=context, **picture)
+    viewpoint = pictures.draw(scene, [match.object_id for match in found], render, context=context, **picture)
     if not as_json:
-        print(f"written: {render} (camera {standpoint.camera.name}, t = {standpoint.t:g})")
+        print(f"written: {render} (camera {viewpoint.camera.name}, t = {viewpoint.t:g})")
     return found
 
 

@@ -108,7 +108,7 @@ def test_runs_that_differ_in_the_seed_alone_are_one_group():
 
 
 def recommend(*some):
-    return recommendation.of(run_spread.combine(some, "kitchen"), run_spread.lines(some))
+    return recommendation.recommend(run_spread.combine(some, "kitchen"), run_spread.lines(some))
 
 
 def test_the_fastest_nearly_best_method_is_recommended_with_its_margin():

@@ -98,7 +98,7 @@ def test_a_legend_is_readable_and_marks_times_past_t_max(scene, monkeypatch):
     real = legend.annotate
     monkeypatch.setattr(legend, "annotate", lambda *given: titles.append(given[-1]) or real(*given))
     small = scenes.orbit_camera(0.5, 32, 24)
-    picture = legend.draw(scene, viewpoints.Standpoint(small, 0.3), backend="auto")
+    picture = legend.draw(scene, viewpoints.Viewpoint(small, 0.3), backend="auto")
     assert picture.shape[1] == legend.LONGEST
-    assert legend.draw(scene, viewpoints.Standpoint(small, 1.0), longest=64, backend=BACKEND).shape[1] == 64
+    assert legend.draw(scene, viewpoints.Viewpoint(small, 1.0), longest=64, backend=BACKEND).shape[1] == 64
     assert "past t_max" not in titles[0] and "past t_max = 0.75" in titles[1] and small.name in titles[0]

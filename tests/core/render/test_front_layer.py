@@ -105,5 +105,5 @@ def test_faint_background_gaussians_of_the_colour_of_the_sky_belong_to_it(posed)
     for row in (alike, opaque, object_):
         pose.sh[row, 0] = spherical_harmonics.rgb_to_dc(sky + 0.02)
     pose.opacity_logits[opaque] = 4
-    found = front_layer.of_sky([scene], [Instance(0, count, np.eye(4))], pose, scene.cameras[0])
+    found = front_layer.sky_mask([scene], [Instance(0, count, np.eye(4))], pose, scene.cameras[0])
     assert found[alike] and not found[[other, opaque, object_]].any() and found.sum() == 1

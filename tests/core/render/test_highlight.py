@@ -94,7 +94,7 @@ def test_the_best_viewpoint_shows_the_most_objects(scene):
     near = scenes.looking_camera(
         scene.gaussians.means[scene.gaussians.object_ids == 2].mean(0) + [0.4, 0, 0], [-1.0, 0, 0], 0.5, 48, 36
     )
-    among = [viewpoints.Standpoint(camera, 0.3) for camera in (away, near, scenes.orbit_camera(0.3))]
+    among = [viewpoints.Viewpoint(camera, 0.3) for camera in (away, near, scenes.orbit_camera(0.3))]
     ids = [item.id for item in scene.objects if item.id > 0]
     assert viewpoints.best(scene, among, ids, backend=BACKEND) is among[2]
     assert viewpoints.best(scene, among[:2], [2], backend=BACKEND) is among[1]
@@ -134,7 +134,7 @@ def test_a_scene_without_cameras_is_viewed_obliquely_from_above(convention):
 
 
 def test_a_resized_camera_keeps_its_field_of_view():
-    camera = viewpoints.sized(CAMERA, 96)
+    camera = viewpoints.resized(CAMERA, 96)
     assert (camera.width, camera.height) == (96, 72)
     points = np.array([[0.1, 0.2, 0.3], [-0.5, 0.1, 0.0]])
     np.testing.assert_allclose(cameras.project(camera, points)[0], 2 * cameras.project(CAMERA, points)[0])
