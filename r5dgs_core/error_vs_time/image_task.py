@@ -13,7 +13,7 @@ from ..data.dataset import Dataset, View
 from ..evaluation import evaluate, ground_truth_poses
 from ..motion import se3
 from ..playback import scene_player
-from ..render import scene_renderer
+from ..render import scene_renderer, viewpoints
 from ..scene.scene import Scene
 from .report_rows import Row
 from .task import Goal, Measured, Panel, Request, Task, decibels
@@ -155,7 +155,7 @@ def _times(
     scene: Scene, views: Sequence[View], moves: dict[str, evaluate.Move], rounds: int, backend: str, clock: str
 ) -> dict[str, dict[str, Any]]:
     """Return the columns of a `Row` that hold times per frame, of motion and of color rasterization, by mode."""
-    some = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(FRAMES, len(views))).round().astype(int))]
+    some = viewpoints.spread(views, FRAMES)
     calls: dict[tuple[str, str], Callable[[], object]] = {}
     for mode, move in moves.items():
         frames = [move(view.t, view.camera.center) for view in some]
