@@ -1,4 +1,7 @@
-"""Timing of several callables in interleaved rounds, so that background load affects all of them equally."""
+"""Timing: laps of consecutive steps, and interleaved rounds of several callables.
+
+Rounds are interleaved so that background load affects all callables equally.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,19 @@ PATIENCE_MS = 30_000.0  # time of a contender's turns after which it takes at mo
 ENOUGH = 3
 BUSY = 1.25  # ratio of wall to single-thread processor time above which the machine counts as busy
 Key = TypeVar("Key", bound=Hashable)
+
+
+class Stopwatch:
+    """Wall time of consecutive steps."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+
+    def lap(self) -> float:
+        """Return the milliseconds since the last lap, or since the start."""
+        now = time.perf_counter()
+        ms, self._start = 1e3 * (now - self._start), now
+        return ms
 
 
 @dataclass(frozen=True)

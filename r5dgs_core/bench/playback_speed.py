@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import timing
 from ..data.dataset import View
 from ..playback import scene_player
 from ..render import scene_renderer
@@ -68,8 +69,8 @@ def _summary(times: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
 
 def _draw(player: scene_player.Player, view: View, backend: str) -> tuple[float, float, float]:
     """Return the time of motion and of rasterization, and the processor time, of one frame in milliseconds."""
-    cpu, start = time.process_time(), time.perf_counter()
+    cpu, watch = time.process_time(), timing.Stopwatch()
     frame = player.frame(view.t, view.camera.center)
-    moved = time.perf_counter()
+    ms_motion = watch.lap()
     scene_renderer.render_frame(player.scene, frame, view.camera, backend=backend)
-    return 1e3 * (moved - start), 1e3 * (time.perf_counter() - moved), 1e3 * (time.process_time() - cpu)
+    return ms_motion, watch.lap(), 1e3 * (time.process_time() - cpu)

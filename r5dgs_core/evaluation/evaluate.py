@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import atomic_files
+from .. import atomic_files, timing
 from ..data import dataset as datasets
 from ..data import images
 from ..errors import ConfigError
@@ -183,18 +182,18 @@ def render_timed(scene: Scene, camera: Camera, t: float, move: Move, *, backend:
     The id of a pixel is the classifier's prediction for the blended identities if the scene has both, else the object
     with the largest weight in the pixel.
     """
-    start = time.perf_counter()
+    watch = timing.Stopwatch()
     frame = move(t, camera.center)
-    moved = time.perf_counter()
+    ms_motion = watch.lap()
     classified = scene.gaussians.identities is not None and scene.classifier is not None
     output = scene_renderer.render_frame(
         scene, frame, camera, backend=backend, features=scene.gaussians.identities if classified else None
     )
     color = output.color
-    rendered = time.perf_counter()
+    ms_raster = watch.lap()
     ids = classify(scene, output.features) if classified else np.maximum(output.ids, 0)
     rounded = images.to_uint8(color).astype(np.float32) / np.float32(255.0)
-    return Rendering(rounded, ids, 1e3 * (moved - start), 1e3 * (rendered - moved))
+    return Rendering(rounded, ids, ms_motion, ms_raster)
 
 
 def truth_background(scene: Scene) -> np.ndarray:

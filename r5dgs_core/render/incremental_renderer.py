@@ -9,11 +9,11 @@ only instances that have moved at least once are drawn into it. The images equal
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Sequence
 
 import numpy as np
 
+from .. import timing
 from ..raster import backends, rasterize
 from ..raster.backend import StaticLayer
 from ..raster.settings import RasterSettings, RenderOutput
@@ -250,9 +250,9 @@ class IncrementalRenderer:
         return RenderOutput(found.color, alpha, depth, None, ids, holdout)
 
     def _pose(self, instances: Sequence[Instance]) -> posed_scene.PosedScene:
-        start = time.perf_counter()
+        watch = timing.Stopwatch()
         posed = posed_scene.pose_instances(self._joined, instances)
-        self.ms_motion += 1e3 * (time.perf_counter() - start)
+        self.ms_motion += watch.lap()
         return posed
 
 

@@ -28,7 +28,6 @@ import os
 import platform
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -36,7 +35,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from .. import __version__, errors
+from .. import __version__, errors, timing
 from ..language import query
 from ..language.encoders import encoder_base, registry
 from ..playback import scene_player
@@ -142,7 +141,7 @@ class Server:
         ranks = 0 if wanted.coverage is None else wanted.coverage.ranks
         fields.check_size(wanted.camera, 0, ranks)
         self._wait_for_kernels()
-        started = time.perf_counter()
+        watch = timing.Stopwatch()
         instances = []
         if wanted.t is None:
             scenes, places = self._points.extend(scenes, edited_points.wanted(wanted))
@@ -162,7 +161,7 @@ class Server:
                 output, ms_motion, count = self._play(wanted, wanted.t, scenes[wanted.scene])
         except (ValueError, OverflowError, FloatingPointError) as error:  # Gaussians out of the numeric range
             raise errors.ConfigError(f"worker: this picture cannot be drawn: {error}") from error
-        ms_raster = 1e3 * (time.perf_counter() - started) - ms_motion
+        ms_raster = watch.lap() - ms_motion
         arrays = {"color": output.color}
         for name in wanted.want:
             value = output.ids if name in ("ids", "owners") else getattr(output, name)
@@ -193,11 +192,11 @@ class Server:
         from ..raster import RasterSettings
         from ..render import scene_renderer
 
-        started = time.perf_counter()
+        watch = timing.Stopwatch()
         if wanted.scene not in self._players:
             self._players[wanted.scene] = scene_player.Player(scene)
         pose = posed_scene.pose_frame(scene, self._players[wanted.scene].frame(t, wanted.camera.center))
-        ms_motion = 1e3 * (time.perf_counter() - started)
+        ms_motion = watch.lap()
         output = scene_renderer.render_frame(
             scene,
             pose,
