@@ -24,8 +24,9 @@ from .layouts import registry
 from .layouts.colmap import MIN_REGISTERED
 from .layouts.raw_dataset import RawDataset
 from .layouts.registry import CAMERAS_FILE
+from .splits import SPLITS
 from .view_masks import MASKS
-from .views import SPLITS, View, make_views
+from .views import View, make_views
 
 FRAMES_PER_UNIT = 60.0
 _log = logging.getLogger(__name__)

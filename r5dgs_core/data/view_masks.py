@@ -9,7 +9,8 @@ from typing import Any
 
 from .. import errors, findings
 from . import mask_notes, masks
-from .views import SPLITS, View
+from .splits import SPLITS
+from .views import View
 
 MASKS, NO_MASKS = "object_mask", "none"
 _log = logging.getLogger(__name__)

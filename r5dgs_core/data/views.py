@@ -12,8 +12,7 @@ from .. import errors, findings
 from ..scene import cameras
 from . import images, masks, transforms
 from .layouts.raw_dataset import RawDataset
-
-SPLITS = ("train", "val", "test")
+from .splits import SPLITS
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ... import errors, input_paths, terminal
+from ...data.splits import SPLITS
 from ...error_vs_time import task_names
 from .. import inputs, options
 from ..exit_status import ExitStatus
@@ -21,8 +22,6 @@ LONG = (
 )
 EXAMPLE = "RUN [RUN ...] --out report"
 PAGE = "user/report.md"
-
-SPLITS = ("train", "val", "test")  # of `data.dataset`
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
