@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...model.group_poses import GroupPoses, at_rest
+from ...model.group_poses import GroupPoses
 from ...raster import compilation as kernels
 from ...raster import thread_pool
 
@@ -95,6 +95,7 @@ def activate(
 
     It is `pose` with one group at rest and no shading, so that its exponentials are the same to the bit.
     """
+    at_rest = GroupPoses(torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.eye(3)[None], torch.zeros(1, 3))
     return pose(
         means,
         quats,
@@ -104,7 +105,7 @@ def activate(
         torch.zeros_like(means),
         torch.zeros(3),
         torch.zeros(len(means), dtype=torch.int64),
-        at_rest(1),
+        at_rest,
         torch.zeros(1, 3),
     )
 
