@@ -155,7 +155,7 @@ def shown(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = 
         layer.table = None  # released before the new one is made
         layer.table = slots, renderer.SplatTable(gaussian_table.pack([layer.clouds[uid] for uid, *_ in slots]))
     numbers = {slot: number for number, slot in enumerate(layer.table[0])}
-    groups = tuple(_group(numbers[slot], one) for slot, one in zip(slots, clouds, strict=True))
+    groups = _groups([numbers[slot] for slot in slots], clouds)
     present = {one.collection for one in clouds}
     first = next(scene for scene in scenes if scene in present)
     return VisibleSplats(layer.table[1], groups, _sky(first), visible_clouds.world_of(first, depsgraph))
@@ -171,14 +171,18 @@ def _slots(clouds: list[visible_clouds.VisibleCloud]) -> tuple[Slot, ...]:
     return tuple(found)
 
 
-def _group(number: int, cloud: visible_clouds.VisibleCloud) -> renderer.Group:
-    light, change = loaded_scenes.light(cloud.collection), (0.0, 0.0, 0.0)
-    if light is not None:
-        turn = affine_transform.nearest_rotation(cloud.matrix[:3, :3])
-        turn = affine_transform.nearest_rotation(cloud.world[:3, :3]).T @ turn
-        change = tuple(posing.light_change(light, turn))
-    source = (0.0, 0.0, 0.0) if light is None else tuple(light)
-    return renderer.Group(number, cloud.matrix, cloud.tint, change, source, cloud.holdout)
+def _groups(numbers: list[int], clouds: list[visible_clouds.VisibleCloud]) -> tuple[renderer.Group, ...]:
+    """Groups of visible clouds; the turns of all are found at once."""
+    linear = np.array([one.matrix[:3, :3] for one in clouds] + [one.world[:3, :3] for one in clouds], np.float64)
+    rotations, found = affine_transform.nearest_rotation(linear), []
+    turns = np.swapaxes(rotations[len(clouds) :], -1, -2) @ rotations[: len(clouds)]
+    for number, cloud, turn in zip(numbers, clouds, turns, strict=True):
+        light, change = loaded_scenes.light(cloud.collection), (0.0, 0.0, 0.0)
+        if light is not None:
+            change = tuple(posing.light_change(light, turn))
+        source = (0.0, 0.0, 0.0) if light is None else tuple(light)
+        found.append(renderer.Group(number, cloud.matrix, cloud.tint, change, source, cloud.holdout))
+    return tuple(found)
 
 
 def _sky(collection: bpy.types.Collection) -> np.ndarray | None:

@@ -99,7 +99,7 @@ def check_meshes(out: Path, size: float):
     view_3d.view_rotation, view_3d.view_location = VIEWS[0].to_quaternion(), middle
     view_3d.view_distance = 6 * radius
     right, back = (view_3d.view_rotation @ Vector(axis) for axis in ((1, 0, 0), (0, 0, 1)))
-    ball_place = middle + 1.2 * radius * right - 0.6 * radius * back
+    ball_place = middle + 0.7 * radius * right - 1.2 * radius * back
     bpy.ops.mesh.primitive_uv_sphere_add(radius=radius, location=ball_place, segments=64, ring_count=32)
     ball = bpy.context.object
     bpy.ops.mesh.primitive_plane_add(size=4 * radius, location=middle)
