@@ -19,7 +19,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 RUN = Path(__file__).with_name("run.py")
 MODULES = {"4.2.23": "3.11", "4.5.15": "3.11", "5.0.1": "3.11", "5.2.3": "3.13"}  # version of bpy to version of Python
-TORCH = next(line for line in (ROOT / "constraints.txt").read_text().splitlines() if line.startswith("torch=="))
+PINS = (ROOT / "constraints.txt").read_text().splitlines()
+HEAVY = tuple(line for line in PINS if line.startswith(("torch==", "numba==", "llvmlite==")))
 BESIDE = ("pytest", "hypothesis", "OpenImageIO", "rich", "packaging", "scipy", "trimesh")
 
 
@@ -38,7 +39,7 @@ def environment(bpy: str, folder: Path, torch: bool) -> Path:
     place = folder / bpy
     python = place / "bin" / "python"
     done = place / "installed"
-    wanted = [f"bpy=={bpy}", *BESIDE, *((TORCH, "numba") if torch else ())]
+    wanted = [f"bpy=={bpy}", *BESIDE, *(HEAVY if torch else ())]
     if not done.exists() or done.read_text() != " ".join(wanted):
         subprocess.run([python_of(MODULES[bpy]), "-m", "venv", str(place)], check=True)
         subprocess.run([str(python), "-m", "pip", "install", "-q", *wanted], check=True)
