@@ -31,6 +31,8 @@ from ..render.posed_scene import PosedScene
 from ..scene import cameras
 from ..scene.scene import Scene
 from ..train import train_views
+from . import unseen_rotations
+from .unseen_rotations import Surface, Unseen
 
 VIEWS = 4  # maximum number of views of a knot, spread evenly
 STEP = 0.03  # change of the pose for finite differences, rad or radii
@@ -53,6 +55,11 @@ class _BodyPixels:
         inner: Squared misfit of the pixels inside the body's outline.
         texture: Squared differences of these pixels in the image from their mean colour.
         values: Number of values of these pixels.
+        points: Points of the surface that they show, world. [P', 3]
+        colors: Their colours in the image. [P', 3]
+        eye: Position of the camera. [3]
+        plane: Two orthogonal unit vectors perpendicular to the direction of the body, world. [2, 3]
+        moments: Second moments of its outline along them, at distance 1. [2, 2]
     """
 
     slopes: np.ndarray
@@ -60,12 +67,31 @@ class _BodyPixels:
     inner: float
     texture: float
     values: int
+    points: np.ndarray
+    colors: np.ndarray
+    eye: np.ndarray
+    plane: np.ndarray
+    moments: np.ndarray
 
 
-def measure(
-    scene: Scene, dataset: datasets.Dataset, config: Config, groups: Collection[int], masked: bool
-) -> dict[int, PoseErrors]:
-    """Return the errors of the observed poses of some groups.
+@dataclass(frozen=True)
+class Measured:
+    """Errors of the observed poses of bodies, by group.
+
+    Attributes:
+        errors: The errors; those of the rotations without unseen axes.
+        unseen: Bodies with rotations that the images do not show.
+    """
+
+    errors: dict[int, PoseErrors]
+    unseen: dict[int, Unseen]
+
+
+NOTHING = Measured({}, {})
+
+
+def measure(scene: Scene, dataset: datasets.Dataset, config: Config, groups: Collection[int], masked: bool) -> Measured:
+    """Return the errors of the observed poses of some groups, and the rotations that are not seen.
 
     Args:
         scene: The scene with the trained motion.
@@ -75,7 +101,7 @@ def measure(
         masked: True if the masks of the data set have the ids of the scene's objects.
 
     Returns:
-        The errors by group.
+        The errors.
 
     Raises:
         DatasetError: An image is missing or cannot be read.
@@ -104,9 +130,31 @@ def measure(
                     look = _look(scene, group, posed[view.t], view, truth, mine)
                     looks.setdefault((group, knot), []).append(look)
     usual, count = float(np.mean(misfits)) if misfits else 0.0, len(scene.tracks.times)
-    return {
-        g: _errors([looks.get((g, s), []) for s in range(count)], scene.groups[g].model.radius, usual) for g in groups
-    }
+    found: dict[int, PoseErrors] = {}
+    unseen: dict[int, Unseen] = {}
+    for g in groups:
+        mine = [looks.get((g, s), []) for s in range(count)]
+        axes = unseen_rotations.find(_surfaces(scene, g, mine))
+        if axes is not None:
+            unseen[g] = axes
+        found[g] = _errors(mine, scene.groups[g].model.radius, usual, scene.tracks.poses[g, :, :4], axes)
+    return Measured(found, unseen)
+
+
+def _surfaces(scene: Scene, group: int, looks: Sequence[Sequence[_BodyPixels]]) -> list[Surface]:
+    """Return the surface of a body at the knots that show it, from its pixels at each knot. [S]"""
+    rest = scene.gaussians.means[scene.gaussians.motion_ids == group].astype(np.float64)
+    pivot, found = scene.groups[group].pivot, []
+    for pose, own in zip(scene.tracks.poses[group], looks, strict=True):
+        if own:
+            center = pivot + rotations.rotate(pose[:4], np.median(rest, axis=0) - pivot) + pose[4:]
+            away = np.concatenate([look.points for look in own]) - center
+            directions = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+            colors = np.concatenate([look.colors for look in own])
+            planes = np.stack([look.plane for look in own])
+            moments = np.stack([look.moments * float(((look.eye - center) ** 2).sum()) for look in own])
+            found.append(Surface(directions, colors, planes, moments, pose[:4]))
+    return found
 
 
 def _moved(scene: Scene, groups: Collection[int], axis: int) -> Scene:
@@ -140,10 +188,12 @@ def _look(
     parts = [posed_scene.rows_of(frame, near) for frame in frames]
     region = np.asarray(region[rows, columns], bool)
     core = np.asarray(ndimage.binary_erosion(mine)[rows, columns], bool)
-    pictures = []
-    for part in parts:
-        mixed = posed_scene.with_moved(parts[0], part, own)
-        pictures.append(np.clip(scene_renderer.render_frame(scene, mixed, camera).color, 0, 1).astype(np.float64))
+    drawn = [scene_renderer.render_frame(scene, posed_scene.with_moved(parts[0], part, own), camera) for part in parts]
+    pictures = [np.clip(one.color, 0, 1).astype(np.float64) for one in drawn]
+    depths = np.asarray(drawn[0].depth, np.float64)[core]
+    rays = cameras.pixel_rays(camera)[core]
+    forward = camera.T_cam_world[2, :3]
+    eye = -camera.T_cam_world[:3, :3].T @ camera.T_cam_world[:3, 3]
     image = np.asarray(truth[rows, columns], np.float64)
     slopes = np.stack([(picture - pictures[0])[region].ravel() for picture in pictures[1:]], -1) / STEP
     inner = image[core] - (image[core].mean(0) if core.any() else 0.0)
@@ -153,16 +203,35 @@ def _look(
         float(((pictures[0] - image)[core] ** 2).sum()),
         float((inner**2).sum()),
         int(3 * core.sum()),
+        eye + rays * (depths / (rays @ forward))[:, None],
+        image[core],
+        eye,
+        *_outline(cameras.pixel_rays(camera)[mine[rows, columns]]),
     )
 
 
-def _errors(looks: Sequence[Sequence[_BodyPixels]], radius: float, usual: float) -> PoseErrors:
+def _outline(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two unit vectors perpendicular to the mean of some rays, and the second moments along them. [n, 3]"""
+    middle = rays.mean(0) / np.linalg.norm(rays.mean(0))
+    plane = np.linalg.svd(middle[None])[2][1:]
+    return plane, np.cov(rays @ plane.T / (rays @ middle)[:, None], rowvar=False)
+
+
+def _errors(
+    looks: Sequence[Sequence[_BodyPixels]],
+    radius: float,
+    usual: float,
+    quats: np.ndarray,
+    unseen: Unseen | None,
+) -> PoseErrors:
     """Return the errors of a body's poses.
 
     Args:
         looks: Its pixels in the views of each knot. S
         radius: Its radius, world units.
         usual: Squared misfit of a value anywhere in the images.
+        quats: Its rotations, unit wxyz. [S, 4]
+        unseen: Axes to leave out of the errors of its rotations.
     """
     variances, ratios = np.full((len(looks), 6), np.inf), []
     for s, own in enumerate(looks):
@@ -173,6 +242,10 @@ def _errors(looks: Sequence[Sequence[_BodyPixels]], radius: float, usual: float)
             scores = np.stack([look.slopes.T @ look.misses for look in own])
             variances[s] = misfit * np.diag(inverse)
             ratios.append(((inverse @ scores.T) ** 2).sum(1) / variances[s])
+            if unseen is not None and len(unseen.axes) == 1:
+                axis = rotations.rotate(quats[s], unseen.axes[0])
+                across = np.eye(3) - np.outer(axis, axis)
+                variances[s, :3] = 1.5 * misfit * np.diag(across @ inverse[:3, :3] @ across)  # of two axes
     every = [look for own in looks for look in own]
     inner, texture = sum(look.inner for look in every), sum(look.texture for look in every)
     blurred = inner > max(UNEXPLAINED * texture, LARGE**2 * usual * sum(look.values for look in every))
@@ -183,6 +256,13 @@ def _errors(looks: Sequence[Sequence[_BodyPixels]], radius: float, usual: float)
         deviation = np.where(np.isinf(deviation), deviation, UNKNOWN if lost else np.minimum(deviation, UNKNOWN))
         found.append(deviation)
     return PoseErrors(tuple((radius * found[0]).tolist()), tuple(found[1].tolist()))
+
+
+def with_unseen(errors: PoseErrors, unseen: Unseen) -> PoseErrors:
+    """Return the errors of all rotations, with `UNKNOWN` about unseen axes, for the scene file."""
+    turn, count = np.array(errors.turn), len(unseen.axes)
+    every = np.sqrt(((3 - count) * turn**2 + count * UNKNOWN**2) / 3) if count < 3 else UNKNOWN
+    return dataclasses.replace(errors, turn=tuple(np.where(np.isinf(turn), turn, every).tolist()))
 
 
 def weights(errors: PoseErrors, observed: np.ndarray, radius: float, turns: bool) -> np.ndarray:

@@ -17,7 +17,7 @@ Notation: G groups, S poses. Until `bind_state.rebind`, poses are relative to th
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,12 +26,12 @@ from scipy import stats
 
 from ..config.sections.needs import NeedsSection
 from ..motion import rotations
-from ..motion.history import PoseErrors
 from ..motion_fit import model_selection, shared_gravity
 from ..scene.scene import MotionGroup, Scene
-from . import bind_state, future_fit, image_evidence, needs, pose_errors, track_checks
+from . import bind_state, future_fit, image_evidence, needs, pose_errors, track_checks, unseen_rotations
 from .draft import Context, Draft, Need
 from .image_evidence import ImageEvidence
+from .unseen_rotations import Unseen
 
 LEVEL = 0.01  # significance level: probability of taking noise for motion
 LOSS = 0.03  # maximum loss of PSNR on the training views by all simplifications together, dB
@@ -126,11 +126,11 @@ def apply(draft: Draft, context: Context) -> Draft:
     """Simplify the motion of the scene by the evidence of the training images."""
     observed = np.stack([group.observed for group in draft.observed.motion.groups])
     evidence = image_evidence.gather(draft.scene, context.dataset, context.config)
-    errors: dict[int, PoseErrors] = {}
+    measured = pose_errors.NOTHING
     if evidence is not None:
         groups = [group.id for group in _moving(draft.scene)]
-        errors = pose_errors.measure(draft.scene, context.dataset, context.config, groups, not context.discovered)
-    found = simplify(draft.scene, observed, evidence, context.wanted, errors)
+        measured = pose_errors.measure(draft.scene, context.dataset, context.config, groups, not context.discovered)
+    found = simplify(draft.scene, observed, evidence, context.wanted, measured)
     return dataclasses.replace(draft, scene=found.scene, trained=draft.scene, parts=found.rows)
 
 
@@ -139,7 +139,7 @@ def simplify(
     observed: np.ndarray,
     evidence: ImageEvidence | None,
     wanted: NeedsSection | None = None,
-    errors: Mapping[int, PoseErrors] | None = None,
+    measured: pose_errors.Measured = pose_errors.NOTHING,
 ) -> Simplified:
     """Drop rotations, paths and bends that are noise, and fit the motion past t_max.
 
@@ -149,12 +149,13 @@ def simplify(
         evidence: The training images; None if they are missing. Then only motion below `needs.STILL` and `needs.TURN`
             is dropped.
         wanted: The user's overrides; parts that are "on" are kept.
-        errors: Errors of the observed poses of groups, if they are known.
+        measured: Errors of the observed poses of groups, and rotations that are not seen.
 
     Returns:
         The simplified scene. Groups that follow a body follow its simplified motion.
     """
-    wanted, errors = wanted or NeedsSection(), errors or {}
+    wanted = wanted or NeedsSection()
+    unseen = {} if wanted.rotation == "on" else measured.unseen
     names = {item.id: item.name for item in scene.objects}
     bodies = _moving(scene)
     parts = [part for g in bodies for part in _parts(scene, g.id, observed[g.id], evidence, wanted)]
@@ -165,13 +166,16 @@ def simplify(
     for g in bodies:
         mine = [part for part in parts if part.group == g.id]
         future = _future(bound.tracks.poses[g.id], mine)
+        if g.id in unseen:
+            future = _without_spin(bound, g.id, future, unseen[g.id])
         if np.any(future[:, 1:] != 0):
             track_checks.warn_of_aliasing(names[g.object_id], scene.tracks.times, future)
-            fits[g.id] = future_fit.fit(bound, g.id, observed[g.id], future, _noise(mine), errors.get(g.id))
+            fits[g.id] = future_fit.fit(bound, g.id, observed[g.id], future, _noise(mine), measured.errors.get(g.id))
             track_checks.warn_of_slips(names[g.object_id], fits[g.id][1].slips)
         description = future_fit.describe(fits[g.id][1] if g.id in fits else None)
         travel = float(np.linalg.norm(bound.tracks.poses[g.id, :, 4:], axis=1).max()) / (2 * g.model.radius)
         found = [_row(part, part in dropped, losses.get(id(part)), description, travel) for part in mine]
+        found += [_unseen_row(unseen[g.id])] if g.id in unseen else []
         rows += [{"object": names[g.object_id], **row} for row in found]
     shared = future_fit.share_gravity(fits, scene.world_convention)
     models = {index: fit.model for index, fit in shared.items()}
@@ -180,7 +184,10 @@ def simplify(
         if part.is_noise and part.group in models:
             models[part.group] = dataclasses.replace(models[part.group], **{part.kind.offset: np.zeros(3)})
     for index, model in models.items():
-        groups[index] = dataclasses.replace(groups[index], model=model, history=shared[index].history)
+        history = shared[index].history
+        if index in unseen and history.errors is not None:
+            history = dataclasses.replace(history, errors=pose_errors.with_unseen(history.errors, unseen[index]))
+        groups[index] = dataclasses.replace(groups[index], model=model, history=history)
     return Simplified(dataclasses.replace(bound, groups=tuple(groups)), tuple(rows))
 
 
@@ -306,6 +313,18 @@ def _future(poses: np.ndarray, parts: Sequence[_Simplification]) -> np.ndarray:
         elif part.is_noise:
             result[:, 4:] = part.poses[:, 4:] - part.poses[-1, 4:]
     return result
+
+
+def _without_spin(scene: Scene, group: int, poses: np.ndarray, unseen: Unseen) -> np.ndarray:
+    """Return the poses of a body without rotation about its unseen axes. [S, 7]"""
+    center = np.median(scene.gaussians.means[scene.gaussians.motion_ids == group].astype(np.float64), axis=0)
+    return unseen_rotations.without_spin(poses, unseen.axes, center - scene.groups[group].pivot)
+
+
+def _unseen_row(unseen: Unseen) -> dict[str, Any]:
+    """Row of the needs table for rotations that are not predicted because no image shows them."""
+    text = f"{unseen.text()}; share of the contrast that shade does not explain"
+    return Need("unseen_rotation", unseen.texture, unseen_rotations.TEXTURE, False, text).row()
 
 
 def _noise(parts: Sequence[_Simplification]) -> tuple[float, float]:

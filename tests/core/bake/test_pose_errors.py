@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.bake import pose_errors
+from r5dgs_core.bake.unseen_rotations import Unseen
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.motion.history import PoseErrors
@@ -39,7 +40,7 @@ def measured(monkeypatch, scene, data, noise=0.02, shown=None):
     monkeypatch.setattr(datasets, "load_image", image)
     monkeypatch.setattr(datasets, "load_mask", mask)
     bodies = [group.id for group in scene.groups if group.role == "body"]
-    return pose_errors.measure(scene, data, config.Config(), bodies, True)
+    return pose_errors.measure(scene, data, config.Config(), bodies, True).errors
 
 
 def test_errors_follow_the_misfit_and_are_infinite_at_knots_that_no_image_shows(monkeypatch, given):
@@ -88,3 +89,10 @@ def test_without_any_view_all_observed_poses_count_alike():
     assert pose_errors.drift(errors, np.array([True, False])) == (0, 0)
     exact = PoseErrors((0.0,) * 2, (0.0,) * 2)
     assert pose_errors.weights(exact, np.array([True, True]), 1.0, True).tolist() == [1, 1]
+
+
+def test_rotations_about_unseen_axes_are_stored_as_unknown():
+    errors = PoseErrors((0.1, 0.1), (0.01, np.inf))
+    some = pose_errors.with_unseen(errors, Unseen(np.eye(3)[:1], 0.1))
+    assert some.turn == pytest.approx((np.sqrt((2 * 0.01**2 + 1) / 3), np.inf)) and some.place == errors.place
+    assert pose_errors.with_unseen(errors, Unseen(np.eye(3), 0.1)).turn == (pose_errors.UNKNOWN, np.inf)
