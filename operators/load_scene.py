@@ -6,7 +6,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
 from ..r5dgs_addon import build_scene
-from ..r5dgs_addon.motion import keyframes, physics
+from ..r5dgs_addon.motion import keyframes, physics, warnings
 from ..r5dgs_addon.scene import loaded_scenes, viewport_display
 from ..r5dgs_addon.ui import plural, stepwise_operator
 from ..r5dgs_core import errors
@@ -146,6 +146,9 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             self.report(
                 {"WARNING"}, f"{path.name} contains only a background, no objects; train with masks to get objects"
             )
+        doubtful = warnings.lines(collection)
+        if doubtful:
+            self.report({"WARNING"}, plural.names(doubtful))
         too_fast = physics.too_fast(loaded_scenes.members(collection, "ANCHOR"))
         if too_fast:
             self.report({"WARNING"}, too_fast)

@@ -4,7 +4,7 @@ import bpy
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import models
-from ..motion import confidence_tubes, curve_place, duplicate_delete, physics, pivot
+from ..motion import confidence_tubes, curve_place, duplicate_delete, physics, pivot, warnings
 from ..scene import loaded_scenes, retiming
 from ..ui import status_bar
 from . import sidebar
@@ -116,8 +116,8 @@ def _physics(layout, anchor) -> None:
 
 def draw_warning(layout, anchor) -> None:
     """Draw a warning if the learned motion is not predictable."""
-    warning = physics.history(anchor).warning()
-    if warning and physics.band(anchor) is not None:
+    warning = warnings.of_anchor(anchor)
+    if warning:
         status_bar.wrapped(layout, bpy.context, warning.capitalize(), "ERROR")
 
 

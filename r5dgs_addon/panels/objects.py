@@ -2,6 +2,7 @@
 
 import bpy
 
+from ..motion import warnings
 from ..scene import isolation, loaded_scenes, object_names, object_tint
 from . import sidebar
 
@@ -26,6 +27,8 @@ class R5DGS_UL_objects(bpy.types.UIList):
         if not own:
             row.label(text="deleted")
             return
+        if warnings.of_object(item.id_data, item.object_id):
+            row.operator("r5dgs.explain_warning", text="", icon="ERROR", emboss=False).object_id = item.object_id
         count = row.row()
         count.alignment = "RIGHT"
         count.label(text=f"{sum(cloud.r5dgs.count for cloud in own):,}")

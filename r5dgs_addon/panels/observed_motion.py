@@ -1,4 +1,4 @@
-"""*Observed Motion* panel: segments and events of the active object up to the last observed time."""
+"""*Observed Motion* panel: segments, events and pose errors of the active object up to the last observed time."""
 
 import math
 
@@ -7,7 +7,7 @@ import numpy as np
 
 from ...r5dgs_core.motion import models
 from ...r5dgs_core.motion.history import Event, Segment
-from ..motion import duplicate_delete, extrapolate, motion_fields, physics
+from ..motion import duplicate_delete, extrapolate, motion_fields, physics, warnings
 from ..scene import timeline
 from . import motion, sidebar
 
@@ -15,7 +15,7 @@ _SLIGHT = 0.1  # change of the speed within a segment that is not shown, as a fr
 
 
 class R5DGS_PT_observed_motion(sidebar.Sidebar, bpy.types.Panel):
-    """Segments and events of the active object."""
+    """Segments, events and errors of the poses of the active object."""
 
     bl_idname = "R5DGS_PT_observed_motion"
     bl_parent_id = motion.R5DGS_PT_motion.bl_idname
@@ -25,7 +25,7 @@ class R5DGS_PT_observed_motion(sidebar.Sidebar, bpy.types.Panel):
     @classmethod
     def poll(cls, context):
         anchor = duplicate_delete.active_anchor(context)
-        return anchor is not None and bool(physics.history(anchor).segments)
+        return anchor is not None and bool(physics.history(anchor).segments or warnings.errors_of_poses(anchor))
 
     def draw(self, context):
         anchor = duplicate_delete.active_anchor(context)
@@ -38,6 +38,11 @@ class R5DGS_PT_observed_motion(sidebar.Sidebar, bpy.types.Panel):
                 column.label(text=line, icon="BLANK1")
             if number < len(found.events):
                 self.layout.label(text=_event(found.events[number], times), icon="MARKER")
+        errors = warnings.errors_of_poses(anchor)
+        if errors:
+            column = self.layout.column(align=True)
+            for line in errors:
+                column.label(text=line, icon="DRIVER_DISTANCE")
         motion.draw_warning(self.layout, anchor)
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r5dgs_core.motion.history import Band, Event, History, Segment
+from r5dgs_core.motion.history import Band, Event, History, PoseErrors, Segment
 from r5dgs_core.scene import scene_file
 from tests.support import layouts, motions, scenes
 
@@ -159,6 +159,34 @@ def test_the_panel_lists_segments_and_events_and_warns_until_the_motion_is_edite
     mug.r5dgs_motion.velocity = (5, 0, 0)
     assert "Not predictable" not in str(layouts.draw(blender, panel))
     assert layouts.draw(blender, observed) == expected
+
+
+def test_the_list_of_objects_and_loading_warn_of_motion_that_is_not_predictable(blender, scene_path, capfd):
+    collection = motions.load(blender, scene_path)
+    assert "mug: not predictable past 0.95 (hit at 0.50)" in capfd.readouterr().out
+    lists = motions.addon("panels.objects")
+    texts = {}
+    for entry in collection.r5dgs.table:
+        said = texts.setdefault(entry.label, [])
+        layout = layouts.Layout(blender, said)
+        lists.R5DGS_UL_objects.draw_item(None, blender.context, layout, None, entry, 0, None, "")
+    assert [name for name, said in texts.items() if "r5dgs.explain_warning" in said] == ["mug"]
+    mug = next(entry.object_id for entry in collection.r5dgs.table if entry.label == "mug")
+    assert blender.ops.r5dgs.explain_warning(object_id=mug) == {"FINISHED"}
+    blender.data.objects["mug anchor"].r5dgs_motion.velocity = (5, 0, 0)
+    assert blender.ops.r5dgs.explain_warning(object_id=mug) == {"CANCELLED"}
+
+
+def test_the_panel_shows_the_errors_of_the_observed_poses(blender, tmp_path):
+    made = scenes.make_scene(n=300, objects=3, seed=1)
+    errors = History(errors=PoseErrors((0.01, 0.01, 0.02), (0.01, 0.02, np.inf)))
+    groups = (made.groups[0], dataclasses.replace(made.groups[1], history=errors), *made.groups[2:])
+    motions.load(blender, scene_file.write(dataclasses.replace(made, groups=groups), tmp_path / "scene.r5dgs"))
+    motions.choose(blender, blender.data.objects["mug anchor"])
+    panel = motions.addon("panels.observed_motion").R5DGS_PT_observed_motion
+    assert panel.poll(blender.context)
+    shown = layouts.draw(blender, panel)
+    assert shown[0] == "Rotation error: 0.86°, worst 1.1°" and shown[1].startswith("Position error: ")
 
 
 def test_an_object_without_events_has_no_panel_of_segments(blender, loaded):
