@@ -81,15 +81,20 @@ def measure(
         for mode, move in plan.items():
             found = evaluate.measure_views(scene, views, move, backend=backend, measured=count)
             missing |= dict.fromkeys(kind for kind in KINDS if found[kind] is None)
-            label: dict[str, Any] = {"mode": mode, "method": "playback"}
-            if mode == ORACLE:  # not a selectable method, so neither timed nor on the Pareto front
-                label = {"mode": "rigid", "method": ORACLE, "note": TRUE_POSES}
             errors = {f"{kind}{name}": found[kind] for kind in KINDS if found[kind] is not None}
-            shared = {"task": "images", "setting": split, "count": found["images"], **label, **times.get(mode, {})}
+            shared = {"task": "images", "setting": split, "count": found["images"]}
+            shared |= _label(mode) | times.get(mode, {})
             rows += [Row(error_kind=kind, error=float(error), **shared) for kind, error in errors.items()]
     if missing:
         absent.append(f"images: not computed: {', '.join(missing)} (requirements: docs/reference/evaluation.md)")
     return rows, absent
+
+
+def _label(mode: str) -> dict[str, Any]:
+    """Columns that name a mode, or the true poses."""
+    if mode == ORACLE:  # not a selectable method, so neither timed nor on the Pareto front
+        return {"mode": "rigid", "method": ORACLE, "note": TRUE_POSES}
+    return {"mode": mode, "method": "playback"}
 
 
 def _plans(

@@ -89,10 +89,15 @@ def run_objects(
         if outlook is not None:
             console.print(outlook)
     if legend is not None and viewpoint is not None:
-        from ...data import images
-        from ...evaluation import legend as legends
-
-        images.write_png(legend, legends.draw(scene, viewpoint, mode, longest=size))
-        if not as_json:
-            print(f"written: {legend} (camera {viewpoint.camera.name}, t = {viewpoint.t:g})")
+        _draw_legend(legend, scene, viewpoint, mode, size, quiet=as_json)
     return result
+
+
+def _draw_legend(path: Path, scene: Any, viewpoint: Any, mode: str, size: int | None, *, quiet: bool) -> None:
+    """Write the picture of the labelled scene, and print its path unless ``quiet``."""
+    from ...data import images
+    from ...evaluation import legend
+
+    images.write_png(path, legend.draw(scene, viewpoint, mode, longest=size))
+    if not quiet:
+        print(f"written: {path} (camera {viewpoint.camera.name}, t = {viewpoint.t:g})")
