@@ -150,9 +150,9 @@ def test_bad_input_raises_with_a_remedy_and_changes_nothing(saved, bad, kind):
 WITHOUT_A_SCENE = {
     "Load an R5DGS scene first": (
         "add_alias", "add_crop_box", "allow_scene_file", "assign_gaussians", "delete_gaussians", "exact_mode",
-        "export_format", "export_masks", "export_ply", "export_scene", "extrapolate_until", "fit_timeline", "isolate",
-        "merge_with_meshes", "preview", "remove_alias", "rename_object", "retime", "select_by_prompt",
-        "select_floaters", "select_gaussians", "select_object", "set_display",
+        "explain_warning", "export_format", "export_masks", "export_ply", "export_scene", "extrapolate_until",
+        "fit_timeline", "isolate", "merge_with_meshes", "preview", "remove_alias", "rename_object", "retime",
+        "select_by_prompt", "select_floaters", "select_gaussians", "select_object", "set_display",
         "show_captured_images", "show_confidence", "use_captured_camera", "view_as_trained", "viewport_render",
     ),
     "Select an object of an R5DGS scene first": (
@@ -168,7 +168,8 @@ WITHOUT_A_SCENE = {
     "Use this in a 3D view": ("brush_gaussians", "lasso_gaussians"),
 }  # fmt: skip
 NEEDING_NONE = {
-    "capture_dataset", "check_worker", "export_cameras", "load_scene", "show_colors_as_trained", "use_engine",
+    "capture_dataset", "check_worker", "export_cameras", "load_scene", "open_manual", "show_colors_as_trained",
+    "use_engine",
 }  # fmt: skip
 
 
