@@ -7,7 +7,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
 from ..r5dgs_addon import build_scene
 from ..r5dgs_addon.motion import keyframes, physics, warnings
-from ..r5dgs_addon.scene import loaded_scenes, viewport_display
+from ..r5dgs_addon.scene import captured_images, loaded_scenes, timeline, viewport_display
 from ..r5dgs_addon.ui import plural, stepwise_operator
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import scene_file
@@ -33,6 +33,7 @@ OPTIONS = (
     "fit_timeline",
     "frame_views",
     "cameras",
+    "images",
     "sh_degree",
     "display",
     "bend",
@@ -83,6 +84,12 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         name="Captured Cameras",
         description="Create the data set's cameras, and use the best one unless this file uses a camera of its own",
         default=True,
+    )
+    images: StringProperty(
+        name="Captured Images",
+        description="Folder of the data set whose images captured cameras show as backgrounds; empty for none",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
     )
     display: EnumProperty(
         name="Display",
@@ -138,6 +145,12 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
+        if self.images and self.cameras and scene.cameras:
+            t = timeline.of_collection(collection).time(context.scene.frame_current_final)
+            try:
+                captured_images.show(collection, Path(bpy.path.abspath(self.images)), t)
+            except errors.R5dgsError as error:
+                self.report({"WARNING"}, str(error))
         named = sum(entry.object_id > 0 for entry in collection.r5dgs.table)
         self.report(
             {"INFO"}, f"{path.name}: {plural.of(len(scene.gaussians.means), 'Gaussian')}, {plural.of(named, 'object')}"

@@ -109,3 +109,11 @@ def test_images_are_found_by_the_names_of_files_and_folders(blender, captured, t
     for other, message in ((tmp_path / "empty", "found none"), (tmp_path, "found no image of a captured camera")):
         with pytest.raises(RuntimeError, match=message):
             blender.ops.r5dgs.show_captured_images(directory=str(other))
+
+
+def test_loading_shows_the_captured_images_on_demand(blender, captured, tmp_path):
+    path, folder = scene_file.write(captured, tmp_path / "scene.r5dgs"), tmp_path / "data"
+    png(folder / "images" / "upright.png", 1)
+    collection = motions.load(blender, path, images=str(folder))
+    assert shown(collection.children["Cameras"]) == {"upright": ["upright.png"]}
+    assert motions.load(blender, path, images=str(tmp_path / "missing")).r5dgs.is_scene  # a warning, not an error
