@@ -1,9 +1,10 @@
 """Shadows between Gaussians and merged meshes: proxies of the Gaussians, rendered by Cycles.
 
-The scene of the meshes gets a collection of proxies: the convex hull of each object of Gaussians, which follows the
-object's anchor, and the visible surface of the background. In the first view layer the proxies are invisible to the
-camera and cast shadows on the meshes. In a second view layer they are shadow catchers, the meshes are invisible to the
-camera, and the pass *Shadow Catcher* is the factor by which the meshes darken the Gaussians.
+The scene of the meshes gets a collection of proxies: the convex hull of each body of Gaussians, stored in the scene
+file or computed here, which follows the body's anchor, and the visible surface of the background. In the first view
+layer the proxies are invisible to the camera and cast shadows on the meshes. In a second view layer they are shadow
+catchers, the meshes are invisible to the camera, and the pass *Shadow Catcher* is the factor by which the meshes
+darken the Gaussians.
 """
 
 from collections.abc import Sequence
