@@ -2,6 +2,8 @@
 
     python -m benchmarks.futures accuracy [--draws 20] [--noise white ...] [--motions NAME ...] [--json FILE]
 
+A long run can be split: write parts with --tracks, and tabulate them with --merge.
+
 Tracks of 15 poses on [0, 0.75] are drawn by `simulated_motions` and fitted by `model_selection.fit`. Columns:
 
     error      median error at t = 1 over a ball of the body's radius, in % of the body's size; 90 % quantile
@@ -10,9 +12,16 @@ Tracks of 15 poses on [0, 0.75] are drawn by `simulated_motions` and fitted by `
     holds      share of the later times at which the error is inside the 95 % band
     width      median half width of the band at t = 1, in % of the body's size
     flagged    share of tracks reported as not predictable up to t = 1
-    events     share of tracks with an event; of those with true events, share found within one step; share of the
-               jumps above five noise sigmas that were found
+    event      share of tracks with an event
+    found      share of the true events that were found within one time step
+    big        the same for those with velocity jumps above five standard deviations of a velocity between neighbours
+    surplus    found events without a true event within one time step, per track
+    slip       share of tracks with a slipped rotation
     ms         processor time per track
+
+The totals of a noise are: tracks; errors inside the band; failures (error above 20 % of the size), the share of them
+that is flagged, and the share of the other tracks that is flagged; found events, big and all; surplus events per track;
+and the share of tracks without true events in which an event was found.
 """
 
 from __future__ import annotations
@@ -77,10 +86,9 @@ def measure(name: str, noise: simulated.Noise, seed: int) -> dict[str, Any]:
     half = 50 / simulated.RADIUS * band.widths(track.later)
     step = track.times[1] - track.times[0]
     found = [event.time for event in fit.history.events]
-    times = [event for event in track.motion.events if event < track.times[-1]]
-    last = max(times, default=None)
-    near = last is not None and any(abs(event - last) <= step for event in found)
+    true = [event for event in track.motion.events if event < track.times[-1]]
     sigma = 2 * simulated.RADIUS * noise.place / step  # of a velocity between neighbouring poses
+    big = track.motion.jump > 5 * sigma
     return {
         "error": float(error[-1]),
         "line": line(track),
@@ -88,12 +96,22 @@ def measure(name: str, noise: simulated.Noise, seed: int) -> dict[str, Any]:
         "inside": float((error <= half).mean()),
         "width": float(half[-1]),
         "flagged": band.predictable_until is not None and bool(band.predictable_until < track.later[-1]),
+        "widest": float(half.max()),
         "event": bool(found),
-        "near": near if times else None,
-        "recalled": near if times and track.motion.jump > 5 * sigma else None,
+        "true": len(true),
+        "found": sum(any(abs(time - event) <= step for time in found) for event in true),
+        "big": len(true) if big else 0,
+        "surplus": sum(all(abs(time - event) > step for event in true) for time in found),
+        "slip": bool(fit.slips),
         "chosen": fit.chosen,
         "ms": spent,
     }
+
+
+def _recall(found: list[dict[str, Any]]) -> float:
+    """Share of true events that were found; NaN without any."""
+    true = sum(row["true"] for row in found)
+    return sum(row["found"] for row in found) / true if true else float("nan")
 
 
 def summary(name: str, noise: str, found: list[dict[str, Any]]) -> dict[str, Any]:
@@ -118,8 +136,10 @@ def summary(name: str, noise: str, found: list[dict[str, Any]]) -> dict[str, Any
         "width": quantile("width"),
         "flagged": share("flagged"),
         "event": share("event"),
-        "near": share("near"),
-        "recalled": share("recalled"),
+        "found": _recall(found),
+        "big": _recall([row for row in found if row["big"]]),
+        "surplus": share("surplus"),
+        "slip": share("slip"),
         "ms": quantile("ms"),
         "chosen": {str(names[i]): int(counts[i]) for i in np.argsort(-counts)[:4]},
     }
@@ -127,7 +147,7 @@ def summary(name: str, noise: str, found: list[dict[str, Any]]) -> dict[str, Any
 
 HEAD = (
     f"{'noise':10} {'motion':28} {'error (90 %)':>14} {'line':>6} {'still':>6} {'holds':>5} {'width':>6} "
-    f"{'flag':>5} {'event':>5} {'near':>5} {'big':>5} {'ms':>5}  chosen"
+    f"{'flag':>5} {'event':>5} {'found':>5} {'big':>5} {'more':>5} {'slip':>5} {'ms':>5}  chosen"
 )
 
 
@@ -135,21 +155,26 @@ def text(row: dict[str, Any]) -> str:
     """Row as a line of the table."""
     return (
         "{noise:10} {motion:28} {error:6.1f} ({error_90:5.1f}) {line:6.1f} {still:6.1f} {holds:5.2f} {width:6.1f} "
-        "{flagged:5.2f} {event:5.2f} {near:5.2f} {recalled:5.2f} {ms:5.0f}  ".format(**row)
+        "{flagged:5.2f} {event:5.2f} {found:5.2f} {big:5.2f} {surplus:5.2f} {slip:5.2f} {ms:5.0f}  ".format(**row)
         + ", ".join(f"{name} {count}" for name, count in row["chosen"].items())
     )
 
 
 def overall(found: list[dict[str, Any]]) -> dict[str, float]:
-    """Coverage, and the quality of the flag, over all tracks of a noise."""
+    """Coverage, quality of the flag, and found events, over all tracks of a noise."""
     bad = [row["flagged"] for row in found if row["error"] > BAD]
     good = [row["flagged"] for row in found if row["error"] <= BAD]
+    smooth = [row["event"] for row in found if row["true"] == 0]
     return {
         "tracks": len(found),
         "holds": float(np.mean([row["inside"] for row in found])),
         "failures": len(bad),
         "failures_flagged": float(np.mean(bad)) if bad else float("nan"),
         "false_alarms": float(np.mean(good)) if good else float("nan"),
+        "big_events_found": _recall([row for row in found if row["big"]]),
+        "events_found": _recall(found),
+        "surplus_events": float(np.mean([row["surplus"] for row in found])),
+        "smooth_with_event": float(np.mean(smooth)) if smooth else float("nan"),
     }
 
 
@@ -161,21 +186,32 @@ def main() -> None:
     parser.add_argument("--noise", nargs="+", choices=list(simulated.NOISES), default=["white"])
     parser.add_argument("--motions", nargs="+", choices=list(simulated.MOTIONS), default=list(simulated.MOTIONS))
     parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--tracks", type=Path, metavar="FILE", help="write the results of all tracks, as JSON")
+    parser.add_argument("--merge", type=Path, nargs="+", metavar="FILE", help="tabulate files of --tracks instead")
     options = parser.parse_args()
-    rows, totals = [], {}
+    rows, totals, tracks = [], {}, []
+    merged = [track for path in options.merge or () for track in json.loads(path.read_text())]
     print(HEAD)
     for noise in options.noise:
         everything = []
         for name in options.motions:
             seeds = range(options.first, options.first + options.draws)
-            found = [measure(name, simulated.NOISES[noise], seed) for seed in seeds]
-            rows.append(summary(name, noise, found))
+            if options.merge:
+                found = [track for track in merged if (track["noise"], track["motion"]) == (noise, name)]
+            else:
+                found = [measure(name, simulated.NOISES[noise], seed) for seed in seeds]
+            if not found:
+                continue
+            rows.append({"draws": len(found), **summary(name, noise, found)})
             everything += found
             print(text(rows[-1]), flush=True)
+            tracks += [{**row, "noise": noise, "motion": name} for row in found]
         totals[noise] = overall(everything)
         print(noise, {key: round(value, 3) for key, value in totals[noise].items()}, flush=True)
+    if options.tracks:
+        options.tracks.write_text(json.dumps(tracks) + "\n")
     if options.json:
-        options.json.write_text(json.dumps({"draws": options.draws, "rows": rows, "totals": totals}, indent=1) + "\n")
+        options.json.write_text(json.dumps({"rows": rows, "totals": totals}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ UP_AXIS = {"blender": np.array([0.0, 0.0, 1.0]), "opengl": np.array([0.0, 1.0, 0
 
 
 def share_gravity(
-    fits: dict[int, tuple[shared_gravity.Track, model_selection.Fit]], convention: str
+    fits: dict[int, tuple[shared_gravity.BodyTrack, model_selection.Fit]], convention: str
 ) -> dict[int, model_selection.Fit]:
     """Return the fits, with one common acceleration for bodies that fall alike.
 
@@ -29,7 +29,9 @@ def share_gravity(
     """
     shared = [fit for _, fit in fits.values()]
     if convention in UP_AXIS and fits:
-        shared, _ = shared_gravity.share([track for track, _ in fits.values()], shared, UP_AXIS[convention])
+        shared, _ = shared_gravity.share_acceleration(
+            [track for track, _ in fits.values()], shared, UP_AXIS[convention]
+        )
     return dict(zip(fits, shared, strict=True))
 
 
@@ -40,7 +42,7 @@ def fit(
     poses: np.ndarray,
     noise: tuple[float, float],
     errors: PoseErrors | None,
-) -> tuple[shared_gravity.Track, model_selection.Fit]:
+) -> tuple[shared_gravity.BodyTrack, model_selection.Fit]:
     """Fit a body's motion past t_max and return its track and the fit.
 
     ``noise`` holds lower bounds of the noise of displacements and of rotations.
@@ -52,7 +54,7 @@ def fit(
     weights, drift = observed.astype(np.float64), (0.0, 0.0)
     if errors is not None:
         weights, drift = pose_errors.weights(errors, observed, radius, turns), pose_errors.drift(errors, observed)
-    track = shared_gravity.Track(scene.tracks.times, poses[:, :4], poses[:, 4:], weights)
+    track = shared_gravity.BodyTrack(scene.tracks.times, poses[:, :4], poses[:, 4:], weights)
     found = model_selection.fit(
         track.times,
         track.quats,

@@ -162,7 +162,7 @@ def simplify(
     dropped, losses = _affordable(scene, [part for part in parts if part.is_noise], evidence)
     bound = bind_state.rebind(scene, _with_parts(scene, dropped))
     rows: list[dict[str, Any]] = []
-    fits: dict[int, tuple[shared_gravity.Track, model_selection.Fit]] = {}
+    fits: dict[int, tuple[shared_gravity.BodyTrack, model_selection.Fit]] = {}
     for g in bodies:
         mine = [part for part in parts if part.group == g.id]
         future = _future(bound.tracks.poses[g.id], mine)

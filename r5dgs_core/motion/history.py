@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from .models import VECTORS
+
 EVENTS = ("start", "stop", "impact", "change")
 MOST_KNOTS = 16
 UNKNOWN_TURN = 1.0  # standard deviation of a rotation that the images do not determine, rad
-_RATES = {"velocity": True, "acceleration": True, "angular_velocity": False}  # True for rates that scale with the scene
 _DONE = {"start": "set off", "stop": "stopped", "impact": "hit", "change": "changed"}
 
 
@@ -41,7 +42,9 @@ class Segment:
     Attributes:
         start, stop: Scene times.
         kind: Kind of the motion, "static" for rest.
-        parameters: "velocity", "acceleration" and "angular_velocity" at its end, world frame. [3] each
+        parameters: "velocity", "acceleration" and "angular_velocity" at its end, world frame, and those of the further
+            fields of `MotionModel` that are known and not zero: constants such as "damping" [1], and in the last
+            segment all fields of its kind, at t_max. [3] or [1] each
     """
 
     start: float
@@ -52,7 +55,9 @@ class Segment:
     def transformed(self, turn: np.ndarray, scale: float) -> Segment:
         """Segment after a similarity of the world, see `MotionModel.transformed`."""
         found = {
-            name: tuple(((scale if _RATES[name] else 1.0) * turn @ np.array(value)).tolist())
+            name: tuple(((scale if VECTORS[name].is_length else 1.0) * turn @ np.array(value)).tolist())
+            if name in VECTORS
+            else value
             for name, value in self.parameters.items()
         }
         return replace(self, parameters=found)

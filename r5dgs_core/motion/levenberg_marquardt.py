@@ -63,9 +63,33 @@ def solve(
     return solve_all(lambda x, _: residuals(x[0])[None], start[None], **options).row(0)
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+Linearized = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Function from parameters [L, P] and the starts [L] that they belong to, to residuals and derivatives."""
+
+
 def solve_all(
-    residuals: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    residuals: Callable[[np.ndarray, np.ndarray], np.ndarray], starts: np.ndarray, **options: Any
+) -> Solution:
+    """Minimise weighted sums of squared residuals from several starts, with forward differences.
+
+    Args:
+        residuals: Function from parameters [L, K, P] and the starts [L] that they belong to, to residuals
+            [L, K, S, D]. Each step calls it once, with P + 1 parameter vectors per start.
+        starts: Initial guesses, with finite residuals. [B, P]
+        options: Those of `solve_linearized`.
+    """
+    nudges = _DIFFERENCE * np.eye(starts.shape[1] + 1, starts.shape[1], -1)
+
+    def linearized(x: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        batch = residuals(x[:, None] + nudges, rows)
+        return batch[:, 0], (batch[:, 1:] - batch[:, :1]) / _DIFFERENCE
+
+    return solve_linearized(linearized, starts, **options)
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def solve_linearized(
+    linearized: Linearized,
     starts: np.ndarray,
     *,
     weights: np.ndarray | None = None,
@@ -79,29 +103,27 @@ def solve_all(
     """Minimise weighted sums of squared residuals from several starts, whose problems may differ.
 
     Args:
-        residuals: Function from parameters [L, K, P] and the starts [L] that they belong to, to residuals
-            [L, K, S, D]. Parameters and residuals should be of order one, residuals in units of their noise. Steps to
-            residuals that are not finite are rejected.
+        linearized: Function from parameters [L, P] and the starts [L] that they belong to, to residuals [L, S, D] and
+            their derivatives [L, P, S, D]. Parameters and residuals should be of order one, residuals in units of their
+            noise. Steps to residuals that are not finite are rejected.
         starts: Initial guesses, with finite residuals. [B, P]
         weights: Weights of the observations, > 0, or None for equal ones. [S]
         precision: Inverse standard deviations of the parameters about 0, for a Gaussian prior; None for no prior. [P]
         softness: Squared length of the residuals of an observation at which its weight is one half; infinite for least
             squares.
-        steps: Maximum number of steps. Each calls ``residuals`` once, with P + 1 parameter vectors per start.
+        steps: Maximum number of steps. Each calls ``linearized`` once.
         enough: Predicted gain below which a start is finished.
         hopeless: Cost above which a start is also finished if its next step would hardly reduce the residuals.
         behind: The same, as excess over the cost of the best start.
 
-    Source: Marquardt 1963, with damping relative to the diagonal of the normal matrix and forward differences. The
-        damping follows the ratio of actual to predicted gain (Nielsen 1999). Robust fits reweight inside each step,
-        with Cauchy weights.
+    Source: Marquardt 1963, with damping relative to the diagonal of the normal matrix. The damping follows the ratio of
+        actual to predicted gain (Nielsen 1999). Robust fits reweight inside each step, with Cauchy weights.
     """
     count, size = starts.shape
     base = np.ones(1) if weights is None else weights
     prior = np.zeros(size) if precision is None else precision**2
-    nudges = _DIFFERENCE * np.eye(size + 1, size, -1)
     problem = _Problem(base, prior, softness)
-    point = problem.linearize(starts, residuals(starts[:, None] + nudges, np.arange(count)))
+    point = problem.expand(starts, *linearized(starts, np.arange(count)))
     damping, growth, live = np.full(count, _FIRST_DAMPING), np.full(count, 2.0), np.arange(count)
     for number in range(steps):
         diagonal = np.einsum("bii->bi", point.normal[live])
@@ -117,7 +139,7 @@ def solve_all(
         if len(live) == 0:
             break
         x = point.x[live] + step
-        trial = problem.linearize(x, residuals(x[:, None] + nudges, live))
+        trial = problem.expand(x, *linearized(x, live))
         ratio = (point.cost[live] - trial.cost) / gain
         better = (ratio >= 0) & np.isfinite(trial.normal).all((1, 2)) & np.isfinite(trial.gradient).all(1)
         good = live[better]
@@ -146,14 +168,13 @@ class _Problem:
         squares = (self.base * point.robust[live] * (point.residuals[live] ** 2).sum(-1)).sum(-1)
         return (point.cost[live] > limit) & (gain < _STALLING * squares)
 
-    def linearize(self, x: np.ndarray, batch: np.ndarray) -> Solution:
-        """Normal equations at x [B, P] from the residuals there and at their neighbours. batch: [B, P + 1, S, D]"""
-        values = batch[:, 0]
+    def expand(self, x: np.ndarray, values: np.ndarray, slopes: np.ndarray) -> Solution:
+        """Normal equations at x [B, P] from the residuals [B, S, D] there and their derivatives [B, P, S, D]."""
         squares = (values**2).sum(-1)
         robust = robust_weights.cauchy_weights(squares, self.softness)
         losses = robust_weights.cauchy_losses(squares, self.softness)
         root = np.sqrt(self.base * robust)[..., None]
-        jacobian = ((batch[:, 1:] - values[:, None]) / _DIFFERENCE * root[:, None]).reshape(*x.shape, -1)
+        jacobian = (slopes * root[:, None]).reshape(*x.shape, -1)
         weighted = (root * values).reshape(len(x), -1, 1)
         return Solution(
             x.copy(),

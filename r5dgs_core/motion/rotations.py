@@ -106,6 +106,14 @@ def cross(a: Array, b: Array) -> Array:
     return xp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
 
 
+def skew(vectors: np.ndarray) -> np.ndarray:
+    """Matrices [v]_x of the cross products v x. [..., 3] -> [..., 3, 3]"""
+    matrices = np.zeros((*vectors.shape[:-1], 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        matrices[..., j, i], matrices[..., i, j] = vectors[..., k], -vectors[..., k]
+    return matrices
+
+
 def normalize(quats: Array) -> Array:
     """Normalise quaternions; the zero quaternion becomes the identity. [..., 4]"""
     xp = array_namespace(quats)
@@ -128,6 +136,14 @@ def multiply(p: Array, q: Array) -> Array:
     xp = array_namespace(p, q)
     pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    if xp is np:
+        w = pw * qw - px * qx - py * qy - pz * qz
+        product = np.empty((*w.shape, 4), w.dtype)
+        product[..., 0] = w
+        product[..., 1] = pw * qx + px * qw + py * qz - pz * qy
+        product[..., 2] = pw * qy - px * qz + py * qw + pz * qx
+        product[..., 3] = pw * qz + px * qy - py * qx + pz * qw
+        return product
     return xp.stack(
         [
             pw * qw - px * qx - py * qy - pz * qz,
@@ -149,6 +165,14 @@ def rotate(quats: Array, vectors: Array) -> Array:
 def rotvecs_to_quats(rotvecs: Array) -> Array:
     """Exponential map, rotation vectors to unit quaternions; zero gives exactly (1, 0, 0, 0). [..., 3] -> [..., 4]"""
     xp = array_namespace(rotvecs)
+    if xp is np:
+        half = 0.5 * np.sqrt(np.einsum("...i,...i->...", rotvecs, rotvecs))
+        quats = np.empty((*rotvecs.shape[:-1], 4), half.dtype)
+        np.cos(half, out=quats[..., 0])
+        safe = np.where(half > 0, half, 1.0)
+        ratio = np.where(half > 0, np.sin(safe) / safe, 1.0)
+        np.multiply(rotvecs, (0.5 * ratio)[..., None], out=quats[..., 1:], casting="same_kind")
+        return quats
     quarter = 0.25 * (rotvecs * rotvecs).sum(-1)[..., None]
     return xp.concatenate([cosine(quarter), 0.5 * sine_ratio(quarter) * rotvecs], -1)
 
@@ -156,6 +180,14 @@ def rotvecs_to_quats(rotvecs: Array) -> Array:
 def quats_to_rotvecs(quats: Array) -> Array:
     """Logarithm map, unit quaternions to rotation vectors of angle at most pi. [..., 4] -> [..., 3]"""
     xp = array_namespace(quats)
+    if xp is np:  # only gradients need the series
+        w, vec = quats[..., 0], quats[..., 1:]
+        norm = np.sqrt(np.einsum("...i,...i->...", vec, vec))
+        size = np.abs(w)
+        tiny = norm < 1e-30
+        ratio = 2 * np.arctan2(norm, size) / np.where(tiny, 1.0, norm)
+        ratio = np.where(tiny, 2 / np.where(tiny, size, 1.0), ratio)
+        return vec * np.where(w < 0, -ratio, ratio)[..., None]
     flipped = xp.where(quats[..., :1] < 0, -quats, quats)
     w, vec = flipped[..., :1], flipped[..., 1:]
     norm2 = (vec * vec).sum(-1)[..., None]

@@ -8,14 +8,14 @@ import numpy as np
 
 from ..motion.pose_track import PoseTrack
 from . import candidates as families
-from .candidates import Noise, Solution
+from .candidates import FittedCandidate, Noise
 
 HELD_OUT = 0.2  # share of the last poses that are predicted
 _FEWEST = 8  # minimum number of poses of a track for this test
 _MOST_SQUARE = 600.0  # maximum squared prediction error, in variances
 
 
-def relative_error(chosen: Solution, track: PoseTrack, noise: Noise, variance: float) -> float:
+def relative_error(chosen: FittedCandidate, track: PoseTrack, noise: Noise, variance: float) -> float:
     """Mean squared error, relative to its expectation, of predictions by the law refitted to earlier poses.
 
     The expected squared error is the variance of the noise plus that of the refitted prediction, both in units of
@@ -25,7 +25,7 @@ def relative_error(chosen: Solution, track: PoseTrack, noise: Noise, variance: f
     if count < _FEWEST:
         return 1.0
     shares = []
-    most = count - chosen.candidate.last_choice  # maximum number of poses to leave out
+    most = count - chosen.candidate.poses_with_choices  # maximum number of poses to leave out
     for held in sorted({1, max(3, math.ceil(HELD_OUT * count)), count // 3}):
         if chosen.parameters > 4 * (count - held) or held > most:
             continue

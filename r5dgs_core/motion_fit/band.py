@@ -15,13 +15,14 @@ import numpy as np
 from ..motion import rotations, se3
 from ..motion.history import MOST_KNOTS, Band
 from . import backtest
-from .candidates import Noise, Solution
-from .evidence import Evidence
+from .candidates import FittedCandidate, Noise
 from .fitted_motion import fade_time
+from .model_scores import NoiseLevel
 from .search import Selected
 
 LEVEL = 0.95
 WIDE = 0.7  # half width above which a motion is not predictable, in radii
+_SOON = 1 / 3  # time past t_max, in spans
 _MULTIPLE = 1.4  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
 _DRIFT = 5.0  # drift of a track over its span, in units of the lower bound of its noise
 _LINE = math.sqrt(12.0)  # drift at a constant rate over the span, in standard deviations
@@ -30,7 +31,7 @@ _FARTHEST = 8.0  # maximum counted distance of another candidate, in radii
 _MOST_SCALE = 36.0  # maximum factor on the covariance from the errors of earlier predictions
 
 
-def slow(least: Noise, deviations: Noise) -> Noise:
+def drift_noise(least: Noise, deviations: Noise) -> Noise:
     """Drift of a track over its span, from the lower bound of its noise and standard deviations due to drift."""
     return Noise(
         max(_DRIFT * least.place, _LINE * deviations.place),
@@ -38,20 +39,20 @@ def slow(least: Noise, deviations: Noise) -> Noise:
     )
 
 
-def of(selected: Selected, variance: float, drift: Noise) -> Widths:
+def confidence_band(selected: Selected, variance: float, drift: Noise) -> Widths:
     """Band of the chosen solution, up to one observed span past t_max.
 
     Args:
         selected: Result of the selection.
-        variance: Factor of the parameters' covariance, from `evidence.variance`.
+        variance: Factor of the parameters' covariance, from `model_scores.covariance_factor`.
         drift: Drift of the track over its span.
     """
     tau = np.linspace(0.0, 1.0, MOST_KNOTS)
-    chosen, evidence, noise = selected.chosen, selected.evidence, selected.noise
+    chosen, noise_level, noise = selected.chosen, selected.noise_level, selected.noise
     place, turn = _variance(chosen, variance, tau)
-    place2, turn2 = _spread(chosen, selected.solutions, evidence, tau)
+    place2, turn2 = _spread(chosen, selected.solutions, noise_level, tau)
     fading = np.exp(-2 * tau / fade_time(chosen))  # of the bind state, which is a noisy pose
-    last = evidence.level * fading
+    last = noise_level.level * fading
     scale = min(max(backtest.relative_error(chosen, selected.track, noise, variance), 1.0), _MOST_SCALE)
     growth = 3 * (0.5 + tau) ** 2
     turn = scale * turn + turn2 + 3 * noise.turn**2 * last + growth * drift.turn**2
@@ -76,6 +77,11 @@ class Widths:
     half_width: np.ndarray
     half_angle: np.ndarray
     trusted: float | None
+
+    @property
+    def unknown(self) -> bool:
+        """True if the half width soon exceeds the body's size, so that no law predicts the motion."""
+        return float(np.interp(_SOON, self.tau, self.half_width)) > 2.0
 
     def scaled(self, t_max: float, radius: float, span: float) -> Band:
         """Band in scene times and world units."""
@@ -104,11 +110,11 @@ def _crossing(tau: np.ndarray, values: np.ndarray, row: int) -> float:
     return float(tau[row - 1] + share * (tau[row] - tau[row - 1]))
 
 
-def _poses(solution: Solution, tau: np.ndarray) -> se3.Pose:
+def _poses(solution: FittedCandidate, tau: np.ndarray) -> se3.Pose:
     return solution.candidate.law.path(solution.law_theta, tau)
 
 
-def _variance(solution: Solution, variance: float, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _variance(solution: FittedCandidate, variance: float, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Variance of the position and of the rotation vector, summed over components, from the covariance. [H]"""
     law, theta = solution.candidate.law, solution.law_theta
     quats, d = law.path(theta, tau)
@@ -122,10 +128,10 @@ def _variance(solution: Solution, variance: float, tau: np.ndarray) -> tuple[np.
 
 
 def _spread(
-    chosen: Solution, all_solutions: Sequence[Solution], evidence: Evidence, tau: np.ndarray
+    chosen: FittedCandidate, all_solutions: Sequence[FittedCandidate], noise_level: NoiseLevel, tau: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean squared distances of other candidates' positions and rotations from the chosen one's, by evidence. [H]"""
-    scores = [evidence.score(s) for s in all_solutions]
+    scores = [noise_level.score(s) for s in all_solutions]
     best = min(scores)
     weights = np.exp(-(np.array(scores) - best) / _SOFT)
     weights = np.where(weights < math.exp(-6.0), 0.0, weights)

@@ -47,12 +47,12 @@ class Candidate:
         return 6 + sum(self._block(name).size for name in self.blocks)
 
     @property
-    def placed(self) -> int:
+    def discrete_choices(self) -> int:
         """Number of discrete choices among the poses, such as the gap of a break."""
         return 0
 
     @property
-    def last_choice(self) -> int:
+    def poses_with_choices(self) -> int:
         """Number of poses, from the first one, that suffice to determine all discrete choices."""
         return 0
 
@@ -98,6 +98,11 @@ class Candidate:
             start = stop
         return found
 
+    @functools.cached_property
+    def rows(self) -> dict[str, np.ndarray]:
+        """Indices of the parameters of the blocks. [size] each"""
+        return self.parts(np.arange(self.parameters))
+
     def pack(self, guess: Mapping[str, np.ndarray]) -> np.ndarray:
         """Parameters from values of the blocks. [P]"""
         names = ("r", "e", *self.blocks)
@@ -137,6 +142,7 @@ ALL = sorted(
 )
 FAMILY = tuple(candidate for candidate in ALL if models.KINDS[candidate.kind].fits_by_default)
 BY_NAME = {candidate.name: candidate for candidate in ALL}
+PLAIN = tuple(c.name for c in ALL if c.name in models.KINDS[c.kind].plain_fits)
 FREE_TOP = BY_NAME["free top"]
 STATIC = BY_NAME["static"]
 
@@ -154,7 +160,7 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Solution:
+class FittedCandidate:
     """A fitted candidate.
 
     Attributes:
@@ -240,7 +246,7 @@ def solve(
     steps: int = 25,
     enough: float = _ENOUGH,
     hopeless: float = np.inf,
-) -> Solution | None:
+) -> FittedCandidate | None:
     """Fit a candidate to poses, robustly.
 
     Args:
@@ -275,6 +281,6 @@ def solve(
     return solution(candidate, found.row(int(np.argmin(np.where(finite, found.cost, np.inf)))), track)
 
 
-def solution(candidate: Candidate, found: levenberg_marquardt.Solution, track: PoseTrack) -> Solution:
-    """Solution of one start."""
-    return Solution(candidate, found.x, found.normal, found.residuals, track.weights)
+def solution(candidate: Candidate, found: levenberg_marquardt.Solution, track: PoseTrack) -> FittedCandidate:
+    """Fitted candidate of one start."""
+    return FittedCandidate(candidate, found.x, found.normal, found.residuals, track.weights)

@@ -12,19 +12,20 @@ import numpy as np
 
 from ..motion import models, rotations
 from ..motion.history import Event, Segment
-from .candidates import Candidate, Solution
+from .candidates import Candidate, FittedCandidate
 
 _FADE_PER_SPAN = 0.1 / 0.75
 _SLIPPED = 0.1  # factor on this time if the last observed rotation is known to be wrong
+_SEGMENT_RATES = ("velocity", "acceleration", "angular_velocity")
 _RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration")
 
 
-def fade_time(solution: Solution) -> float:
+def fade_time(solution: FittedCandidate) -> float:
     """Time constant, in spans, with which the body leaves the last observed pose for the fitted curve."""
     return _FADE_PER_SPAN * (_SLIPPED if solution.candidate.slip(solution.theta).any() else 1.0)
 
 
-def to_model(solution: Solution, variance: float, radius: float, span: float) -> models.MotionModel:
+def to_model(solution: FittedCandidate, variance: float, radius: float, span: float) -> models.MotionModel:
     """Motion model in world units and units of time; ``variance`` is the factor of the parameters' covariance."""
     law, theta = solution.candidate.law, solution.law_theta
     fields = _fields(law, theta, radius, span)
@@ -69,7 +70,7 @@ def _fields(law: Candidate, theta: np.ndarray, radius: float, span: float) -> di
     return found
 
 
-def events(solution: Solution, variance: float, t_max: float, span: float) -> tuple[Event, ...]:
+def events(solution: FittedCandidate, variance: float, t_max: float, span: float) -> tuple[Event, ...]:
     """Events of a solution in the observed window, in order; only the first of several between two poses."""
     gap = -solution.candidate.window.first / len(solution.weights)
     found: list[tuple[str, np.ndarray]] = []
@@ -93,12 +94,17 @@ def events(solution: Solution, variance: float, t_max: float, span: float) -> tu
 
 
 def segments(
-    solutions: Sequence[Solution], found: tuple[Event, ...], first: float, t_max: float, radius: float, span: float
+    solutions: Sequence[FittedCandidate],
+    found: tuple[Event, ...],
+    first: float,
+    t_max: float,
+    radius: float,
+    span: float,
 ) -> tuple[Segment, ...]:
     """Segments between events, from the first pose to t_max; empty without events.
 
     Args:
-        solutions: Solution of each segment.
+        solutions: FittedCandidate of each segment.
         found: Events.
         first: Time of the first pose.
     """
@@ -122,5 +128,18 @@ def segments(
         kind = "static" if rests else solution.candidate.law.kind
         if not rests and kind == "static":  # a body that stopped
             kind = "ballistic_spin"
+        if not rests:
+            rates |= _parameters(solution, radius, span, last=stop == t_max)
         result.append(Segment(start, stop, kind, {name: tuple(value.tolist()) for name, value in rates.items()}))
     return tuple(result)
+
+
+def _parameters(solution: FittedCandidate, radius: float, span: float, last: bool) -> dict[str, np.ndarray]:
+    """Parameters of a segment beside the common rates: constants of its law, and in the last one all that it has."""
+    law = solution.candidate.law
+    if not last and law is not solution.candidate:  # the law holds after the break alone
+        return {}
+    fields = _fields(law, solution.law_theta, radius, span)
+    names = [*models.KINDS[law.kind].fields, "center_offset"] if last else []
+    names += [name for name, unit in models.SCALARS.items() if unit.per_time >= 0]  # constants, unlike times
+    return {name: fields[name] for name in names if name not in _SEGMENT_RATES and fields[name].any()}

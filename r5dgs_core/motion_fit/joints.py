@@ -145,7 +145,7 @@ def _noise(
 ) -> tuple[float, float]:
     """Standard deviations of relative displacements and rotations, including those of the pose at t_max."""
     track = PoseTrack((times - times[-1]) / (times[-1] - times[0]), quats, moves / radius, np.ones(len(times)))
-    found = noise.contrasts(track)
+    found = noise.estimate(track)
     return _BOTH * max(radius * found.place, least[0]), _BOTH * max(found.turn, least[1])
 
 

@@ -1,7 +1,7 @@
 """Select the motion model of a group past t_max from its observed poses.
 
-Every candidate law (`candidates`) and every kind of break in every gap (`kinks`) is fitted to all poses. They are
-compared by their evidence (`evidence`): a break is chosen only with strong evidence, otherwise the simplest law near
+Every candidate law (`candidates`) and every kind of break in every gap (`breaks`) is fitted to all poses. They are
+compared by their scores (`model_scores`): a break is chosen only with strong evidence, otherwise the simplest law near
 the best one. After a break, the last part of the track is searched again. Notation: S poses, tau = t - t_max <= 0;
 radius weights rotations against displacements.
 """
@@ -19,8 +19,7 @@ from ..motion.history import NONE, History
 from ..motion.pose_track import PoseTrack
 from . import band as bands
 from . import candidates as families
-from . import evidence as evidences
-from . import fitted_motion, noise, search
+from . import fitted_motion, model_scores, noise, search, simple_rules
 from .candidates import Candidate, Noise
 from .search import Selected
 
@@ -32,7 +31,7 @@ class Score:
     Attributes:
         name: Name of the candidate.
         parameters: Number of its free parameters, including the six of the pose.
-        evidence: Its score, see `evidence`; infinite if it was not fitted, or if the poses do not determine the
+        evidence: Its score, see `model_scores`; infinite if it was not fitted, or if the poses do not determine the
             frequency of an oscillation.
         fit: Root mean square of its residuals in units of the noise, or NaN if it was not fitted.
     """
@@ -124,26 +123,33 @@ def fit(
     family = tuple(replace(candidate, window=track.window) for candidate in family)
     least = Noise(max(least_noise[0] / radius, noise.FLOOR), max(least_noise[1], noise.FLOOR))
     few = len(track) < 4
-    selected = search.few(track, family) if few else search.select(track, family, least, candidates is None, up)
+    selected = (
+        search.select_from_few_poses(track, family)
+        if few
+        else search.select(track, family, least, candidates is None, up)
+    )
     drifts = Noise(drift[0] / radius, drift[1])
-    return _result(selected, family, float(times[-1]), radius, span, bands.slow(least, drifts))
+    return _result(selected, family, float(times[-1]), radius, span, bands.drift_noise(least, drifts))
 
 
 def _result(
     selected: Selected, family: tuple[Candidate, ...], t_max: float, radius: float, span: float, drift: Noise
 ) -> Fit:
-    """Fit in world units; ``drift`` is that of `band.of`."""
-    chosen, evidence, level = selected.chosen, selected.evidence, selected.noise
-    variance = evidences.variance(chosen, selected.track, level, evidence)
-    model = fitted_motion.to_model(chosen, variance, radius, span)
-    parts = [(part, fitted_motion.events(part, evidence.variance, t_max, span)) for part in selected.earlier]
+    """Fit in world units; ``drift`` is that of `band.confidence_band`."""
+    chosen, noise_level, level = selected.chosen, selected.noise_level, selected.noise
+    variance = model_scores.covariance_factor(chosen, selected.track, level, noise_level)
+    widths = bands.confidence_band(selected, variance, drift)
+    rule = simple_rules.better(selected.track, level) if widths.unknown else None
+    predicted = rule or chosen
+    model = fitted_motion.to_model(predicted, variance, radius, span)
+    parts = [(part, fitted_motion.events(part, noise_level.variance, t_max, span)) for part in selected.earlier]
     parts.append((chosen, fitted_motion.events(chosen, variance, t_max, span)))
     found = tuple(event for _, own in parts for event in own)
     owners = [part for part, own in parts for _ in own]
     first = t_max + span * selected.first
     segments = fitted_motion.segments([*owners, chosen], found, first, t_max, radius, span)
-    band = bands.of(selected, variance, drift).scaled(t_max, radius, span)
-    name = chosen.candidate.law.name
+    band = widths.scaled(t_max, radius, span)
+    name = predicted.candidate.law.name
     rests = bool(found) and found[-1].kind == "stop"
     by_name = {s.candidate.name: s for s in selected.solutions}
     listed = {c.name: c.parameters for c in family} | {s.candidate.name: s.parameters for s in selected.solutions}
@@ -151,12 +157,12 @@ def _result(
     for each, parameters in listed.items():
         s = by_name.get(each)
         root = math.nan if s is None else math.sqrt(float((s.robust * s.squares).mean()) / 6)
-        table.append(Score(each, parameters, math.inf if s is None else evidence.score(s), root))
-    scale = math.sqrt(evidence.level)
+        table.append(Score(each, parameters, math.inf if s is None else noise_level.score(s), root))
+    scale = math.sqrt(noise_level.level)
     return Fit(
         model,
         tuple(table),
-        chosen="static" if rests else name,
+        chosen="static" if rests and rule is None else name,
         rested=rests,
         sigma_t=scale * level.place * radius,
         sigma_r=scale * level.turn,

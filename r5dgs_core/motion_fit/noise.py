@@ -7,12 +7,15 @@ import numpy as np
 from ..motion.pose_track import PoseTrack
 from .candidates import Noise
 
-IMAGES = (0.001, 0.002)  # share of the diameter, and rad; smooth errors of tracks from images, which do not scatter
+IMAGE_NOISE = (
+    0.001,
+    0.002,
+)  # share of the diameter, and rad; smooth errors of tracks from images, which do not scatter
 FLOOR = 1e-7  # radii and radians; below this, noise is only rounding
 _MEDIAN = 1.538  # median length of three numbers with unit variance
 
 
-def contrasts(track: PoseTrack) -> Noise:
+def estimate(track: PoseTrack) -> Noise:
     """Noise from combinations of four neighbouring poses that vanish for motions quadratic in time.
 
     It is too large for motions that are fast between poses and too small for noise that is correlated in time.
@@ -31,4 +34,4 @@ def contrasts(track: PoseTrack) -> Noise:
 
 def of_images(radius: float, place: float = 0.0, turn: float = 0.0) -> tuple[float, float]:
     """Lower bounds of the noise of a track from images, for `model_selection.fit`; at least (place, turn)."""
-    return max(place, 2 * radius * IMAGES[0]), max(turn, IMAGES[1])
+    return max(place, 2 * radius * IMAGE_NOISE[0]), max(turn, IMAGE_NOISE[1])

@@ -8,16 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..motion import rotations
+from ..motion import models, rotations
 from ..motion.pose_track import PoseTrack
-from . import backtest, kinks, noise, slips
+from . import backtest, breaks, model_scores, noise, slips
 from . import candidates as families
-from . import evidence as evidences
-from .candidates import Candidate, Noise, Solution
-from .evidence import Evidence
+from .candidates import Candidate, FittedCandidate, Noise
+from .model_scores import NoiseLevel
 
 FREQUENCY_ERROR = 0.25  # maximum relative standard deviation of a determined frequency
-_SEEN = 0.9  # minimum number of observed periods of each of two oscillations
 _FEW = 8  # number of poses below which neither breaks nor large candidates are tried
 _PER_POSE = 3  # maximum number of parameters per pose of a candidate for few poses
 STEEP = 0.9  # cosine of the angle to the vertical below which a motion is vertical
@@ -33,7 +31,7 @@ _HOPELESS_LOSS = 200.0  # excess of the loss of a candidate above which it is no
 _HOPELESS = 30.0  # score excess of plain parts above which a track is not cut
 _CUTS = 4  # number of breaks at which such a track is cut on trial
 _FEWEST = 4  # minimum number of poses of its parts
-_PLAIN = ("static", "translation + spin", "ballistic + spin", "drag")  # laws that determine the cut
+_FEW_BLOCKS = {"v", "w"}  # blocks of laws for two or three poses
 _WELL = 1.5  # loss of a part, relative to that of noise, below which it is not searched again
 _AHEAD = 1 / 3  # time past t_max, in spans, over which a law must be plausible
 _RUNAWAY = 2.5  # distance in this time, relative to the largest observed, above which a law is not plausible
@@ -47,24 +45,24 @@ class Selected:
     Attributes:
         chosen: Chosen solution, refined.
         solutions: All solutions.
-        evidence: Noise level.
+        noise_level: Noise level.
         track: The poses that they were fitted to.
         noise: Their noise.
         earlier: Solutions with events before the track of `chosen`, in order.
         first: Time of the first pose.
     """
 
-    chosen: Solution
-    solutions: tuple[Solution, ...]
-    evidence: Evidence
+    chosen: FittedCandidate
+    solutions: tuple[FittedCandidate, ...]
+    noise_level: NoiseLevel
     track: PoseTrack
     noise: Noise
     first: float
-    earlier: tuple[Solution, ...] = ()
+    earlier: tuple[FittedCandidate, ...] = ()
 
 
 def select(
-    track: PoseTrack, family: tuple[Candidate, ...], least: Noise, breaks: bool, up: np.ndarray | None
+    track: PoseTrack, family: tuple[Candidate, ...], least: Noise, try_breaks: bool, up: np.ndarray | None
 ) -> Selected:
     """Fit four or more poses.
 
@@ -72,22 +70,22 @@ def select(
         track: The poses.
         family: Laws to try.
         least: Lower bound of the noise.
-        breaks: True to try breaks.
+        try_breaks: True to try breaks.
         up: See `model_selection.fit`.
     """
-    level = noise.contrasts(track)
+    level = noise.estimate(track)
     level = Noise(max(level.place, least.place), max(level.turn, least.turn))
     most = 6 * len(track) - 6 if len(track) >= _FEW else _PER_POSE * len(track)
     tried = [c for c in family if c.parameters <= most] or [min(family, key=lambda c: c.parameters)]
-    found, broken, slipped = _try_all(tried, track, level, breaks)
+    found, broken, slipped = _try_all(tried, track, level, try_breaks)
     coarser = _misfit((*found, *broken, *slipped))
     if (
         max(coarser) > _NOTHING_FITS
     ):  # if the noise is underestimated, the robust losses of all candidates are nearly equal
         level = level.scaled(*(math.sqrt(max(ratio, 1.0)) for ratio in coarser))
-        found, broken, slipped = _try_all(tried, track, level, breaks)
+        found, broken, slipped = _try_all(tried, track, level, try_breaks)
     for _ in range(_ROUNDS):
-        shares = _shares((*found, *broken, *slipped))
+        shares = _residual_variances((*found, *broken, *slipped))
         if min(shares) > _TOO_LARGE:
             break
         finer = level.scaled(*(math.sqrt(min(share, 1.0)) for share in shares))
@@ -97,66 +95,66 @@ def select(
         best = _best(found, broken, slipped)
         found = _refined(found, best, track, level, finer)
         slipped = _refined(slipped, best, track, level, finer)
-        searched = isinstance(best.candidate, kinks.Kink)
-        broken = kinks.search(track, finer) if searched else _refined(broken, best, track, level, finer)
+        searched = isinstance(best.candidate, breaks.BreakCandidate)
+        broken = breaks.search(track, finer) if searched else _refined(broken, best, track, level, finer)
         level = finer
-    evidence = Evidence.of((*found, *broken, *slipped), _floor(level, least))
-    laws = [s for s in found if _determined(s, evidence) and not _rises(s, up)] or found[:1]
+    noise_level = NoiseLevel.of((*found, *broken, *slipped), _floor(level, least))
+    laws = [s for s in found if _determined(s, noise_level) and not _rises(s, up)] or found[:1]
     plausible = [s for s in laws if not runs_away(s, track)] or laws[:1]
-    chosen = _simplest(plausible, evidence, track, level)
+    chosen = _simplest(plausible, noise_level, track, level)
     smooth = [s for s in plausible if not s.candidate.events(s.theta)]
     if chosen.candidate.events(chosen.theta) and smooth:
-        other = _simplest(smooth, evidence, track, level)
-        chosen = other if evidence.score(chosen) + evidences.STRONG > evidence.score(other) else chosen
+        other = _simplest(smooth, noise_level, track, level)
+        chosen = other if noise_level.score(chosen) + model_scores.STRONG > noise_level.score(other) else chosen
     if broken:
-        best = min(broken, key=evidence.score)
-        if evidence.score(best) + _margin(best) < min(evidence.score(s) for s in plausible):
+        best = min(broken, key=noise_level.score)
+        if noise_level.score(best) + _margin(best) < min(noise_level.score(s) for s in plausible):
             chosen = best
     if slipped:
-        best = min(slipped, key=evidence.score)
-        if evidence.score(best) < min(evidence.score(s) for s in (*laws, *broken)):
+        best = min(slipped, key=noise_level.score)
+        if noise_level.score(best) < min(noise_level.score(s) for s in (*laws, *broken)):
             chosen = best
     solutions = (*laws, *broken, *slipped)
-    final = _again(chosen, track, level, _EXACT)
+    final = _refit(chosen, track, level, _EXACT)
     solutions = tuple(final if s is chosen else s for s in solutions)
-    whole = Selected(final, solutions, evidence, track, level, float(track.tau[0]))
-    cut = _cut(whole, broken, family, up, _floor(level, least)) if broken and evidence.variance > _POOR else None
+    whole = Selected(final, solutions, noise_level, track, level, float(track.tau[0]))
+    cut = _cut(whole, broken, family, up, _floor(level, least)) if broken and noise_level.variance > _POOR else None
     return cut or _with_parts(whole, family, up)
 
 
 def _try_all(
-    tried: Sequence[Candidate], track: PoseTrack, level: Noise, breaks: bool
-) -> tuple[list[Solution], list[Solution], list[Solution]]:
+    tried: Sequence[Candidate], track: PoseTrack, level: Noise, try_breaks: bool
+) -> tuple[list[FittedCandidate], list[FittedCandidate], list[FittedCandidate]]:
     """Fits of all laws, of all kinds of breaks, and of slips."""
     hopeless, solved = math.inf, {}
-    for candidate in sorted(tried, key=lambda c: c.name not in _PLAIN):  # a good fit early on saves time later
+    for candidate in sorted(tried, key=lambda c: c.name not in families.PLAIN):  # a good fit early on saves time later
         solution = solved[candidate.name] = families.solve(candidate, track, level, hopeless=hopeless)
         if solution is not None:
             hopeless = min(hopeless, _hopeless(solution))
     found = [s for c in tried if (s := solved[c.name]) is not None]
     found = found or [s for s in [families.solve(families.STATIC, track, level)] if s is not None]
-    if not breaks or len(track) < _FEW:
+    if not try_breaks or len(track) < _FEW:
         return found, [], []
-    return found, kinks.search(track, level, hopeless), slips.search(track, level, hopeless)
+    return found, breaks.search(track, level, hopeless), slips.search(track, level, hopeless)
 
 
-def _hopeless(best: Solution) -> float:
+def _hopeless(best: FittedCandidate) -> float:
     """Loss above which other candidates may end early, from that of a good one."""
     free = max(best.residuals.size - best.parameters, 1)
     return best.loss + families.HOPELESS_LOSS * max(1.0, best.loss / free)
 
 
-def _misfit(solutions: Sequence[Solution]) -> tuple[float, float]:
+def _misfit(solutions: Sequence[FittedCandidate]) -> tuple[float, float]:
     """Median squared position and rotation residuals per component, of the solution with the smallest ones."""
     medians = [np.median(s.residuals.reshape(-1, 2, 3) ** 2, 0).mean(-1) / _MEDIAN_SQUARE for s in solutions]
     place, turn = min(medians, key=lambda pair: float(np.prod(np.maximum(pair, 1.0))))
     return float(place), float(turn)
 
 
-def _margin(kink: Solution) -> float:
+def _margin(broken: FittedCandidate) -> float:
     """Minimum evidence for a break; small jumps need more, because drifting tracks imitate them."""
-    assert isinstance(kink.candidate, kinks.Kink)
-    return evidences.STRONG * max(1.0, _SMALL_JUMP / max(kink.candidate.jump(kink.theta), 1e-3)) ** 2
+    assert isinstance(broken.candidate, breaks.BreakCandidate)
+    return model_scores.STRONG * max(1.0, _SMALL_JUMP / max(broken.candidate.jump(broken.theta), 1e-3)) ** 2
 
 
 def _floor(level: Noise, least: Noise) -> float:
@@ -169,34 +167,38 @@ def _with_parts(whole: Selected, family: tuple[Candidate, ...], up: np.ndarray |
 
     The break's own fit of a part is replaced only by one with strong evidence.
     """
-    kink = whole.chosen.candidate
-    if not isinstance(kink, kinks.Kink):
+    first = whole.chosen.candidate
+    if not isinstance(first, breaks.BreakCandidate):
         return whole
     result = whole
-    for rows in (slice(0, kink.gap), slice(kink.gap, None)):
+    for rows in (slice(0, first.gap), slice(first.gap, None)):
         track = whole.track.rows(rows)
-        loss, free = float(whole.chosen.losses[rows].sum()), 6 * len(track) - kink.law.parameters
-        if len(track) < _LEAST_PART or loss < _WELL * min(whole.evidence.level, 1.0) * free:
+        loss, free = float(whole.chosen.losses[rows].sum()), 6 * len(track) - first.law.parameters
+        if len(track) < _LEAST_PART or loss < _WELL * min(whole.noise_level.level, 1.0) * free:
             continue
         own = tuple(replace(candidate, window=track.window) for candidate in family)
-        part = select(track, own, whole.noise, breaks=len(track) >= _FEW, up=up)
-        level = replace(whole.evidence, count=len(track))
-        shared = level.of_sums(loss, kink.law.parameters)
-        if level.score(part.chosen) + evidences.STRONG > shared:
+        part = select(track, own, whole.noise, try_breaks=len(track) >= _FEW, up=up)
+        level = replace(whole.noise_level, count=len(track))
+        shared = level.of_sums(loss, first.law.parameters)
+        if level.score(part.chosen) + model_scores.STRONG > shared:
             continue
         if rows.start:
-            result = replace(part, evidence=level, first=whole.first, earlier=(*result.earlier, whole.chosen))
-        elif isinstance(part.chosen.candidate, kinks.Kink):
-            # The kink of the whole track assumed one law before it: search again from the earlier break on.
+            result = replace(part, noise_level=level, first=whole.first, earlier=(*result.earlier, whole.chosen))
+        elif isinstance(part.chosen.candidate, breaks.BreakCandidate):
+            # The break of the whole track assumed one law before it: search again from the earlier break on.
             rest = whole.track.rows(slice(part.chosen.candidate.gap, None))
             own = tuple(replace(candidate, window=rest.window) for candidate in family)
-            result = select(rest, own, whole.noise, breaks=len(rest) >= _FEW, up=up)
+            result = select(rest, own, whole.noise, try_breaks=len(rest) >= _FEW, up=up)
             return replace(result, first=whole.first, earlier=(*part.earlier, part.chosen, *result.earlier))
     return result
 
 
 def _cut(
-    whole: Selected, broken: Sequence[Solution], family: tuple[Candidate, ...], up: np.ndarray | None, least: float
+    whole: Selected,
+    broken: Sequence[FittedCandidate],
+    family: tuple[Candidate, ...],
+    up: np.ndarray | None,
+    least: float,
 ) -> Selected | None:
     """Search the parts before and after the best break independently, for tracks that no candidate explains.
 
@@ -211,72 +213,77 @@ def _cut(
         None if this is not clearly better than the best single candidate.
     """
     track, found = whole.track, []
-    for kink in sorted(broken, key=lambda s: s.loss)[:_CUTS]:
-        gap = kink.candidate.last_choice - kinks.LEAST_AFTER
+    for solution in sorted(broken, key=lambda s: s.loss)[:_CUTS]:
+        gap = solution.candidate.poses_with_choices - breaks.LEAST_AFTER
         rows = (slice(0, gap), slice(gap, None))
         sides = [track.rows(row) for row in rows]
         if min(map(len, sides)) < _FEWEST or any(gap == other[1] for other in found):
             continue
         plain = [_plain(side, whole.noise) for side in sides]
-        found.append((sum(s.loss + s.parameters for s in plain), gap, kink, sides, plain))
+        found.append((sum(s.loss + s.parameters for s in plain), gap, solution, sides, plain))
     if not found:
         return None
-    _, _, kink, sides, plain = min(found, key=lambda entry: entry[:2])
-    best = min(whole.solutions, key=whole.evidence.score)
+    _, _, broken_at, sides, plain = min(found, key=lambda entry: entry[:2])
+    best = min(whole.solutions, key=whole.noise_level.score)
     if _excess(plain, best, least) > _HOPELESS:
         return None
     parts = []
     for side in sides:
         own = tuple(replace(candidate, window=side.window) for candidate in family)
-        parts.append(select(side, own, whole.noise, breaks=len(side) >= _FEW, up=up))
+        parts.append(select(side, own, whole.noise, try_breaks=len(side) >= _FEW, up=up))
     before, after = parts
     pieces = (before.chosen, after.chosen)
-    if _excess(pieces, best, least) > -evidences.STRONG:
+    if _excess(pieces, best, least) > -model_scores.STRONG:
         return None
-    evidence = Evidence.of_parts(pieces, least)
-    earlier = (*before.earlier, *([before.chosen] if before.chosen.candidate.placed else []), kink, *after.earlier)
-    return replace(after, evidence=replace(evidence, count=len(after.track)), first=whole.first, earlier=earlier)
+    noise_level = NoiseLevel.of_parts(pieces, least)
+    earlier = (
+        *before.earlier,
+        *([before.chosen] if before.chosen.candidate.discrete_choices else []),
+        broken_at,
+        *after.earlier,
+    )
+    return replace(after, noise_level=replace(noise_level, count=len(after.track)), first=whole.first, earlier=earlier)
 
 
-def _plain(track: PoseTrack, level: Noise) -> Solution:
+def _plain(track: PoseTrack, level: Noise) -> FittedCandidate:
     """Fit of the best plain law to a part of a track."""
-    laws = (replace(families.BY_NAME[name], window=track.window) for name in _PLAIN)
+    laws = (replace(families.BY_NAME[name], window=track.window) for name in families.PLAIN)
     found = [s for law in laws if (s := families.solve(law, track, level)) is not None]
     return min(found, key=lambda s: s.loss + s.parameters)
 
 
-def _excess(parts: Sequence[Solution], single: Solution, least: float) -> float:
+def _excess(parts: Sequence[FittedCandidate], single: FittedCandidate, least: float) -> float:
     """Score of two parts of a track minus that of a single candidate, by the noise level of the parts."""
-    evidence = Evidence.of_parts(parts, least)
-    placed = 1 + sum(part.candidate.placed for part in parts)
+    noise_level = NoiseLevel.of_parts(parts, least)
+    choices = 1 + sum(part.candidate.discrete_choices for part in parts)
     loss, parameters = sum(part.loss for part in parts), sum(part.parameters for part in parts)
-    return evidence.of_sums(loss, parameters, placed) - evidence.score(single)
+    return noise_level.of_sums(loss, parameters, choices) - noise_level.score(single)
 
 
 def _refined(
-    solutions: Sequence[Solution], best: Solution, track: PoseTrack, level: Noise, finer: Noise
-) -> list[Solution]:
+    solutions: Sequence[FittedCandidate], best: FittedCandidate, track: PoseTrack, level: Noise, finer: Noise
+) -> list[FittedCandidate]:
     """Refits to the same poses with less noise; residuals of solutions far worse than the best are only rescaled."""
     scales = np.repeat([level.place / finer.place, level.turn / finer.turn], 3)
     return [
-        _again(s, track, finer) if s.loss < best.loss + _HOPELESS_LOSS else replace(s, residuals=scales * s.residuals)
+        _refit(s, track, finer) if s.loss < best.loss + _HOPELESS_LOSS else replace(s, residuals=scales * s.residuals)
         for s in solutions
     ]
 
 
-def _again(solution: Solution, track: PoseTrack, level: Noise, enough: float | None = None) -> Solution:
+def _refit(solution: FittedCandidate, track: PoseTrack, level: Noise, enough: float | None = None) -> FittedCandidate:
     """Refit a solution from its own parameters."""
     options = {} if enough is None else {"enough": enough, "steps": 40}
     return families.solve(solution.candidate, track, level, [solution.theta], **options) or solution
 
 
-def _best(*groups: Sequence[Solution]) -> Solution:
-    """Solution with the least loss per degree of freedom."""
+def _best(*groups: Sequence[FittedCandidate]) -> FittedCandidate:
+    """Candidate with the least loss per degree of freedom."""
     every = [s for group in groups for s in group]
     return min(every, key=lambda s: s.loss / max(s.residuals.size - s.parameters, 1))
 
 
-def _shares(solutions: Sequence[Solution]) -> tuple[float, float]:
+def _residual_variances(solutions: Sequence[FittedCandidate]) -> tuple[float, float]:
     """Variances of the position and rotation residuals of the best solution, in units of the noise."""
     best = _best(solutions)
     weights = (best.weights * best.robust)[:, None]
@@ -285,56 +292,51 @@ def _shares(solutions: Sequence[Solution]) -> tuple[float, float]:
     return float(means[:3].mean()), float(means[3:].mean())
 
 
-def _determined(solution: Solution, evidence: Evidence) -> bool:
-    """Return True if the frequencies are inside their range and known to `FREQUENCY_ERROR`, or if none is free.
-
-    For bounces, at least one flight between two of them must be longer than two gaps between poses. For a sum of
-    oscillations, nearly a full period of each must be observed, because slower ones can imitate any curve.
-    """
-    candidate = solution.candidate
-    rows = candidate.parts(np.arange(candidate.parameters))
-    window = candidate.window
-    if "bounce" in rows:
-        times = [float(time.reshape(-1)[0]) for _, time in candidate.events(solution.theta)]
-        return bool(len(times) < 2 or max(np.diff(times)) > 2 * -window.first / (evidence.count - 1))
-    for block in ("pace", "pace2"):
-        if block not in rows:
+def _determined(solution: FittedCandidate, noise_level: NoiseLevel) -> bool:
+    """Return True if the poses resolve the motion, and its frequencies are known to `FREQUENCY_ERROR`."""
+    candidate, window = solution.candidate, solution.candidate.window
+    kind = models.KINDS[candidate.kind]
+    if not kind.resolved(candidate.parts(solution.theta), window, noise_level.count):
+        return False
+    for block in kind.frequency_blocks:
+        if block not in candidate.rows:
             continue
-        index = int(rows[block][0])
+        index = int(candidate.rows[block][0])
         frequency = float(window.frequency(solution.theta[index]))
-        if "pace2" in rows and frequency < _SEEN * 2 * math.pi / -window.first:
-            return False
         share = (frequency - window.low) / (window.high - window.low)
-        deviation = math.sqrt(max(evidence.variance * solution.inverse[index, index], 0.0))
+        deviation = math.sqrt(max(noise_level.variance * solution.inverse[index, index], 0.0))
         sigma = deviation * share * (1 - share) * (window.high - window.low)
         if not (0.01 < share < 0.99 and sigma < FREQUENCY_ERROR * frequency):
             return False
     return True
 
 
-def _simplest(laws: Sequence[Solution], evidence: Evidence, track: PoseTrack, level: Noise) -> Solution:
+def _simplest(
+    laws: Sequence[FittedCandidate], noise_level: NoiseLevel, track: PoseTrack, level: Noise
+) -> FittedCandidate:
     """Law with the fewest parameters among those near the best whose refits to earlier poses predict the later ones.
 
-    Evidence alone may follow small systematic errors of a track, which predicting later poses reveals. Among laws with
-    equally many parameters, the evidence decides.
+    Scores alone may follow small systematic errors of a track, which predicting later poses reveals. Among laws with
+    equally many parameters, the score decides.
     """
-    best = min(evidence.score(s) for s in laws)
-    near = [s for s in laws if evidence.score(s) <= best + evidences.NEAR]
-    misses = [backtest.relative_error(s, track, level, evidence.variance) for s in near]
+    best = min(noise_level.score(s) for s in laws)
+    near = [s for s in laws if noise_level.score(s) <= best + model_scores.NEAR]
+    misses = [backtest.relative_error(s, track, level, noise_level.variance) for s in near]
     limit = _CONTRADICTED * max(min(misses), 1.0)
     fit = [s for s, miss in zip(near, misses, strict=True) if miss <= limit]
-    return min(fit, key=lambda s: (s.parameters, evidence.score(s)))
+    return min(fit, key=lambda s: (s.parameters, noise_level.score(s)))
 
 
-def _rises(solution: Solution, up: np.ndarray | None) -> bool:
-    """Return True for friction without spin on a vertical line, as of a body thrown upwards."""
-    if up is None or solution.candidate.kind != "friction" or "w" in solution.candidate.blocks:
+def _rises(solution: FittedCandidate, up: np.ndarray | None) -> bool:
+    """Return True if a support would have to hold a body that moves on a vertical line, as one thrown upwards."""
+    candidate = solution.candidate
+    if up is None or not models.KINDS[candidate.kind].needs_support or "w" in candidate.blocks:
         return False
-    v = solution.candidate.parts(solution.theta)["v"]
+    v = candidate.parts(solution.theta)["v"]
     return bool(abs(v @ up) > STEEP * np.linalg.norm(v) * np.linalg.norm(up))
 
 
-def runs_away(solution: Solution, track: PoseTrack) -> bool:
+def runs_away(solution: FittedCandidate, track: PoseTrack) -> bool:
     """Return True if the body would move or turn much further past t_max than in any equal observed time."""
     ends = np.searchsorted(track.tau, track.tau + _AHEAD)
     starts = np.flatnonzero(ends < len(track))
@@ -349,12 +351,12 @@ def runs_away(solution: Solution, track: PoseTrack) -> bool:
     return bool(math.hypot(float(np.linalg.norm(d[-1] - d[0])), angle * math.sqrt(2 / 3)) > _RUNAWAY * most)
 
 
-def few(track: PoseTrack, family: tuple[Candidate, ...]) -> Selected:
+def select_from_few_poses(track: PoseTrack, family: tuple[Candidate, ...]) -> Selected:
     """Fit two or three poses: the simplest of static, translation, spin and both with errors below a hundredth."""
     level = Noise(1e-2, 1e-2)
-    allowed = [c for c in family if c.parameters <= 12 and not {"a", "kappa", "u"} & set(c.blocks)]
+    allowed = [c for c in family if set(c.blocks) <= _FEW_BLOCKS]
     fits = [families.solve(c, track, level, enough=1e-9) for c in allowed or [families.STATIC]]
     solutions = tuple(s for s in fits if s is not None)
     roots = [math.sqrt(float(s.squares.mean()) / 6) for s in solutions]
     index = next((i for i, root in enumerate(roots) if root <= 1.0), int(np.argmin(roots)))
-    return Selected(solutions[index], solutions, Evidence(len(track), 1.0, 1.0), track, level, float(track.tau[0]))
+    return Selected(solutions[index], solutions, NoiseLevel(len(track), 1.0, 1.0), track, level, float(track.tau[0]))

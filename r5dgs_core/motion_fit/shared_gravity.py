@@ -20,7 +20,7 @@ AGREE = 11.34  # maximum squared Mahalanobis distance: 99 % quantile of chi2 wit
 
 
 @dataclass(frozen=True)
-class Track:
+class BodyTrack:
     """Observed poses of one body, as passed to `model_selection.fit`.
 
     Attributes:
@@ -36,8 +36,8 @@ class Track:
     weights: np.ndarray
 
 
-def share(
-    tracks: Sequence[Track], fits: Sequence[model_selection.Fit], up: np.ndarray | None = None
+def share_acceleration(
+    tracks: Sequence[BodyTrack], fits: Sequence[model_selection.Fit], up: np.ndarray | None = None
 ) -> tuple[list[model_selection.Fit], tuple[int, ...]]:
     """Replace the accelerations of bodies that fall alike by their weighted mean, and refit the rest of their motion.
 
@@ -111,7 +111,7 @@ def _largest_agreeing(found: dict[int, tuple[np.ndarray, np.ndarray]]) -> list[i
 
 
 def _refit(
-    track: Track, fit: model_selection.Fit, acceleration: np.ndarray, covariance: np.ndarray
+    track: BodyTrack, fit: model_selection.Fit, acceleration: np.ndarray, covariance: np.ndarray
 ) -> model_selection.Fit:
     """Refit a body with a given acceleration; returns the old fit if the new one is at rest or has no covariance."""
     tau = track.times - track.times[-1]

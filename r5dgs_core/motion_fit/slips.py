@@ -17,7 +17,7 @@ from ..motion import rotations, se3
 from ..motion.models import Block
 from ..motion.pose_track import PoseTrack
 from . import candidates as families
-from .candidates import Candidate, Noise, Solution
+from .candidates import Candidate, FittedCandidate, Noise
 
 LAWS = ("static", "translation", "translation + spin", "hinge", "ballistic + spin", "drag")
 _TRIED = 2  # number of the largest jumps that are tried
@@ -42,11 +42,11 @@ class Slip(Candidate):
     high: float = np.inf
 
     @property
-    def placed(self) -> int:
+    def discrete_choices(self) -> int:
         return int(np.isfinite(self.low)) + int(np.isfinite(self.high))
 
     @property
-    def last_choice(self) -> int:
+    def poses_with_choices(self) -> int:
         return 1 + (self.stop if np.isfinite(self.high) else self.start)
 
     def slip(self, theta: np.ndarray) -> np.ndarray:
@@ -74,7 +74,7 @@ class Slip(Candidate):
         return rotations.multiply(quats, rotations.rotvecs_to_quats(turned * theta[..., None, -3:])), d
 
 
-def search(track: PoseTrack, noise: Noise, hopeless: float = np.inf) -> list[Solution]:
+def search(track: PoseTrack, noise: Noise, hopeless: float = np.inf) -> list[FittedCandidate]:
     """Fit plain laws with a slip at the largest jumps of the rotation; the best slip of each law.
 
     Args:
@@ -88,7 +88,7 @@ def search(track: PoseTrack, noise: Noise, hopeless: float = np.inf) -> list[Sol
     gaps = gaps[sizes[gaps - 1] > _JUMP * noise.turn]
     if len(gaps) == 0 or len(track) < _NEAR:
         return []
-    best: dict[str, Solution] = {}
+    best: dict[str, FittedCandidate] = {}
     for start, stop in _blocks(gaps, len(track)):
         low, high = (_middle(track, gap) for gap in (start, stop))
         b = jumps[start - 1] if start > 0 else -jumps[stop - 1]

@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import errors
 from ..motion.history import EVENTS, MOST_KNOTS, Band, Event, History, PoseErrors, Segment
-from ..motion.models import KINDS
+from ..motion.models import FIELDS, KINDS, SCALARS
 from .json_row import Row
 
 _RATES = ("velocity", "acceleration", "angular_velocity")
@@ -22,8 +22,7 @@ def tree(history: History) -> dict[str, Any]:
         found["events"] = [{"time": e.time, "kind": e.kind, "sigma": e.sigma} for e in history.events]
     if history.segments:
         found["segments"] = [
-            {"from": s.start, "to": s.stop, "kind": s.kind, "parameters": {k: list(v) for k, v in s.parameters.items()}}
-            for s in history.segments
+            {"from": s.start, "to": s.stop, "kind": s.kind, "parameters": _parameters(s)} for s in history.segments
         ]
     if history.band is not None:
         band = history.band
@@ -38,6 +37,10 @@ def tree(history: History) -> dict[str, Any]:
         columns = {"place": history.errors.place, "turn": history.errors.turn}
         found["errors"] = {name: [x if math.isfinite(x) else None for x in values] for name, values in columns.items()}
     return found
+
+
+def _parameters(segment: Segment) -> dict[str, Any]:
+    return {name: value[0] if name in SCALARS else list(value) for name, value in segment.parameters.items()}
 
 
 def read(row: Row) -> History:
@@ -62,8 +65,14 @@ def _segment(row: Row) -> Segment:
         row.get("from", float),
         row.get("to", float),
         _one_of(row, "kind", tuple(KINDS)),
-        {name: rates.floats(name, 3) for name in _RATES},
+        {name: rates.floats(name, 3) for name in _RATES} | _further(rates),
     )
+
+
+def _further(rates: Row) -> dict[str, Any]:
+    """Optional parameters of a segment; those of later releases are ignored."""
+    names = [name for name in FIELDS if name not in _RATES and not rates.lacks(name)]
+    return {name: (_at_least_zero(rates, name),) if name in SCALARS else rates.floats(name, 3) for name in names}
 
 
 def _band(row: Row) -> Band:

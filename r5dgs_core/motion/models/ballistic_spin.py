@@ -32,6 +32,7 @@ class BallisticSpin(MotionKind):
         "ballistic + spin, free centre": ("v", "a", "w", "u"),
         "full, free centre": ("v", "a", "w", "eps", "u"),
     }
+    plain_fits = ("translation + spin", "ballistic + spin")
     drawn_fits = (_SPIN, (*_SPIN, "center_offset"))
 
     def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:

@@ -104,6 +104,9 @@ class MotionKind:
             t_max (r, e).
         blocks: Sizes and priors of blocks of `fits` that no other kind has; `BLOCKS` has the common ones.
         fits_by_default: False if a caller must choose these candidates by name.
+        plain_fits: Names in `fits` of plain laws, which are tried first and describe parts of broken motions.
+        frequency_blocks: Blocks of `fits` that determine a frequency.
+        needs_support: True if a body that moves like this without spin on a vertical line would fall back.
         drawn_fits: Sets of free rates with which `fit_drawn_curve` tries this kind.
     """
 
@@ -117,6 +120,9 @@ class MotionKind:
     blocks: Mapping[str, Block] = {}
     fits_by_default = True
     drawn_fits: tuple[tuple[str, ...], ...] = ()
+    plain_fits: tuple[str, ...] = ()
+    frequency_blocks: tuple[str, ...] = ("pace",)
+    needs_support = False
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
         """Poses and their exact derivatives without offsets, at times of either sign. [..., 1]
@@ -197,6 +203,10 @@ class MotionKind:
     def events(self, parts: Mapping[str, np.ndarray], window: Window) -> list[tuple[str, np.ndarray]]:
         """Kinds of the events in the window and their times, each [..., 1], from values of free blocks."""
         return []
+
+    def resolved(self, parts: Mapping[str, np.ndarray], window: Window, count: int) -> bool:
+        """True if ``count`` poses in the window resolve the motion with these values of its blocks."""
+        return True
 
     def kinks(self, model: MotionModel, end: float) -> np.ndarray:
         """Times since t_max, in (0, end], at which the velocity or the acceleration jumps, increasing. [K]"""

@@ -126,6 +126,11 @@ class Bounce(MotionKind):
         numbers = range(int(first) + 1, int(min(last, first + 50)) + 1)
         return [("impact", parts["bounce"] + _start(np.array(float(k)), speed, gravity, rho)) for k in numbers]
 
+    def resolved(self, parts: Mapping[str, np.ndarray], window: Window, count: int) -> bool:
+        """True if at least one flight between two bounces is longer than two gaps between poses."""
+        times = [float(time.reshape(-1)[0]) for _, time in self.events(parts, window)]
+        return bool(len(times) < 2 or max(np.diff(times)) > 2 * -window.first / (count - 1))
+
     def kinks(self, model: MotionModel, end: float) -> np.ndarray:
         """Impacts, and the time from which the body stays on the floor."""
         g, up = _gravity(model.acceleration)

@@ -22,6 +22,7 @@ class Friction(MotionKind):
     word = "friction"
     fields = ("velocity", "angular_velocity", "stop_time")
     fits = {"slide, friction": ("v", "log_stop"), "slide + turn, friction": ("v", "w", "log_stop")}
+    needs_support = True
     blocks = {"log_stop": Block(1, 2.0)}
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:

@@ -17,6 +17,7 @@ class Static(MotionKind):
     tooltip = "Does not move"
     word = "rests"
     fits = {"static": ()}
+    plain_fits = ("static",)
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
         shape = np.broadcast_shapes(rates.v.shape[:-1], span.shape[:-1])

@@ -11,6 +11,8 @@ from ..pose_track import PoseTrack, Window
 from . import first_guesses
 from .base import Block, Curve, MotionKind, MotionModel, Rates, clock_slopes, clocks
 
+_SEEN = 0.9  # minimum number of observed periods
+
 
 class TwoOscillations(MotionKind):
     """d_f = v s1 + a s2 + v2 s1' + a2 s2', R_f = exp(w s1 + eps s2 + w2 s1' + eps2 s2'), ' of the second frequency."""
@@ -31,19 +33,32 @@ class TwoOscillations(MotionKind):
         "pace2": Block(1, 5.0)
     }
 
+    frequency_blocks = ("pace", "pace2")
+
+    def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:
+        once, twice = clocks(rates.frequency, span)
+        once2, twice2 = clocks(rates.frequency2, span)
+        phi = rates.w * once + rates.eps * twice + rates.w2 * once2 + rates.eps2 * twice2
+        return rotations.rotvecs_to_quats(phi), rates.v * once + rates.a * twice + rates.v2 * once2 + rates.a2 * twice2
+
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
+        quats, d = self.poses(rates, span)
         once, twice = clocks(rates.frequency, span)
         once2, twice2 = clocks(rates.frequency2, span)
         slope, slope2 = (clock_slopes(f, span, 0.0)[0] for f in (rates.frequency, rates.frequency2))
         phi = rates.w * once + rates.eps * twice + rates.w2 * once2 + rates.eps2 * twice2
-        d = rates.v * once + rates.a * twice + rates.v2 * once2 + rates.a2 * twice2
         rate = rates.w * slope + rates.eps * once + rates.w2 * slope2 + rates.eps2 * once2
         velocity = rates.v * slope + rates.a * once + rates.v2 * slope2 + rates.a2 * once2
-        return rotations.rotvecs_to_quats(phi), d, se3.v_matrix_times(phi, rate), velocity
+        return quats, d, se3.v_matrix_times(phi, rate), velocity
 
     def rates(self, parts: Mapping[str, np.ndarray], window: Window) -> Rates:
         rest = {name: parts[name] for name in ("v2", "a2", "w2", "eps2") if name in parts}
         return super().rates(parts, window)._replace(frequency2=window.frequency(parts["pace2"]), **rest)
+
+    def resolved(self, parts: Mapping[str, np.ndarray], window: Window, count: int) -> bool:
+        """True if nearly a full period of each oscillation is observed: slower ones can imitate any curve."""
+        slowest = _SEEN * 2 * np.pi / -window.first
+        return all(float(window.frequency(parts[block])[0]) >= slowest for block in self.frequency_blocks)
 
     def starts(self, blocks: Sequence[str], track: PoseTrack, window: Window) -> list[first_guesses.Guess]:
         return first_guesses.pairs(track, window, clocks)

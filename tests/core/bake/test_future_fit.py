@@ -19,7 +19,7 @@ def fits_of(accelerations):
         tau = (TIMES - TIMES[-1])[:, None]
         path = tau * [0.3, 0.5, 0.1] + 0.5 * tau**2 * acceleration + 1e-3 * rng.normal(size=(15, 3))
         path -= path[-1]
-        track = shared_gravity.Track(TIMES, rotations.identity(15), path, np.ones(15))
+        track = shared_gravity.BodyTrack(TIMES, rotations.identity(15), path, np.ones(15))
         fits[index] = track, model_selection.fit(TIMES, track.quats, path, radius=0.3, candidates=FAMILY)
     return fits
 

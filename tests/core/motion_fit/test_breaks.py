@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import models, pose_track, rotations
-from r5dgs_core.motion_fit import candidates, fitted_motion, kinks, model_selection, search
+from r5dgs_core.motion_fit import breaks, candidates, fitted_motion, model_selection, search
 from tests.support import problems
 from tests.support.problems import RADIUS, SIZE, T_MAX
 
@@ -103,6 +103,24 @@ def test_segments_lie_between_events_and_hold_the_rates_of_each_side():
     assert still.history.segments[0].kind == "static"
 
 
+def test_segments_hold_the_constants_of_their_law():
+    def path(t):
+        g, speed, keep = 16.0, 3.0, 0.8
+        first = 0.15
+        second = first + 2 * speed / g
+        k = (t >= first).astype(int) + (t >= second)
+        since = t - np.array([first - 2 * speed / keep / g, first, second])[k]
+        up = np.array([speed / keep, speed, speed * keep])[k]
+        return rotations.identity(len(t)), np.stack([0.5 * t, 0 * t, up * since - 0.5 * g * since**2], -1)
+
+    fit, _ = observed(path, sigma=(1e-6 * SIZE, 1e-6))
+    assert [event.kind for event in fit.history.events] == ["impact", "impact"]
+    for segment in fit.history.segments:
+        np.testing.assert_allclose(segment.parameters["restitution"], 0.8, atol=1e-3)
+    assert "bounce_time" in fit.history.segments[-1].parameters
+    assert "bounce_time" not in fit.history.segments[0].parameters
+
+
 def test_two_impacts_are_both_found():
     def path(t):
         first, second = 0.2, 0.55
@@ -182,7 +200,7 @@ def test_a_body_that_friction_stopped_rests():
 def test_each_kind_of_break_is_tried_in_each_gap():
     rng = np.random.default_rng(3)
     fit = model_selection.fit(TIMES, rotations.identity(15), rng.normal(size=(15, 3)), radius=RADIUS)
-    assert {score.name for score in fit.scores} >= set(kinks.BREAKS)
+    assert {score.name for score in fit.scores} >= set(breaks.BREAKS)
 
 
 def test_a_small_change_of_the_rates_needs_more_evidence_than_a_large_one():
@@ -198,7 +216,7 @@ def test_bounces_that_no_pose_separates_are_one_event():
     parts |= {"v": np.array([1.0, 0, 0.5]), "a": np.array([0, 0, -10.0]), "r": ZERO, "e": ZERO}
     ball = candidates.BY_NAME["bounces"]
     theta = ball.pack(parts)
-    solution = candidates.Solution(ball, theta, np.eye(len(theta)), np.zeros((15, 6)), np.ones(15))
+    solution = candidates.FittedCandidate(ball, theta, np.eye(len(theta)), np.zeros((15, 6)), np.ones(15))
     assert len(ball.events(theta)) > 10
     found = fitted_motion.events(solution, 1.0, T_MAX, T_MAX)
     assert len(found) > 1
@@ -219,5 +237,5 @@ def test_a_law_that_moves_a_body_further_than_ever_is_implausible(acceleration, 
     track = pose_track.PoseTrack(tau, rotations.identity(15), 3.0 * tau[:, None] * [1, 0, 0], np.ones(15))
     law = candidates.BY_NAME["translation, quadratic"]
     theta = law.pack({"r": ZERO, "e": ZERO, "v": np.array([3.0, 0, 0]), "a": np.array([0, acceleration, 0])})
-    solution = candidates.Solution(law, theta, np.eye(len(theta)), np.zeros((15, 6)), np.ones(15))
+    solution = candidates.FittedCandidate(law, theta, np.eye(len(theta)), np.zeros((15, 6)), np.ones(15))
     assert search.runs_away(solution, track) == much

@@ -5,7 +5,7 @@ import pytest
 
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.motion.pose_track import PoseTrack
-from r5dgs_core.motion_fit import candidates, evidence, kinks, model_selection
+from r5dgs_core.motion_fit import breaks, candidates, model_scores, model_selection
 from tests.support import problems
 from tests.support.problems import MOTIONS, RADIUS, SIZE, T_MAX
 
@@ -369,9 +369,9 @@ def test_the_world_twist_can_be_requested():
 
 def test_the_table_names_every_candidate_and_covariance_is_stored():
     fit, _ = fitted("uniform", np.random.default_rng(13), 0.003, 0.01)
-    assert [s.name for s in fit.scores] == [*(c.name for c in candidates.FAMILY), *kinks.BREAKS]
+    assert [s.name for s in fit.scores] == [*(c.name for c in candidates.FAMILY), *breaks.BREAKS]
     best = min(s.evidence for s in fit.scores)
-    assert best <= next(s.evidence for s in fit.scores if s.name == fit.chosen) <= best + evidence.STRONG
+    assert best <= next(s.evidence for s in fit.scores if s.name == fit.chosen) <= best + model_scores.STRONG
     variances = np.diag(fit.model.covariance)
     assert fit.model.covariance_names[0] == "velocity.x"
     assert (variances[:3] > 0).all()

@@ -32,7 +32,7 @@ def observed(truths, rng, sigma=0.005 * SIZE):
     tracks, fits, lasts = [], [], []
     for truth in truths:
         quats, d, last_quat, last = problems.observe(truth, TIMES, rng, sigma, 2 * sigma)
-        tracks.append(shared_gravity.Track(TIMES, quats, d, np.ones(len(TIMES))))
+        tracks.append(shared_gravity.BodyTrack(TIMES, quats, d, np.ones(len(TIMES))))
         fits.append(model_selection.fit(TIMES, quats, d, radius=RADIUS))
         lasts.append((last_quat, last))
     return tracks, fits, lasts
@@ -48,7 +48,7 @@ def falls():
 def test_bodies_that_fall_share_gravity_and_are_predicted_better(falls, up):
     alone, together, sharing = [], [], []
     for tracks, fits, lasts in falls:
-        shared, who = shared_gravity.share(tracks, fits, up)
+        shared, who = shared_gravity.share_acceleration(tracks, fits, up)
         assert {0, 2} <= set(who)
         sharing += who
         for i in who:
@@ -69,7 +69,7 @@ def test_bodies_that_fall_share_gravity_and_are_predicted_better(falls, up):
 def test_bodies_with_deviating_acceleration_do_not_share_gravity():
     tracks, fits, _ = observed([*FALLING[:2], SPEEDING, SLIDING], np.random.default_rng(1), 0.002 * SIZE)
     assert fits[2].chosen == "translation, quadratic"
-    shared, who = shared_gravity.share(tracks, fits)
+    shared, who = shared_gravity.share_acceleration(tracks, fits)
     assert who == (0, 1)
     assert shared[2] is fits[2]
     assert shared[3] is fits[3]
@@ -79,26 +79,26 @@ def test_bodies_with_deviating_acceleration_do_not_share_gravity():
 def test_gravity_needs_at_least_two_agreeing_bodies():
     tracks, fits, _ = observed([FALLING[0], SPEEDING], np.random.default_rng(2), 0.002 * SIZE)
     for count in (0, 1, 2):
-        shared, who = shared_gravity.share(tracks[:count], fits[:count])
+        shared, who = shared_gravity.share_acceleration(tracks[:count], fits[:count])
         assert who == ()
         assert all(x is y for x, y in zip(shared, fits, strict=False))
 
 
 def test_bodies_with_equal_acceleration_share_it_only_if_they_fall():
     tracks, fits, _ = observed([SPEEDING, SPEEDING], np.random.default_rng(3), 0.002 * SIZE)
-    assert shared_gravity.share(tracks, fits)[1] == (0, 1)
-    assert shared_gravity.share(tracks, fits, np.array([0, 0, 1.0]))[1] == ()
+    assert shared_gravity.share_acceleration(tracks, fits)[1] == (0, 1)
+    assert shared_gravity.share_acceleration(tracks, fits, np.array([0, 0, 1.0]))[1] == ()
 
 
 def test_bodies_that_came_to_rest_do_not_share():
     tracks, fits, _ = observed(FALLING, np.random.default_rng(4))
     fits[0] = dataclasses.replace(fits[0], rested=True)
-    assert shared_gravity.share(tracks, fits)[1] == (1, 2)
+    assert shared_gravity.share_acceleration(tracks, fits)[1] == (1, 2)
 
 
 def test_without_noise_gravity_is_exact():
     tracks, fits, lasts = observed(FALLING, np.random.default_rng(5), 1e-9)
-    shared, who = shared_gravity.share(tracks, fits)
+    shared, who = shared_gravity.share_acceleration(tracks, fits)
     assert who == (0, 1, 2)
     for truth, fit, last in zip(FALLING, shared, lasts, strict=True):
         assert problems.error_percent(fit.model, truth, np.array([1.25]), *last)[0] < 0.01
@@ -107,4 +107,4 @@ def test_without_noise_gravity_is_exact():
 def test_a_direction_that_is_none_is_refused():
     for up in (np.zeros(3), np.array([1.0, np.nan, 0]), np.ones(2)):
         with pytest.raises(ValueError, match="up"):
-            shared_gravity.share([], [], up)
+            shared_gravity.share_acceleration([], [], up)

@@ -13,10 +13,11 @@ from r5dgs_core.scene import scene_file
 from tests.support import scenes
 
 RATES = {"velocity": (1.0, 0.0, 0.5), "acceleration": (0.0, 0.0, -9.0), "angular_velocity": (0.0, 2.0, 0.0)}
+DRAG = {**RATES, "damping": (2.5,), "precession": (1.0, 0.0, 0.0)}
 BAND = Band((0.75, 0.9, 1.5), (0.01, 0.02, 0.3), (0.0, 0.1, 0.5), predictable_until=1.1)
 HIT = History(
     (Event(0.31, "start", 0.01), Event(0.55, "impact", 0.002)),
-    (Segment(0.0, 0.31, "static", RATES), Segment(0.31, 0.55, "drag", RATES), Segment(0.55, 0.75, "drag", RATES)),
+    (Segment(0.0, 0.31, "static", RATES), Segment(0.31, 0.55, "drag", RATES), Segment(0.55, 0.75, "drag", DRAG)),
     BAND,
 )
 
@@ -39,6 +40,7 @@ def test_events_segments_and_band_survive_a_file(tmp_path):
     features = tree_of(path)["features"]
     assert [(row["name"], row["required"]) for row in features] == [("events", False)]
     assert tree_of(path)["groups"][1]["segments"][1]["from"] == 0.31
+    assert tree_of(path)["groups"][1]["segments"][2]["parameters"]["damping"] == 2.5
 
 
 def test_pose_errors_survive_a_file_and_grow_with_the_scene(tmp_path):

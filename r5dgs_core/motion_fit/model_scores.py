@@ -1,4 +1,4 @@
-"""Evidence for candidate motions: one score for laws with and without breaks.
+"""Scores of candidate motions: one score for laws with and without breaks.
 
 The score B of a candidate is its Cauchy loss in units of the noise level s2 of the best candidate, divided by the
 inflation a for noise that is correlated in time, plus P log(N / a) for its P parameters, with N numbers in the track,
@@ -15,7 +15,7 @@ import numpy as np
 
 from ..motion.pose_track import PoseTrack
 from . import candidates as families
-from .candidates import Noise, Solution
+from .candidates import FittedCandidate, Noise
 
 STRONG = 10.0  # minimum difference of scores for a break
 NEAR = 6.0  # maximum difference of scores within which the simplest law is chosen
@@ -25,7 +25,7 @@ _RHOS = np.linspace(0.0, 0.9, 19)  # tried correlations of neighbouring poses
 
 
 @dataclass(frozen=True)
-class Evidence:
+class NoiseLevel:
     """Noise level of a track, from all candidates together.
 
     Attributes:
@@ -39,37 +39,37 @@ class Evidence:
     inflation: float
 
     @staticmethod
-    def of(solutions: Sequence[Solution], least: float = 0.0) -> Evidence:
+    def of(solutions: Sequence[FittedCandidate], least: float = 0.0) -> NoiseLevel:
         """Noise level, at least ``least``, from solutions of which one must be close to the truth."""
         count = len(solutions[0].weights)
         numbers = 6 * count
         level = max(_LEAST_LEVEL, least, min(s.loss / max(numbers - s.parameters, 1) for s in solutions))
         best = min(solutions, key=lambda s: s.loss / level + s.parameters * math.log(numbers))
-        return Evidence(count, level, _inflation([best], count, best.parameters))
+        return NoiseLevel(count, level, _inflation([best], count, best.parameters))
 
     @staticmethod
-    def of_parts(parts: Sequence[Solution], least: float) -> Evidence:
+    def of_parts(parts: Sequence[FittedCandidate], least: float) -> NoiseLevel:
         """Noise level, at least ``least``, from solutions of successive parts of a track."""
         count, parameters = sum(len(s.weights) for s in parts), sum(s.parameters for s in parts)
         level = sum(s.loss for s in parts) / max(6 * count - parameters, 1)
-        return Evidence(count, max(_LEAST_LEVEL, least, level), _inflation(parts, count, parameters))
+        return NoiseLevel(count, max(_LEAST_LEVEL, least, level), _inflation(parts, count, parameters))
 
     @property
     def variance(self) -> float:
         """Factor of the parameters' covariance, s2 a."""
         return self.level * self.inflation
 
-    def score(self, solution: Solution) -> float:
+    def score(self, solution: FittedCandidate) -> float:
         """B of a candidate; less is better."""
-        return self.of_sums(solution.loss, solution.parameters, solution.candidate.placed)
+        return self.of_sums(solution.loss, solution.parameters, solution.candidate.discrete_choices)
 
-    def of_sums(self, loss: float, parameters: int, placed: int = 0) -> float:
+    def of_sums(self, loss: float, parameters: int, choices: int = 0) -> float:
         """Score B from a loss, the number of parameters and the number of choices of a pose."""
         penalty = parameters * math.log(6 * self.count / self.inflation)
-        return loss / self.variance + penalty + 2 * placed * math.log(self.count)
+        return loss / self.variance + penalty + 2 * choices * math.log(self.count)
 
 
-def variance(solution: Solution, track: PoseTrack, noise: Noise, evidence: Evidence) -> float:
+def covariance_factor(solution: FittedCandidate, track: PoseTrack, noise: Noise, noise_level: NoiseLevel) -> float:
     """Factor of the parameters' covariance for noise of an unknown correlation, at least that of the evidence.
 
     It is the mean of s2 (1 + rho) / (1 - rho), weighted by the restricted likelihood of rho, the correlation of
@@ -79,13 +79,13 @@ def variance(solution: Solution, track: PoseTrack, noise: Noise, evidence: Evide
         solution: The chosen solution, fitted to the track.
         track: Its poses.
         noise: Their noise.
-        evidence: Noise level of the track.
+        noise_level: Noise level of the track.
     """
     misses, slopes = families.linearized(solution.candidate, solution.theta, track, noise)
     weights = np.sqrt(solution.robust * solution.weights)[:, None]
     free = misses.size - len(slopes)
     if free <= 0:
-        return evidence.variance
+        return noise_level.variance
     steps = np.diff(track.tau) / np.median(np.diff(track.tau))
     phi = _RHOS[:, None, None] ** steps[:, None]  # [R, S - 1, 1]
     rest = np.sqrt(1 - phi**2)
@@ -101,14 +101,14 @@ def variance(solution: Solution, track: PoseTrack, noise: Noise, evidence: Evide
     logs = 12 * np.log(rest).sum((1, 2)) + np.linalg.slogdet(normal)[1] + free * np.log(losses)
     used = np.isfinite(logs)  # if only a weak prior determines a direction, exact poses hide it in rounding
     if not used.any():
-        return evidence.variance
+        return noise_level.variance
     variances = (losses / free * (1 + _RHOS) / (1 - _RHOS))[used]
     likelihoods = -0.5 * logs[used]
     shares = np.exp(likelihoods - likelihoods.max())
-    return max(evidence.variance, float(shares @ variances / shares.sum()))
+    return max(noise_level.variance, float(shares @ variances / shares.sum()))
 
 
-def _inflation(parts: Sequence[Solution], count: int, parameters: int) -> float:
+def _inflation(parts: Sequence[FittedCandidate], count: int, parameters: int) -> float:
     """a from the robustly weighted correlation of neighbouring residuals, which the fit reduces; corrected for that."""
     energy = product = 0.0
     for solution in parts:

@@ -8,7 +8,6 @@ after the break and are values at t_max, D rates are added before it.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,8 +15,9 @@ import numpy as np
 from ..motion import levenberg_marquardt, rotations, se3
 from ..motion.models import Block
 from ..motion.pose_track import PoseTrack
+from . import break_fits
 from . import candidates as families
-from .candidates import Candidate, Noise, Solution
+from .candidates import Candidate, FittedCandidate, Noise
 
 LEAST_AFTER = 2  # poses after a break
 _BLOCKS = {
@@ -30,6 +30,7 @@ _BLOCKS = {
     "h": Block(3, 100.0),
     "c": Block(1, 3.0),
 }
+_PRECISION = np.repeat([0.0, 0.0, *(1 / block.prior for block in _BLOCKS.values())], 3)[: break_fits.COUNT]
 _STEPS = 9
 _BEFORE, _AFTER = 4, 5  # poses of the first guess
 Parts = dict[str, np.ndarray]
@@ -50,6 +51,38 @@ class Break:
     blocks: tuple[str, ...]
     law: str
 
+    @property
+    def rests_before(self) -> bool:
+        """True if the body is at rest before the break."""
+        return self.event == "start"
+
+    @property
+    def rests_after(self) -> bool:
+        """True if the body is at rest after the break."""
+        return self.event == "stop"
+
+    @property
+    def starts_slowly(self) -> bool:
+        """True if the velocity is zero at the break."""
+        return self.rests_before and "v" not in self.blocks
+
+    @property
+    def keeps_spin(self) -> bool:
+        """True if the spin is the same on both sides."""
+        return "w" in self.blocks and "dw" not in self.blocks and not self.rests_before
+
+    @property
+    def bend(self) -> str | None:
+        """Block of the acceleration, or None."""
+        return next((block for block in "gah" if block in self.blocks), None)
+
+    def ways(self, t: np.ndarray, c: np.ndarray) -> dict[str, np.ndarray]:
+        """Factors of the blocks in the displacement, at times t of a break at c; [...] each."""
+        b, f = np.minimum(t - c, 0), np.maximum(t, c)
+        way = 0.5 * f**2 - c * f if self.starts_slowly else 0.5 * f**2 + (0 if self.rests_before else c * b)
+        found = {"v": f if self.rests_before else t, "dv": b, "g": 0.5 * t**2, "h": 0.5 * b**2, "a": way}
+        return {name: factor for name, factor in found.items() if name in self.blocks}
+
 
 BREAKS = {
     "start": Break("start", ("v", "w"), "translation + spin"),
@@ -64,7 +97,7 @@ BREAKS = {
 
 
 @dataclass(frozen=True)
-class Kink(Candidate):
+class BreakCandidate(Candidate):
     """A break between two neighbouring poses, or one such break per start if the limits are arrays [B, 1, 1, 1].
 
     Attributes:
@@ -82,11 +115,11 @@ class Kink(Candidate):
         return BREAKS[self.name]
 
     @property
-    def placed(self) -> int:
+    def discrete_choices(self) -> int:
         return 1
 
     @property
-    def last_choice(self) -> int:
+    def poses_with_choices(self) -> int:
         return self.gap + LEAST_AFTER
 
     def _block(self, name: str) -> Block:
@@ -100,29 +133,27 @@ class Kink(Candidate):
         p = {name: part[..., None, :] for name, part in self.parts(theta).items()}
         t, c = tau[:, None], self.time(p)
         b, f = np.minimum(t - c, 0), np.maximum(t, c)
-        rests = self.broken.event == "start"
-        v, w = p.get("v", np.zeros(3)), p.get("w", np.zeros(3))
-        if self.name == "drop":
-            v = -p["a"] * c
-        d = p["e"] + v * (f if rests else t)
-        for name, way in (("dv", b), ("g", 0.5 * t**2), ("h", 0.5 * b**2)):
-            if name in p:
-                d = d + p[name] * way
-        if "a" in p:
-            d = d + p["a"] * (0.5 * f**2 + (0 if rests else c * b))
+        d = p["e"]
+        for name, way in self.broken.ways(t, c).items():
+            d = d + p[name] * way
         quats = rotations.rotvecs_to_quats(p["r"])
         if "w" in p:
-            quats = rotations.multiply(rotations.rotvecs_to_quats(w * f), quats)
-        if "dw" in p:
-            quats = rotations.multiply(rotations.rotvecs_to_quats((w + p["dw"]) * b), quats)
-        elif "w" in p and not rests:
-            quats = rotations.multiply(rotations.rotvecs_to_quats(w * b), quats)
+            quats = rotations.multiply(rotations.rotvecs_to_quats(p["w"] * f), quats)
+        before = self._spin_before(p)
+        if before is not None:
+            quats = rotations.multiply(rotations.rotvecs_to_quats(before * b), quats)
         shape = np.broadcast_shapes(quats.shape[:-1], d.shape[:-1])
         return np.broadcast_to(quats, (*shape, 4)), d
 
+    def _spin_before(self, parts: Parts) -> np.ndarray | None:
+        """Spin before the break, or None if the body does not spin there."""
+        if "dw" in parts:
+            return parts.get("w", np.zeros(3)) + parts["dw"]
+        return None if self.broken.rests_before else parts.get("w")
+
     def jump(self, theta: np.ndarray) -> float:
         """Change of the rates by the break until t_max, relative to the largest rates on either side. [P]"""
-        if self.broken.event in ("start", "stop"):
+        if self.broken.rests_before or self.broken.rests_after:
             return 1.0
         p = self.parts(theta)
         left, none = -float(self.time(p)[0]), np.zeros(3)
@@ -140,14 +171,14 @@ class Kink(Candidate):
         p = self.parts(theta)
         c = self.time(p)
         after = {"r": p["r"], "e": p["e"], "w": p.get("w"), "a": p.get("a", p.get("g"))}
-        after["v"] = -p["a"] * c if self.name == "drop" else p.get("v")
+        after["v"] = -p["a"] * c if self.broken.starts_slowly else p.get("v")
         return np.concatenate([after[name] for name in ("r", "e", *self.law.blocks)], -1)
 
     def events(self, theta: np.ndarray) -> list[tuple[str, np.ndarray]]:
         return [(self.broken.event, self.time(self.parts(theta)))]
 
 
-def search(track: PoseTrack, noise: Noise, hopeless: float = np.inf, first_gap: int = 2) -> list[Solution]:
+def search(track: PoseTrack, noise: Noise, hopeless: float = np.inf, first_gap: int = 2) -> list[FittedCandidate]:
     """Fit all kinds of breaks in all gaps; the best gap of each kind.
 
     Args:
@@ -159,41 +190,43 @@ def search(track: PoseTrack, noise: Noise, hopeless: float = np.inf, first_gap: 
     gaps = np.arange(first_gap, len(track) - LEAST_AFTER + 1)
     if len(gaps) == 0 or len(track) < 5:
         return []
-    sides = _Sides(track, gaps)
+    sides, low, high = _Sides(track, gaps), track.tau[gaps - 1], track.tau[gaps]
+    kinds = [(kind, _candidate(name, track)) for name, kind in BREAKS.items()]
+    kinds = [(kind, family) for kind, family in kinds if family.parameters <= 6 * len(track) - 12]
+    if not kinds:
+        return []
+    starts = np.zeros((len(kinds), len(gaps), break_fits.COUNT))
+    for row, (kind, family) in enumerate(kinds):
+        guesses = np.array([family.pack(sides.guess(kind, k)) for k in range(len(gaps))])
+        starts[row][:, break_fits.rows_of(family)] = guesses
+    every = break_fits.Breaks.of([(family, kind.rests_before, kind.starts_slowly) for kind, family in kinds], low, high)
+    solved = levenberg_marquardt.solve_linearized(
+        lambda theta, rows: every.linearized(theta, rows, track, noise),
+        starts.reshape(-1, break_fits.COUNT),
+        weights=track.weights,
+        precision=_PRECISION,
+        softness=families.SOFTNESS,
+        steps=_STEPS,
+        enough=0.05,
+        hopeless=hopeless,
+        behind=families.HOPELESS_LOSS,
+    )
+    finite = np.isfinite(solved.cost) & np.isfinite(solved.normal).all((1, 2))
+    costs = np.where(finite, solved.cost, np.inf).reshape(len(kinds), -1)
     found = []
-    for name, kind in BREAKS.items():
-        low, high = track.tau[gaps - 1], track.tau[gaps]
-        kink = Kink(name, "ballistic_spin", (*kind.blocks, "c"), track.window)
-        if kink.parameters > 6 * len(track) - 12:
-            continue
-        starts = np.array([kink.pack(sides.guess(name, k)) for k in range(len(gaps))])
-        solved = levenberg_marquardt.solve_all(
-            _residuals(kink, low, high, track, noise),
-            starts,
-            weights=track.weights,
-            precision=kink.precision,
-            softness=families.SOFTNESS,
-            steps=_STEPS,
-            enough=0.05,
-            hopeless=hopeless,
-            behind=families.HOPELESS_LOSS,
-        )
-        cost = np.where(np.isfinite(solved.cost) & np.isfinite(solved.normal).all((1, 2)), solved.cost, np.inf)
-        best = int(np.argmin(cost))
-        if np.isfinite(cost[best]):
-            kink = replace(kink, low=float(low[best]), high=float(high[best]), gap=int(gaps[best]))
-            found.append(families.solution(kink, solved.row(best), track))
+    for row, (_, family) in enumerate(kinds):
+        best = int(np.argmin(costs[row]))
+        if np.isfinite(costs[row, best]):
+            chosen = replace(family, low=float(low[best]), high=float(high[best]), gap=int(gaps[best]))
+            own = break_fits.rows_of(family)
+            point = solved.row(row * len(gaps) + best)
+            normal = point.normal[np.ix_(own, own)]
+            found.append(FittedCandidate(chosen, point.x[own], normal, point.residuals, track.weights))
     return found
 
 
-def _residuals(
-    kink: Kink, low: np.ndarray, high: np.ndarray, track: PoseTrack, noise: Noise
-) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    def residuals(theta: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        here = replace(kink, low=low[rows, None, None, None], high=high[rows, None, None, None])
-        return families.residuals(here, theta, track, noise)
-
-    return residuals
+def _candidate(name: str, track: PoseTrack) -> BreakCandidate:
+    return BreakCandidate(name, "ballistic_spin", (*BREAKS[name].blocks, "c"), track.window)
 
 
 class _Sides:
@@ -218,35 +251,24 @@ class _Sides:
         turned = self._track.turned
         return mean - v * middle, v, (turned[stop - 1] - turned[start]) / max(float(tau[-1] - tau[0]), 1e-12)
 
-    def guess(self, name: str, k: int) -> Parts:
+    def guess(self, kind: Break, k: int) -> Parts:
         """First guess of a kind of break in gap ``k``."""
         track, gap = self._track, int(self._gaps[k])
         _, v1, w1, e2, v2, w2 = self._lines[k]
         tau, c = track.tau, 0.5 * (track.tau[gap - 1] + track.tau[gap])
-        kind = BREAKS[name]
         guess = {"e": e2, "v": v2, "w": w2, "dv": v1 - v2, "dw": w1 - w2, "c": np.zeros(1)}
-        columns = {"start": np.maximum(tau, c), "stop": np.ones_like(tau)}.get(kind.event, tau)
-        b, f = np.minimum(tau - c, 0), np.maximum(tau, c)
-        ways = {"g": 0.5 * tau**2, "a": 0.5 * f**2 + (0 if kind.event == "start" else c * b), "h": 0.5 * b**2}
-        bent = next((block for block in ways if block in kind.blocks), None)
-        if bent is not None:
-            way = 0.5 * np.maximum(tau - c, 0) ** 2 if name == "drop" else ways[bent]
-            first = [np.ones_like(tau)] + ([columns] if "v" in kind.blocks else [])
-            jump = [b] if "dv" in kind.blocks else []
-            fit = np.linalg.lstsq(np.stack([*first, *jump, way], -1), track.displacements, rcond=None)[0]
-            guess["e"], guess[bent] = fit[0], fit[-1]
-            if "v" in kind.blocks:
-                guess["v"] = fit[1]
-            if jump:
-                guess["dv"] = fit[-2]
-            if name == "switch":
-                guess["w"] = track.spin
-            if name == "drop":
-                guess["e"] = fit[0] + fit[-1] * 0.5 * c**2
-        if kind.event == "stop":
+        if kind.bend is not None:
+            ways = kind.ways(tau, np.array(c))
+            fitted = [name for name in ("v", "dv", kind.bend) if name in ways]
+            columns = np.stack([np.ones_like(tau), *(ways[name] for name in fitted)], -1)
+            found = np.linalg.lstsq(columns, track.displacements, rcond=None)[0]
+            guess |= dict(zip(("e", *fitted), found, strict=True))
+        if kind.keeps_spin:
+            guess["w"] = track.spin
+        if kind.rests_after:
             mean = rotations.normalize(track.quats[gap:].mean(0))
             guess |= {"r": rotations.quats_to_rotvecs(mean), "dw": w1}
-            guess |= {} if bent else {"e": track.displacements[gap:].mean(0), "dv": v1}
+            guess |= {} if kind.bend else {"e": track.displacements[gap:].mean(0), "dv": v1}
         elif "w" in kind.blocks:
             back = rotations.rotvecs_to_quats(-guess["w"] * tau[gap])
             guess["r"] = rotations.quats_to_rotvecs(rotations.multiply(back, track.quats[gap]))
