@@ -104,7 +104,7 @@ def _of_modes(
 def _of_models(
     scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], later: np.ndarray, rounds: int, clock: str
 ) -> tuple[list[Row], list[str]]:
-    """Measure each motion model alone, the selected one, and its confidence band."""
+    """Measure each motion model alone, the selected one, and the confidence band that the scene stores."""
     times = bodies[0].times[later]
     taus = times - scene.t_max
     fitted = {name: fit_all(scene, bodies, (name, STEADY[name]) if name in STEADY else (name,)) for name in MODELS}
@@ -127,7 +127,7 @@ def _of_models(
         notes += [f"{STEADY[name]} if nothing swings"] if name in STEADY else []
         label = {"task": "poses", "mode": "rigid/fitted", "method": name, "setting": setting, "note": "; ".join(notes)}
         rows += errors(scene, bodies, later, predicted, {**label, **timed[name].columns(clock), "ms_once_cpu": some.ms})
-    band, absent = _band(bodies, chosen, times, taus)
+    band, absent = _band(bodies, times, taus)
     return rows + band, absent
 
 
@@ -237,37 +237,37 @@ def errors(
 
 
 def _band(
-    bodies: tuple[ground_truth_poses.Body, ...], chosen: FittedMethod, times: np.ndarray, taus: np.ndarray
+    bodies: tuple[ground_truth_poses.Body, ...], times: np.ndarray, taus: np.ndarray
 ) -> tuple[list[Row], list[str]]:
-    """Return the share of errors outside the 95 % band, over bodies and times within reach of the band.
+    """Return the share of errors of the stored motions outside their stored 95 % bands, over bodies and times.
 
-    The error of a body is the RMS over a sphere of its radius: |dd|^2 + 2/3 (dtheta radius)^2. If the images do not
-    determine the rotation of the body, it is the position error.
+    Only times up to the last knot of a band count. The error of a body is the RMS over a sphere of its radius:
+    |dd|^2 + 2/3 (dtheta radius)^2. If the images do not determine the rotation of the body, it is the position error.
     """
     inside, count, widths = 0, 0, []
-    for body, fit in zip(bodies, chosen.fits, strict=True):
-        band = None if fit is None else fit.history.band
-        if fit is None or band is None:
+    for body in bodies:
+        band, model = body.group.history.band, body.group.model
+        if band is None:
             continue
         reached = times <= band.times[-1] + _SAME
         truth = body.motion[np.isin(body.times, times)]
-        distances, angles = metrics.pose_errors(model_motion(body, fit.model, taus), truth, body.group.pivot)
+        distances, angles = metrics.pose_errors(model_motion(body, model, taus), truth, body.group.pivot)
         if not body.turn_seen:  # then neither its rotation nor the pivot's place in the true body is known
-            places = body.group.pivot + models.evaluate(fit.model, taus)[1]
+            places = body.group.pivot + models.evaluate(model, taus)[1]
             distances, angles = np.linalg.norm(places - body.path[np.isin(body.times, times)], axis=-1), 0.0 * angles
-        errors = np.sqrt(distances**2 + 2 / 3 * (np.radians(angles) * fit.model.radius) ** 2)
+        errors = np.sqrt(distances**2 + 2 / 3 * (np.radians(angles) * model.radius) ** 2)
         half = band.widths(times)
         inside += int((errors <= half)[reached].sum())
         count += int(reached.sum())
         widths.append(float(half[reached][-1]) / body.size if reached.any() else np.nan)
     if count == 0:
-        return [], ["poses: no body has a confidence band that reaches the times of the truth"]
+        return [], ["poses: the scene stores no confidence band that reaches the times of the truth"]
     width = f"; median half width at the last time {np.nanmedian(widths):.3g} of the size"
     row = Row(
         task="poses",
         mode="rigid/fitted",
         method="outside 95 % band",
-        setting=CHOSEN,
+        setting="as baked",
         error_kind="outside_band",
         error=1 - inside / count,
         count=count,

@@ -27,6 +27,7 @@ from r5dgs_core.error_vs_time import (
 from r5dgs_core.error_vs_time import report as error_vs_time_report
 from r5dgs_core.evaluation import ground_truth_poses
 from r5dgs_core.motion import models, se3
+from r5dgs_core.motion.history import NONE, Band, History
 from r5dgs_core.motion_fit import candidates
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
@@ -63,7 +64,11 @@ def quick(monkeypatch):
 
 @pytest.fixture(scope="module")
 def scene():
-    return scenes.make_scene(n=240, objects=4, seed=5, identities=False)
+    """A scene whose bodies have wide confidence bands."""
+    made = scenes.make_scene(n=240, objects=4, seed=5, identities=False)
+    wide = History(band=Band((made.t_max, 2.0), (1.0, 1.0), (1.0, 1.0)))
+    groups = [dataclasses.replace(g, history=wide) if g.role == "body" else g for g in made.groups]
+    return dataclasses.replace(made, groups=tuple(groups))
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +189,21 @@ def test_each_motion_model_is_right_about_its_own_motion(scene, data, monkeypatc
     assert chosen.error_worst < 0.02 and chosen.ms_once_cpu > 0
     assert only(rows, method="static", error_kind="position").error_worst > 0.2
     band = only(rows, error_kind="outside_band")
-    assert 0 <= band.error <= 1 and math.isnan(band.ms) and not band.pareto
+    assert band.error == 0 and math.isnan(band.ms) and not band.pareto
+
+
+def test_the_stored_band_is_compared_with_the_stored_motion(scene):
+    truth = truth_of(scene)
+    narrow = History(band=Band((scene.t_max, 2.0), (1e-6, 1e-6), (1e-6, 1e-6)))
+    groups = list(scene.groups)
+    groups[2] = dataclasses.replace(groups[2], history=narrow)
+    off = changed_group(dataclasses.replace(scene, groups=tuple(groups)), 2, velocity=[5.0, 0, 0])
+    rows, _ = pose_task.measure(off, truth, 1)
+    count = sum(group.role == "body" for group in scene.groups)
+    assert only(rows, error_kind="outside_band").error == pytest.approx(1 / count)
+    bare = dataclasses.replace(scene, groups=tuple(dataclasses.replace(g, history=NONE) for g in scene.groups))
+    rows, missing = pose_task.measure(bare, truth, 1)
+    assert not pick(rows, error_kind="outside_band") and any("band" in line for line in missing)
 
 
 def truth_of(scene):
