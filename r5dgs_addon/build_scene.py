@@ -2,7 +2,8 @@
 
 Notation: the root carries the world convention W. The anchor of motion group g sits at the group's pivot p and is
 animated with the group's pose (R, d). A bind-state point x appears at W T(p + d) R T(-p) x, where T(-p) is the point
-cloud's parent inverse. The point cloud therefore stores the coordinates of the scene file unchanged.
+cloud's parent inverse. The point cloud therefore stores the coordinates of the scene file unchanged. The anchor of a
+part with a parent sits at its joint, under the anchor of the parent, and is animated relative to it.
 """
 
 import math
@@ -15,10 +16,10 @@ from mathutils import Matrix, Vector
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.color import srgb
+from ..r5dgs_core.playback import group_dynamics
 from ..r5dgs_core.scene import cameras, spherical_harmonics
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
 from ..r5dgs_core.scene.splats import to_opacities
-from ..r5dgs_core.shapes import object_hulls
 from . import compat
 from .motion import event_markers, exact_mode, keyframes, physics
 from .scene import (
@@ -189,19 +190,19 @@ def _objects(
                 object_names.fit(name if key[1] else name + object_names.OTHERS_SUFFIX)
             )
             above.children.link(children[key])
-    bodies = object_hulls.bodies(scene)
-    hulls = {(hull.object_id, hull.motion_id): hull.vertices.ravel().tolist() for hull in scene.hulls}
     anchors = {}
-    for part in anchor_ranges(scene, parts):
+    depths = {group.id: number for number, (group, _) in enumerate(group_dynamics.parts_of(scene), start=1)}
+    for part in sorted(anchor_ranges(scene, parts), key=lambda own: depths.get(own.motion_id, 0)):  # parents come first
         home = children[part.object_id, part == largest[part.object_id]]
-        anchors[_anchor_key(part)] = _anchor(home, root, scene, part, largest, extent)
+        anchors[_anchor_key(part)] = anchor = _anchor(home, root, scene, part, largest, extent)
+        parent = anchors.get((0, scene.groups[part.motion_id].parent))
+        if parent is not None:  # locations stay in the axes of the bind state
+            anchor.parent, anchor.matrix_parent_inverse = parent, Matrix.Translation(-Vector(parent.r5dgs.pivot))
     for part, data in zip(parts, compat.new_point_clouds([part.count for part in parts]), strict=True):
         point_clouds.fill(data, scene, slice(part.start, part.start + part.count), extent, sh_degree)
         data.materials.append(material)
         home = children[part.object_id, part == largest[part.object_id]]
-        cloud = _cloud(home, anchors[_anchor_key(part)], scene, part, largest, data)
-        if (part.object_id, part.motion_id) in bodies:
-            cloud[loaded_scenes.HULL] = hulls.get((part.object_id, part.motion_id), [])
+        _cloud(home, anchors[_anchor_key(part)], scene, part, largest, data)
     return anchors
 
 
@@ -230,9 +231,9 @@ def _root(collection: bpy.types.Collection, scene: Scene, convention: str) -> bp
 
 
 def _pivot(scene: Scene, part: Range) -> np.ndarray:
-    """Position of a range's anchor: the group's pivot, or the object's median point for the pinned group. [3]"""
+    """Position of an anchor: the pivot or joint of the group, or for the pinned group the median of the object. [3]"""
     if part.motion_id != 0:
-        return np.asarray(scene.groups[part.motion_id].pivot, np.float64)
+        return scene.groups[part.motion_id].home
     if part.object_id <= 0:
         return np.zeros(3)
     return np.median(scene.gaussians.means[part.start : part.start + part.count].astype(np.float64), axis=0)
@@ -252,7 +253,13 @@ def _part_name(scene: Scene, part: Range, largest: dict[int, Range]) -> str:
         return f"{owner} shadow" if part.object_id <= 0 else f"{name} with {owner} shadow"
     if part == largest[part.object_id]:
         return name
+    if part.motion_id and group.object_id == part.object_id:
+        return f"{name} part {[g.id for g in scene.groups if _is_part(g, part.object_id)].index(group.id) + 1}"
     return f"{name} still" if part.motion_id == 0 else f"{name} with {object_name(scene, group.object_id)}"
+
+
+def _is_part(group: MotionGroup, object_id: int) -> bool:
+    return group.role == "body" and group.object_id == object_id
 
 
 def _anchor(

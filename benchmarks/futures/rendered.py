@@ -5,8 +5,7 @@
 Renders each scene of `rendered_scenes`, trains and bakes it. Columns, per object:
 
     place      largest error of its place at the observed times, in % of its size
-    turn       median and largest error of its rotation there, degrees; of the body whose rotation is best known if
-               several bodies have its id
+    turn       median and largest error of its rotation there, degrees
     future     error of its place at t = 1 in % of its size, and of its rotation, degrees
     warning    reason why its motion is reported as not predictable, if it is
 

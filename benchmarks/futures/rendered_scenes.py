@@ -8,6 +8,7 @@
 | hidden | a box appears late; a ball passes behind a screen for a third of the time |
 | arm | two links, one id each |
 | one_arm | the same links under one id |
+| flag | a strip that waves, of ten slabs under one id |
 """
 
 from __future__ import annotations
@@ -199,6 +200,30 @@ def _arm(rng: np.random.Generator, lower_id: int) -> list[Body]:
     ]
 
 
+def flag(rng: np.random.Generator) -> list[Body]:
+    """A strip on a pole, bent by a wave that travels along it and grows towards its free end."""
+    count, length = 10, 1.7
+    amplitude, waves, speed = rng.uniform(0.25, 0.35), rng.uniform(3.0, 4.0), rng.uniform(5.0, 7.0)
+
+    def slab(k: int) -> Motion:
+        s = length * (k + 0.5) / count
+
+        def path(t: float) -> tuple[np.ndarray, Rotation]:
+            phase = waves * s - speed * t
+            share = amplitude / length
+            slope = share * (math.sin(phase) + waves * s * math.cos(phase))
+            place = np.array([s - 0.5 * length, share * s * math.sin(phase), 0.6])
+            return place, _turned(math.atan(slope) * UP)
+
+        return path
+
+    half = (0.5 * length / count + 0.02, 0.04, 0.4)
+    return [
+        Body(f"slab {k}" if k else "flag", 1, ray_tracer.box(half), ray_tracer.patches(rng, 12), 0.44, slab(k))
+        for k in range(count)
+    ]
+
+
 SCENES: dict[str, Callable[[np.random.Generator], list[Body]]] = {
     "balls": balls,
     "sliders": sliders,
@@ -206,6 +231,7 @@ SCENES: dict[str, Callable[[np.random.Generator], list[Body]]] = {
     "hidden": hidden,
     "arm": lambda rng: _arm(rng, 2),
     "one_arm": lambda rng: _arm(rng, 1),
+    "flag": flag,
 }
 
 
@@ -241,18 +267,18 @@ def write(folder: Path, name: str, seed: int) -> None:
             frames.append({"file_path": f"./{split}/r_{i:03d}", "time": float(t), "transform_matrix": matrix})
         content = {"camera_angle_x": FIELD_OF_VIEW, "frames_per_unit": 60.0, "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
-    named = {b.object_id: b for b in reversed(bodies) if b.object_id}
+    names = {body.object_id: body.name for body in reversed(bodies) if body.object_id}
     rows = []
     every = [float(t) for t in (*times, *LATER)]
-    for key in sorted(named):
+    for body in sorted((body for body in bodies if body.object_id), key=lambda body: body.object_id):
         matrices = []
         for t in every:
             matrix = np.eye(4)
-            matrix[:3, 3], turn = named[key].path(t)
+            matrix[:3, 3], turn = body.path(t)
             matrix[:3, :3] = turn.as_matrix()
             matrices.append(matrix.tolist())
-        rows.append({"id": key, "name": named[key].name, "matrices": matrices})
-    (folder / "objects.json").write_text(json.dumps({key: body.name for key, body in named.items()}))
+        rows.append({"id": body.object_id, "name": body.name, "matrices": matrices})
+    (folder / "objects.json").write_text(json.dumps(names))
     (folder / "ground_truth.json").write_text(json.dumps({"t_max": T_MAX, "times": every, "objects": rows}))
 
 

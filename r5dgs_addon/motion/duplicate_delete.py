@@ -47,7 +47,7 @@ def clouds_of(anchor: bpy.types.Object) -> list[bpy.types.Object]:
 def duplicate(
     context: bpy.types.Context, anchors: list[bpy.types.Object], offset: tuple[float, float, float], shadows: bool
 ) -> list[bpy.types.Object]:
-    """Copy anchors with their point clouds, motion and, optionally, shadows, each object into a collection of its own.
+    """Copy anchors with their parts, point clouds, motion and, optionally, shadows, each into a collection of its own.
 
     The copies share the points of the originals and have their own actions. Their offset is a delta transform, which
     keyframes do not overwrite.
@@ -59,11 +59,12 @@ def duplicate(
         shadows: True to copy the anchors that follow these, too.
 
     Returns:
-        The new anchors in the order of ``anchors``, followed by those of the shadows.
+        The new anchors in the order of ``anchors``, followed by those of further parts and of the shadows.
 
     Raises:
         ConfigError: An anchor belongs to another .blend file.
     """
+    anchors = extrapolate.with_parts(anchors)
     everyone = [*anchors, *(extrapolate.followers(anchors) if shadows else ())]
     for anchor in everyone:
         curve_place.check_local(anchor)
@@ -78,7 +79,10 @@ def duplicate(
             copy.r5dgs_motion.tube = None
             collection.objects.link(copy)
             _copy_actions(copy)
-            copy.delta_location = np.array(copy.delta_location) + np.array(offset)
+            if anchor.parent in copies:
+                copy.parent, copy.matrix_parent_inverse = copies[anchor.parent], anchor.matrix_parent_inverse
+            else:
+                copy.delta_location = np.array(copy.delta_location) + np.array(offset)
             for cloud in clouds_of(anchor):
                 twin = cloud.copy()
                 collection.objects.link(twin)
@@ -114,7 +118,7 @@ def _copy_actions(obj: bpy.types.Object) -> None:
 
 
 def delete(context: bpy.types.Context, anchors: list[bpy.types.Object], shadows: bool) -> tuple[int, list[str]]:
-    """Remove anchors with their point clouds, actions, helpers and, optionally, shadows. Empty collections are removed.
+    """Remove anchors with their parts, point clouds, actions, helpers and, optionally, shadows, and empty collections.
 
     Other children of an anchor are unparented and keep their world transform. Unused points are removed.
 
@@ -129,6 +133,7 @@ def delete(context: bpy.types.Context, anchors: list[bpy.types.Object], shadows:
     Raises:
         ConfigError: An anchor belongs to another .blend file; nothing was removed.
     """
+    anchors = extrapolate.with_parts(anchors)
     everyone = [*anchors, *(extrapolate.followers(anchors) if shadows else ())]
     for anchor in everyone:
         curve_place.check_local(anchor)

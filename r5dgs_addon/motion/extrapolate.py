@@ -61,6 +61,14 @@ def followers(anchors: Iterable[bpy.types.Object]) -> list[bpy.types.Object]:
     ]
 
 
+def with_parts(anchors: Iterable[bpy.types.Object]) -> list[bpy.types.Object]:
+    """The given anchors, and those of the parts that they carry."""
+    found = list(dict.fromkeys(anchors))
+    for anchor in found:
+        found += [child for child in anchor.children if child.r5dgs.role == "ANCHOR" and child not in found]
+    return found
+
+
 def re_extrapolate(anchors: list[bpy.types.Object], t_end: float | None = None) -> list[bpy.types.Object]:
     """Write the keys past t_max of anchors and their followers from their motions.
 
@@ -92,7 +100,9 @@ def _plan(anchor: bpy.types.Object, t_end: float | None, most: int) -> PendingKe
     if times.t_end > times.t_max:
         allowed, reach = physics.key_error(anchor)
         sample, model = _sampler(anchor, location, quat, times, most)
-        future = keyframes.reduced_keys(sample, times.t_max, times, allowed, reach, most, model)
+        stop = physics.stop_time(physics.mover(anchor))
+        sample = keyframes.stopped(sample, times.t_max, stop)
+        future = keyframes.reduced_keys(sample, times.t_max, times, allowed, reach, most, model, stop)
         too_fast = not future.followed
         tails = {
             "location": fcurves.frames(future.location, times),
@@ -244,7 +254,7 @@ def read_source(anchors: list[bpy.types.Object], path: Path) -> Scene:
     scene = scene_file.read(path)
     for anchor in anchors:
         motion_id = anchor.r5dgs.motion_id
-        pivot = np.float32(scene.groups[motion_id].pivot) if motion_id < len(scene.groups) else None
+        pivot = np.float32(scene.groups[motion_id].home) if motion_id < len(scene.groups) else None
         if pivot is None or (motion_id and (np.array(anchor.r5dgs.pivot, np.float32) != pivot).any()):
             raise errors.SceneFileError(f"{path}: expected the scene of '{anchor.name}', found another; load it again")
     return scene

@@ -14,7 +14,7 @@ import numpy as np
 from ...r5dgs_core.motion import cubic_curves, models, rotations
 from ...r5dgs_core.motion import key_reduction as reduction
 from ...r5dgs_core.motion.cubic_curves import Curves, Keys
-from ...r5dgs_core.playback import group_dynamics, scene_player
+from ...r5dgs_core.playback import group_dynamics
 from ...r5dgs_core.scene import row_runs
 from ...r5dgs_core.scene.scene import Scene
 from .. import compat
@@ -56,7 +56,7 @@ def animate(
         return
     fcurves = compat.own_fcurves(anchor, anchor.name)
     if moves:
-        pivot = np.asarray(scene.groups[motion_id].pivot, np.float64)
+        pivot = scene.groups[motion_id].home
         placed = Keys(location.times, location.values + pivot, location.left_slopes, location.right_slopes)
         write(fcurves, "location", placed, times)
     if turns:
@@ -74,7 +74,8 @@ def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float
         reach: Reach of the group, from `reaches`.
 
     Returns:
-        Displacement of the pivot and rotation, with a key at t_max unless they are constant.
+        Displacement of the anchor and rotation, in the frame of its parent if the group is a part, with a key at t_max
+        unless they are constant.
     """
     allowed = tolerance * scene.extent
     observed = _observed(scene, motion_id, allowed, reach)
@@ -82,7 +83,22 @@ def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float
         return observed
     most = intervals_per_object(len(scene.groups))
     sample, model = _future(scene, motion_id, most)
-    return cubic_curves.join(observed, reduced_keys(sample, scene.t_max, times, allowed, reach, most, model))
+    joint = scene.groups[motion_id].joint
+    stop = None if joint is None else joint.stop_time
+    return cubic_curves.join(observed, reduced_keys(sample, scene.t_max, times, allowed, reach, most, model, stop))
+
+
+def stopped(sample: reduction.Sampler, start: float, stop_time: float | None) -> reduction.Sampler:
+    """Sampler of a motion since ``start`` that rests from ``stop_time`` on, if it is not None."""
+    if stop_time is None:
+        return sample
+
+    def held(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        quats, displacements, quat_slopes, slopes = sample(np.minimum(at, start + stop_time))
+        moving = (at < start + stop_time)[:, None]
+        return quats, displacements, quat_slopes * moving, slopes * moving
+
+    return held
 
 
 def intervals_per_object(objects: int) -> int:
@@ -98,6 +114,7 @@ def reduced_keys(
     reach: float,
     most: int,
     model: models.MotionModel,
+    stop_time: float | None = None,
 ) -> Curves:
     """Reduced keys from a scene time to the end.
 
@@ -109,8 +126,11 @@ def reduced_keys(
         reach: Largest distance of a member from the pivot, world units.
         most: Maximum number of intervals between keys, from `intervals_per_object`.
         model: Motion behind the samples since ``start``, whose kinks become keys.
+        stop_time: Time since ``start`` at which the motion stops, which becomes a key, too; None if it does not.
     """
     kinks = start + models.kinks(model, times.t_end - start)
+    if stop_time is not None and 0 < stop_time < times.t_end - start:
+        kinks = np.append(kinks[kinks < start + stop_time], start + stop_time)
     frames = reduction.FrameTimes(times.time(0.0), 1 / times.frames_per_unit)
     nearest = NEAREST / times.frames_per_unit
     return reduction.reduce(sample, start, times.t_end, allowed, reach, kinks.tolist(), nearest, frames, most)
@@ -120,7 +140,7 @@ def reaches(scene: Scene) -> np.ndarray:
     """Largest distance of a member from the pivot of each motion group. [G] float64"""
     result = np.zeros(len(scene.groups))
     for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
-        pivot = np.asarray(scene.groups[g].pivot, np.float64)
+        pivot = scene.groups[g].home
         squares = np.zeros(stop - start)
         for axis in range(3):  # one column at a time, because numpy is slow for rows of three
             arms = scene.gaussians.means[start:stop, axis] - pivot[axis]
@@ -132,9 +152,8 @@ def reaches(scene: Scene) -> np.ndarray:
 def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Curves:
     """One key per knot, which is exact, or fewer keys if they stay within the tolerance."""
     times = np.asarray(scene.tracks.times, np.float64)
-    own = slice(motion_id, motion_id + 1)
-    quats, displacements = (values[0] for values in group_dynamics.knots(scene, own))
-    quat_slopes, displacement_slopes = (values[0] for values in scene_player.knot_slopes(scene, own))
+    quats, displacements = group_dynamics.local_knots(scene, scene.groups[motion_id])
+    quat_slopes, displacement_slopes = (cubic_curves.slopes(times, values) for values in (quats, displacements))
     exact = Curves(
         Keys(times, displacements, displacement_slopes, displacement_slopes),
         Keys(times, quats, quat_slopes, quat_slopes),
@@ -186,10 +205,11 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
 
 
 def _future(scene: Scene, motion_id: int, most: int) -> tuple[reduction.Sampler, models.MotionModel]:
-    """Sampler past t_max and its model: the group's own, or the leader's as in `scene_player.group_poses`."""
+    """Sampler past t_max and its model: the anchor's own, or the leader's as in `scene_player.group_poses`."""
     group = scene.groups[motion_id]
     if group.follows is None or group.follow_matrix is None:
-        return reduction.model_sampler(group.model, scene.t_max, most), group.model
+        model, stop = group.own_model, None if group.joint is None else group.joint.stop_time
+        return stopped(reduction.model_sampler(model, scene.t_max, most), scene.t_max, stop), model
     model = scene.groups[group.follows].model
     leader = reduction.model_sampler(model, scene.t_max, most)
     follow = np.asarray(group.follow_matrix, np.float64)

@@ -52,7 +52,8 @@ def remember(
         state = anchor.r5dgs_motion
         state.learned = json.dumps(
             {
-                "model": group.model.to_dict(),
+                "model": group.own_model.to_dict(),
+                "stop_time": None if group.joint is None else group.joint.stop_time,
                 "history": history_json.tree(group.history),
                 "follow_matrix": None if group.follow_matrix is None else np.asarray(group.follow_matrix).tolist(),
                 "reach": float(reaches[motion_id]) if motion_id else 0.0,
@@ -61,7 +62,7 @@ def remember(
         )
         state.frames_per_unit = scene.frames_per_unit
         state.leader = state.learned_leader = leader
-        set_fields(state, group.model)
+        set_fields(state, group.own_model)
         store_digests(anchor, times)
 
 
@@ -156,6 +157,12 @@ def basis(state: bpy.types.PropertyGroup) -> MotionModel:
     if state.taken:
         return MotionModel.from_dict(_parsed(state.taken))
     return MotionModel.from_dict(_parsed(state.learned)["model"]) if state.learned else models.STATIC
+
+
+def stop_time(anchor: bpy.types.Object) -> float | None:
+    """Time past t_max at which an anchor reaches a limit of its joint, or None; unknown once the motion is edited."""
+    state = anchor.r5dgs_motion
+    return None if state.taken or not state.learned or edited(state) else _parsed(state.learned).get("stop_time")
 
 
 def history(anchor: bpy.types.Object) -> History:

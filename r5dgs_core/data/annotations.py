@@ -19,7 +19,7 @@ class GroundTruth:
 
     Attributes:
         times: Times of the poses, increasing. [T]
-        object_ids: Ids, in the order of ``matrices``. (M,)
+        object_ids: Ids, in the order of ``matrices``; an object of several rigid bodies has one entry for each. (M,)
         names: Names, in the same order. (M,)
         matrices: Object to world. [M, T, 4, 4]
         t_max: Last observed time according to the capture.
@@ -106,6 +106,6 @@ def read_ground_truth(root: Path) -> GroundTruth | None:
         ) from error
     if times.ndim != 1 or not (np.isfinite(matrices).all() and np.isfinite(times).all() and (np.diff(times) > 0).all()):
         raise errors.DatasetError(f"{path}: expected finite poses at increasing times")
-    if len(set(ids)) != len(ids):
-        raise errors.DatasetError(f"{path}: an object id appears twice")
+    if len(set(zip(ids, names, strict=True))) != len(ids):
+        raise errors.DatasetError(f"{path}: an object id appears twice; give the parts of an object different names")
     return GroundTruth(times, ids, names, matrices, t_max)

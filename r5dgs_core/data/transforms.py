@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors, findings, strict_json
-from ..scene.validation import MOST_TIME
+from ..scene.model_checks import MOST_TIME
 
 RIGID_TOLERANCE = 1e-3
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")

@@ -115,20 +115,26 @@ def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[
     """
     quats, moves = group_dynamics.knots(scene)
     known = np.concatenate([quats, moves], axis=-1)
+    carried = {group.id: number for number, (group, _) in enumerate(group_dynamics.parts_of(scene), start=1)}
     courses = [_course(scene, cluster, known) for cluster in found]
     later = np.asarray(times[len(scene.tracks.times) :], np.float64) - scene.t_max
     groups: dict[int, tuple[MotionGroup, bool]] = {}
-    for follows in (False, True):  # groups that follow another come last
-        for cluster, course in zip(found, courses, strict=True):
-            if cluster.id == 0 or not cluster.pieces:
-                groups[cluster.id] = replace(cluster.source, id=cluster.id), True
-            elif (cluster.source.follows is not None) == follows:
-                leaders = [
-                    (courses[other.id], *groups[other.id])
-                    for other in found[1:]
-                    if other.source.id == cluster.source.follows and other.id in groups
-                ]
-                groups[cluster.id] = _go_on(scene, cluster, course, leaders, later, notes)
+
+    def turn(
+        cluster: Cluster,
+    ) -> tuple[bool, int]:  # parts come after their parents, and groups that follow another last
+        return cluster.source.follows is not None, carried.get(cluster.source.id, 0)
+
+    for cluster in sorted(found, key=turn):
+        if cluster.id == 0 or not cluster.pieces:
+            groups[cluster.id] = replace(cluster.source, id=cluster.id), True
+            continue
+        leaders = [
+            (courses[other.id], *groups[other.id])
+            for other in found[1:]
+            if other.source.id in (cluster.source.follows, cluster.source.parent) and other.id in groups
+        ]
+        groups[cluster.id] = _go_on(scene, cluster, courses[cluster.id], leaders, later, notes)
     return [
         MovedCluster(
             cluster.pieces,
@@ -171,6 +177,9 @@ def _pivot(scene: Scene, cluster: Cluster, allowed: float) -> np.ndarray:
     if cluster.source.id == 0:
         own = np.median(scene.gaussians.means[first.start : first.start + first.count].astype(np.float64), axis=0)
     pivot = bind[:3, :3] @ own + bind[:3, 3] if first.pivot is None else np.asarray(first.pivot, np.float64)
+    home = bind[:3, :3] @ cluster.source.home + bind[:3, 3]  # a part's anchor is at its joint
+    if cluster.source.joint is not None and np.linalg.norm(pivot - home) <= allowed:
+        pivot = bind[:3, :3] @ own + bind[:3, 3]
     return own if np.linalg.norm(pivot - own) <= allowed else pivot
 
 
@@ -210,6 +219,14 @@ def _go_on(
     def shown(q: np.ndarray, d: np.ndarray) -> bool:
         return bool((fit_drawn_curve.pose_errors(q, d, quats, moves, course.reach) <= course.allowed).all())
 
+    if source.joint is not None:
+        quats_of, moves_of = _played(scene, source.id, later)
+        if shown(*_turned(quats_of, moves_of, course.parent)):
+            for leading, parent, _ in leaders:
+                if (carried := _carried(scene, source, course, leading, parent)) is not None:
+                    return replace(carried, **known), course.same and carried.joint is source.joint
+        notes.append(f"{first.name}: its joint is left out, as its motion or that of its parent was edited")
+        source = replace(source, parent=None, joint=None)
     if source.follows is not None and source.follow_matrix is not None:
         for leading, leader, as_before in leaders:
             matrix = course.parent @ source.follow_matrix @ np.linalg.inv(leading.parent)
@@ -234,3 +251,39 @@ def _go_on(
         )
     history = replace(source.history, band=None, errors=None)
     return replace(source, **known, model=model, follows=None, follow_matrix=None, history=history), False
+
+
+def _played(scene: Scene, group: int, later: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of a group at times since t_max, as in playback. [L, 4], [L, 3]"""
+    motion = group_dynamics.GroupMotion(scene)
+    poses = [motion.poses(scene.t_max + float(tau)) for tau in later]
+    quats, moves = ([pose[part][group] for pose in poses] for part in (0, 1))
+    return np.reshape(quats, (-1, 4)), np.reshape(moves, (-1, 3))
+
+
+def _carried(
+    scene: Scene, source: MotionGroup, course: _Course, leading: _Course, parent: MotionGroup
+) -> MotionGroup | None:
+    """Return a part with its joint, or None if a similarity does not place both it and its parent.
+
+    Args:
+        scene: The original scene.
+        source: The part in it.
+        course: New motion of the part in the observed time.
+        leading: New motion of its parent in the observed time.
+        parent: New group of its parent.
+    """
+    assert source.parent is not None and source.joint is not None
+    old, linear = scene.groups[source.parent], course.parent
+    shift = course.pivot - linear @ source.pivot
+    together = np.linalg.norm(leading.pivot - linear @ old.pivot - shift) <= course.allowed
+    alike = together and np.abs(leading.parent - linear).max() <= 1e-6
+    if not alike or parent.model != _turned_model(old.model, leading.parent):
+        return None
+    if (linear == np.eye(3)).all():
+        moved = source if not shift.any() else replace(source, joint=source.joint.transformed(np.eye(3), 1.0, shift))
+        return replace(moved, parent=parent.id)
+    turn, scale = _turn_of(linear)
+    history = replace(source.history.transformed(turn, scale), errors=None)
+    joint = source.joint.transformed(turn, scale, shift)
+    return replace(source, model=source.model.transformed(turn, scale), history=history, joint=joint, parent=parent.id)

@@ -48,8 +48,7 @@ def edit(
     kept, arrays, untouched = edited_gaussians.gather(scene, clusters)
     objects = _objects(scene, table, arrays["object_ids"])
     groups = _groups(clusters, scene, objects, kept, arrays["motion_ids"])
-    same = untouched and all(cluster.same for cluster in clusters)
-    if not same:
+    if not (untouched and all(cluster.same for cluster in clusters)):
         for name in ("dynamics", "canonical_means"):
             if arrays.get(name) is not None:
                 arrays[name] = None
@@ -64,7 +63,6 @@ def edit(
         objects=objects,
         groups=groups,
         lookup=lookup,
-        hulls=scene.hulls if same and all(cluster.id == cluster.source.id for cluster in clusters) else (),
     )
     return _with_representatives(result), notes
 
@@ -113,6 +111,8 @@ def _groups(
         if not cluster.pieces and group.follows is not None:
             leader = new_ids.get(group.follows)
             group = replace(group, follows=leader, follow_matrix=None if leader is None else group.follow_matrix)
+        if not cluster.pieces and group.parent is not None:
+            group = replace(group, parent=new_ids.get(group.parent))
         groups.append(
             replace(
                 group,
@@ -121,7 +121,10 @@ def _groups(
                 anchor_index=int(rows[0]) if len(rows) else -1,
             )
         )
-    return tuple(groups)
+    return tuple(
+        g if g.parent is not None and groups[g.parent].object_id == g.object_id else replace(g, parent=None, joint=None)
+        for g in groups
+    )
 
 
 def _by_object(

@@ -231,8 +231,9 @@ def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> li
 
     Returns:
         Per object ``id name position_error rotation_error_deg warning half_width half_width_percent``, in world units
-        and degrees. The errors are None if the object has no true pose or no motion group, the others if the scene
-        stores no confidence band (`predictability.Outlook`). Without ground truth, one row per object of the scene.
+        and degrees, of the worst of its true bodies. The errors are None if the object has no true pose or no motion
+        group, the others if the scene stores no confidence band (`predictability.Outlook`). Without ground truth, one
+        row per object of the scene.
     """
     named = {item.id: item.name for item in scene.objects if item.id > 0}
     known: tuple[ground_truth_poses.Body, ...] = ()
@@ -250,7 +251,8 @@ def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> li
         predicted = ground_truth_poses.motion(scene, [body.group], body.times[-1:])[0]
         position, angle = metrics.pose_errors(predicted, body.motion[-1:], body.group.pivot)
         errors = {"position_error": float(position[0]), "rotation_error_deg": float(angle[0])}
-        rows[body.object_id].update(errors)
+        row = rows[body.object_id]
+        row.update({name: max(error, row[name] or 0.0) for name, error in errors.items()})
     return [rows[key] for key in sorted(rows)]
 
 

@@ -1,7 +1,8 @@
 """True poses of a data set in the frame of a scene: true motion of each motion group, and its error.
 
 The object frames in the scene and in the ground truth differ by a constant rigid offset, which is estimated from the
-observed times at which the object was seen (`metrics.true_motion`). Notation: T times of the ground truth.
+observed times at which the object was seen (`metrics.true_motion`). An object may have several true bodies and several
+groups, its parts; those that move alike are compared. Notation: T times of the ground truth.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class Body:
 
     Attributes:
         object_id: Id of the object.
-        name: Name of the object in the ground truth.
+        name: Name of the body in the ground truth.
         group: The motion group; for an object at rest, one of role "pinned" about the object's own center.
         size: Diameter of the object, world units.
         times: Times of the ground truth. [T]
@@ -60,7 +61,8 @@ def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> t
     Args:
         scene: The scene.
         ground_truth: True poses. Discovered objects of a scene are matched to the true ones by position.
-        every: Return all bodies of an object instead of only the one with most of its Gaussians.
+        every: Return all groups of an object. By default, there is one for each of its true bodies: the one with
+            most of its Gaussians if there is a single true body, else the one that moves alike.
 
     Returns:
         Bodies in the order of the ground truth; empty if no time of the ground truth was observed.
@@ -72,21 +74,43 @@ def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> t
     if scene.provenance.get("discovered"):
         ground_truth = _renumbered(scene, ground_truth)
     found = []
-    for object_id, name, truth in zip(ground_truth.object_ids, ground_truth.names, ground_truth.matrices, strict=True):
+    for object_id in dict.fromkeys(ground_truth.object_ids):
+        rows = [row for row, key in enumerate(ground_truth.object_ids) if key == object_id]
         main = _body(scene, object_id)
-        others = [g for g in scene.groups if every and g.role == "body" and g.object_id == object_id]
-        for group in others or ([] if main is None else [main]):
-            first, last = group.seen or (-np.inf, np.inf)
-            seen = observed & (times >= first - 1e-9) & (times <= last + 1e-9)
-            predicted = motion(scene, [group], times)[0]
-            used = seen if seen.any() else observed
-            true = metrics.true_motion(predicted, truth, used, group.pivot)
-            here = (predicted @ np.append(group.pivot, 1.0))[:, :3]
-            path = truth[:, :3, 3] + (here - truth[:, :3, 3])[used].mean(axis=0)
-            _, angles = metrics.pose_errors(predicted[used], true[used], group.pivot)
-            size = _size(scene, group)
-            found.append(Body(object_id, name, group, size, times, true, path, float(np.median(angles))))
+        parts = [g for g in scene.groups if g.role == "body" and g.object_id == object_id]
+        groups = parts if parts and (every or len(rows) > 1) else [] if main is None else [main]
+        pairs = [[_paired(scene, ground_truth, group, row, observed) for row in rows] for group in groups]
+        found += [body for body, _ in _matched(pairs, every)]
     return tuple(found)
+
+
+def _paired(
+    scene: Scene, ground_truth: GroundTruth, group: MotionGroup, row: int, observed: np.ndarray
+) -> tuple[Body, float]:
+    """Return a group with the true motion of a row, and the distance of both in the observed time, in sizes."""
+    times, truth = ground_truth.times, ground_truth.matrices[row]
+    first, last = group.seen or (-np.inf, np.inf)
+    seen = observed & (times >= first - 1e-9) & (times <= last + 1e-9)
+    predicted = motion(scene, [group], times)[0]
+    used = seen if seen.any() else observed
+    true = metrics.true_motion(predicted, truth, used, group.pivot)
+    here = (predicted @ np.append(group.pivot, 1.0))[:, :3]
+    path = truth[:, :3, 3] + (here - truth[:, :3, 3])[used].mean(axis=0)
+    places, angles = metrics.pose_errors(predicted[used], true[used], group.pivot)
+    name, size = ground_truth.names[row], _size(scene, group)
+    body = Body(ground_truth.object_ids[row], name, group, size, times, true, path, float(np.median(angles)))
+    return body, float(np.mean(places) / size + np.mean(np.radians(angles)))
+
+
+def _matched(pairs: Sequence[Sequence[tuple[Body, float]]], every: bool) -> list[tuple[Body, float]]:
+    """Return the pairs of groups and rows of one object that are nearest: one for each group, or one to one."""
+    costs = np.array([[cost for _, cost in row] for row in pairs]).reshape(len(pairs), -1)
+    if every:
+        return [row[int(np.argmin(own))] for row, own in zip(pairs, costs, strict=True)]
+    return sorted(
+        (pairs[g][k] for g, k in zip(*optimize.linear_sum_assignment(costs), strict=True)),
+        key=lambda pair: pair[0].name,
+    )
 
 
 def motion(scene: Scene, groups: Sequence[MotionGroup], times: np.ndarray) -> np.ndarray:

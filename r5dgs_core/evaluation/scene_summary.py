@@ -18,8 +18,10 @@ STILL = 0.05  # maximum motion of a still object, as a share of its radius
 def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
     """Return the motion of an object past t_max in words, by its motion models; "pinned" if no group can move."""
     words = []
-    for group in groups:
-        if not KINDS[group.model.kind].fields and _moved(scene, group) <= STILL * group.model.radius:
+    for number, group in enumerate(groups, start=1):
+        if group.joint is not None:
+            words.append(f"part {number}: {group.joint.text()}")
+        elif not KINDS[group.model.kind].fields and _moved(scene, group) <= STILL * group.model.radius:
             words.append("still")
         else:
             words.append(KINDS[group.model.kind].word)

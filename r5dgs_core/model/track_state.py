@@ -9,6 +9,8 @@ from torch import Tensor
 
 from .tracks import Tracks
 
+OWNERS = "tracks.owners"  # only present if an object has several parts
+
 
 def tensors_of(tracks: Tracks) -> dict[str, Tensor]:
     """Return the tensors of tracks, named ``tracks.NAME``."""
@@ -16,6 +18,8 @@ def tensors_of(tracks: Tracks) -> dict[str, Tensor]:
     named["tracks.times"] = torch.from_numpy(tracks.times)
     for name in ("centers", "base_quats", "casters", "plane_normal"):
         named[f"tracks.{name}"] = getattr(tracks, name)
+    if not torch.equal(tracks.owners, torch.arange(tracks.bodies)):
+        named[OWNERS] = tracks.owners
     return named
 
 
@@ -28,6 +32,7 @@ def tracks_of(tensors: Mapping[str, Tensor]) -> Tracks:
         tensors["tracks.base_quats"].clone(),
         tensors["tracks.casters"],
         tensors["tracks.plane_normal"],
+        tensors.get(OWNERS),
     )
     for name in ("rotvecs", "slope"):
         tracks.params[name] = tensors[f"tracks.{name}"].clone().requires_grad_(True)

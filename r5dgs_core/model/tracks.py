@@ -28,6 +28,7 @@ class Tracks:
         base_quats: Rotations at the knots, unit wxyz. [B, S, 4]
         casters: Body that each shadow group follows; shadow groups are numbered from B on. [W]
         plane_normal: Unit normal of the support plane, or None without shadows. [3]
+        owners: Class of each body; None if body k is that of class k. Parts of an object have its class. [B]
     """
 
     def __init__(
@@ -38,12 +39,14 @@ class Tracks:
         base_quats: Tensor,
         casters: Tensor | None = None,
         plane_normal: Tensor | None = None,
+        owners: Tensor | None = None,
     ):
         self.times = np.asarray(times, np.float64)
         self.centers = centers
         self.base_quats = base_quats
         self.casters = casters if casters is not None else torch.zeros(0, dtype=torch.int64)
         self.plane_normal = plane_normal if plane_normal is not None else torch.tensor([0.0, 0.0, 1.0])
+        self.owners = owners if owners is not None else torch.arange(len(centers))
         self.params: dict[str, Tensor] = {
             "translations": translations.detach().requires_grad_(True),
             "rotvecs": torch.zeros_like(translations).requires_grad_(True),
@@ -141,8 +144,8 @@ class Tracks:
 
         Args:
             entered: First and last knot to include; None for all. The mean is always over all knots.
-            shift_stiffness: Weight of each body's displacement at each knot; None for 1. [B - 1, S]
-            turn_stiffness: Weight matrix of its rotation, world axes; None for the identity. [B - 1, S, 3, 3]
+            shift_stiffness: Weight of each class's displacement at each knot; None for 1. [C - 1, S]
+            turn_stiffness: Weight matrix of its rotation, world axes; None for the identity. [C - 1, S, 3, 3]
         """
         first, last = (0, len(self.times) - 1) if entered is None else entered
         if last - first < 2 or self.bodies < 2:
@@ -163,7 +166,7 @@ class Tracks:
             if stiffness is None:
                 weighted = second
             else:
-                stiffness = stiffness[:, here]
+                stiffness = stiffness[self.owners[1:] - 1][:, here]
                 middle = (stiffness[:, :-2] + stiffness[:, 1:-1] + stiffness[:, 2:]) / 3
                 flat = middle.dim() == 2
                 weighted = middle[..., None] * second if flat else (middle @ second[..., None])[..., 0]

@@ -8,12 +8,11 @@ import numpy as np
 
 from .. import findings
 from ..motion.joint import BALL, KINDS, Joint
-from . import cameras
+from . import cameras, model_checks
 from .array_shapes import fail
 from .scene import MotionGroup, Scene
 
 _UNIT_TOLERANCE = 1e-6
-_MOST_TIME = 1e12
 
 
 def check(scene: Scene, place: str, guard: findings.Guard) -> None:
@@ -65,6 +64,6 @@ def _fault(joint: Joint) -> tuple[str, str, Any] | None:
         return "axis", "a unit vector", joint.axis
     elif joint.limits is None or not -farthest <= joint.limits[0] <= joint.limits[1] <= farthest:
         return "limits", f"two numbers up to {farthest:g}, in order", joint.limits
-    if joint.stop_time is not None and not 0 <= joint.stop_time <= _MOST_TIME:
-        return "stop_time", f"a number from 0 to {_MOST_TIME:g}, or null", joint.stop_time
+    if joint.stop_time is not None and not 0 <= joint.stop_time <= model_checks.MOST_TIME:
+        return "stop_time", f"a number from 0 to {model_checks.MOST_TIME:g}, or null", joint.stop_time
     return None

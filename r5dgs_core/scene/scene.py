@@ -112,6 +112,16 @@ class MotionGroup:
     parent: int | None = None
     joint: Joint | None = None
 
+    @property
+    def home(self) -> np.ndarray:
+        """Position of the group's anchor in Blender at t_max: the point of its joint, or its pivot. [3]"""
+        return np.asarray(self.pivot if self.joint is None else self.joint.point, np.float64)
+
+    @property
+    def own_model(self) -> MotionModel:
+        """Motion past t_max of that anchor, in the frame of its parent if it has one."""
+        return self.model if self.joint is None else self.joint.model
+
 
 @dataclass(frozen=True)
 class Gaussians:
@@ -210,21 +220,6 @@ class Shading:
     rest: np.ndarray | None = None
 
 
-@dataclass(frozen=True)
-class Hull:
-    """Convex hull of the Gaussians of an object that move with one motion group, in the bind state.
-
-    Attributes:
-        object_id: The object.
-        motion_id: The motion group.
-        vertices: Points whose convex hull it is, 4 to 64, world. [V, 3] float64
-    """
-
-    object_id: int
-    motion_id: int
-    vertices: np.ndarray
-
-
 # Groups of arrays in `Scene`: class, and the names of its arrays in a file by attribute.
 GROUPS: dict[str, tuple[type, dict[str, str]]] = {
     "gaussians": (Gaussians, {field.name: field.name for field in dataclasses.fields(Gaussians)}),
@@ -278,7 +273,6 @@ class Scene:
         origin: Point of the data set's world from which all positions of the scene are measured:
             world = origin + position. Zero unless the world's origin is so far away that float32 would lose detail. [3]
             float64
-        hulls: Convex hulls of objects, at most one for each object and motion group. Empty in scenes without them.
     """
 
     name: str
@@ -306,7 +300,6 @@ class Scene:
     near_plane: float = NEAR_PLANE
     harmonics_turn: bool = True
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    hulls: tuple[Hull, ...] = ()
 
     @functools.cached_property
     def extent(self) -> float:

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors, findings
-from ..motion import models
-from . import array_shapes, cameras, hull_json, part_checks
+from . import array_shapes, cameras, model_checks, part_checks
 from .lookup_table import Table
 from .row_runs import runs
 from .scene import DTYPES, EMBEDDINGS, GROUPS, ROLES, MotionGroup, Scene
@@ -26,11 +25,7 @@ _UNIT_TOLERANCE = 1e-3
 # Maximum numbers of a scene: their squares are within the range of float32, and no motion overflows within its times.
 _LARGE = 1e9  # colours, logits, embeddings
 _LOG_SCALE, _LEAST_LOG_SCALE = 40.0, -1e4  # thinner Gaussians than float32 resolves are drawn at the minimum width
-_SPIN = 1e6  # rad per unit of time, and per its square
-_LEAST_LENGTH = 1e-30  # minimum near plane and radius
-MOST_TIME = 1e12  # maximum time
-_LEAST_STEP = 1e-12  # minimum step between observed times
-_RATES = np.repeat([cameras.FARTHEST, _SPIN, cameras.FARTHEST, _SPIN], 3)
+_RATES = np.repeat([cameras.FARTHEST, model_checks.SPIN, cameras.FARTHEST, model_checks.SPIN], 3)
 _POSE = np.repeat([_LARGE, cameras.FARTHEST], [4, 3])
 _LIMITS: dict[str, float | np.ndarray] = {
     "means": cameras.FARTHEST,
@@ -38,7 +33,7 @@ _LIMITS: dict[str, float | np.ndarray] = {
     "log_scales": _LOG_SCALE,
     "opacity_logits": _LARGE,
     "sh": _LARGE,
-    "track_times": MOST_TIME,
+    "track_times": model_checks.MOST_TIME,
     "track_poses": _POSE,
     "background_sh": _LARGE,
     "identities": _LARGE,
@@ -54,17 +49,6 @@ _LIMITS: dict[str, float | np.ndarray] = {
     "light_direction": _LARGE,
     "origin": cameras.FARTHEST,
 }
-
-
-def _limit(unit: models.Unit) -> float:
-    """Largest number of a rate."""
-    if unit.per_time < 0:
-        return MOST_TIME
-    return cameras.FARTHEST if unit.is_length else _SPIN
-
-
-_MODEL_LIMITS = {name: _limit(unit) for name, unit in {**models.VECTORS, **models.SCALARS}.items()}
-_MODEL_LIMITS |= {"fade_time": MOST_TIME, "radius": cameras.FARTHEST}
 _MOST_ID = np.iinfo(np.int32).max
 _CONVERTED = ("background_sh", "identities", *EMBEDDINGS)  # any float dtype in memory; converted on writing
 _DTYPES = {name: dtype for name, dtype in DTYPES.items() if name not in _CONVERTED} | {"origin": np.float64}
@@ -104,7 +88,6 @@ def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> 
         if group is not findings.UNREAD:
             _check_group(scene, place, row, group, object_ids, guard)
     part_checks.check(scene, place, guard)
-    hull_json.check(scene, place, guard)
     for camera in _listed(scene.cameras):
         with guard():
             try:
@@ -236,16 +219,18 @@ def _check_units(scene: Scene, place: str, guard: findings.Guard) -> None:
 def _check_times(scene: Scene, place: str, guard: findings.Guard) -> None:
     times = scene.tracks.times
     with guard():
-        if len(times) == 0 or not (np.diff(times) >= _LEAST_STEP).all():
-            _fail(place, "track_times", f"at least one time, increasing by {_LEAST_STEP:g} or more", times)
+        if len(times) == 0 or not (np.diff(times) >= model_checks.LEAST_STEP).all():
+            _fail(place, "track_times", f"at least one time, increasing by {model_checks.LEAST_STEP:g} or more", times)
     with guard():
         if not np.isfinite(scene.t_max) or times[-1] != scene.t_max:
             _fail(place, "t_max", f"the last of track_times, {float(times[-1])!r}", repr(scene.t_max))
     with guard():
-        if not 1 / MOST_TIME <= scene.frames_per_unit <= MOST_TIME:
-            _fail(place, "frames_per_unit", f"a positive number up to {MOST_TIME:g}", scene.frames_per_unit)
+        if not 1 / model_checks.MOST_TIME <= scene.frames_per_unit <= model_checks.MOST_TIME:
+            _fail(
+                place, "frames_per_unit", f"a positive number up to {model_checks.MOST_TIME:g}", scene.frames_per_unit
+            )
     with guard():
-        if not _LEAST_LENGTH <= scene.near_plane <= cameras.FARTHEST:
+        if not model_checks.LEAST_LENGTH <= scene.near_plane <= cameras.FARTHEST:
             _fail(place, "near_plane", f"a positive depth up to {cameras.FARTHEST:g}", scene.near_plane)
     with guard(), np.errstate(invalid="ignore"):  # infinite means are reported separately
         last = scene.tracks.poses[:, -1]
@@ -317,9 +302,9 @@ def _check_group(
     with guard():
         if not (0 <= group.rigid_rms <= farthest and 0 <= group.rigid_max <= farthest):
             _fail(place, where, f"rigid residuals from 0 to {farthest:g}", (group.rigid_rms, group.rigid_max))
-    _check_model(group.model, f"{place}: {where}: model", guard)
+    model_checks.check(group.model, f"{place}: {where}: model", guard)
     if group.joint is not None and group.joint is not findings.UNREAD:
-        _check_model(group.joint.model, f"{place}: {where}: joint: model", guard)
+        model_checks.check(group.joint.model, f"{place}: {where}: joint: model", guard)
     with guard():
         if group.seen is not None and not group.seen[0] <= group.seen[1]:
             _fail(place, where, "'seen' as first and last time, in order", group.seen)
@@ -339,15 +324,3 @@ def _check_group(
         matrix = group.follow_matrix
         if matrix is None or matrix.shape != (3, 3) or not (np.abs(matrix) <= _LARGE).all():
             _fail(place, where, f"a follow_matrix (3, 3) of numbers up to {_LARGE:g}", matrix)
-
-
-def _check_model(model: models.MotionModel, place: str, guard: findings.Guard) -> None:
-    """Raise `SceneFileError` naming a rate that playback cannot use."""
-    for name, limit in _MODEL_LIMITS.items():
-        with guard():
-            value = np.max(np.abs(getattr(model, name)))
-            if not value <= limit:
-                _fail(place, name, f"numbers up to {limit:g}", f"{value:g}")
-    with guard():
-        if model.radius < _LEAST_LENGTH or model.fade_time < _LEAST_STEP:
-            _fail(place, "radius and fade_time", f"{_LEAST_LENGTH:g} and {_LEAST_STEP:g} or more", "less")

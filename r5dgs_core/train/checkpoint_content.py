@@ -53,6 +53,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "tracks.casters": ("W",),
     "tracks.plane_normal": (3,),
     "tracks.entered": (2,),
+    "tracks.owners": ("G",),
     "field.times": ("S",),
     "field.casters": ("W",),
     "field.plane_normal": (3,),
@@ -67,12 +68,16 @@ _WHOLE_NUMBERS = {
     "labels",
     "tracks.casters",
     "tracks.entered",
+    "tracks.owners",
     "field.casters",
     "field.bodies",
     "field.iteration",
 }
 _REQUIRED = {  # by representation
-    "tracks": ("light", *(name for name in _SHAPES if name.startswith("tracks.") and name != "tracks.entered")),
+    "tracks": (
+        "light",
+        *(name for name in _SHAPES if name.startswith("tracks.") and name not in ("tracks.entered", "tracks.owners")),
+    ),
     "field": ("light", *(name for name in _SHAPES if name.startswith("field."))),
     "still": ("still.centers", "still.time"),
 }

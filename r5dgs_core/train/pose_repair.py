@@ -76,12 +76,13 @@ def repair(trainer: Trainer) -> int:
     count = len(trainer.times)
     errors = np.stack([registration.errors(trainer, s, VIEWS) for s in range(count)], -1)  # [B - 1, S]
     changed: dict[int, int] = {}
-    for body in range(1, motion.tracks.bodies):
-        seen = np.flatnonzero(np.isfinite(errors[body - 1]))
+    for body, owner in enumerate(motion.tracks.owners.tolist()[1:], start=1):
+        own = errors[owner - 1]
+        seen = np.flatnonzero(np.isfinite(own))
         if body in bent:
             continue
-        queue = suspicious(errors[body - 1], _quats(trainer, body), trainer.times).tolist()
-        limit = UNUSUAL * float(np.median(errors[body - 1, seen])) if queue else 0.0
+        queue = suspicious(own, _quats(trainer, body), trainer.times).tolist()
+        limit = UNUSUAL * float(np.median(own[seen])) if queue else 0.0
         found: set[int] = set()
         for _ in range(MOST * count):
             if not queue:
@@ -91,7 +92,7 @@ def repair(trainer: Trainer) -> int:
                 found.add(s)
                 queue += [int(n) for n in seen if abs(n - s) == 1 and n not in queue]
         if found:
-            changed[int(trainer.object_ids[body])] = len(found)
+            changed[int(trainer.object_ids[owner])] = changed.get(int(trainer.object_ids[owner]), 0) + len(found)
     if changed:
         log.info("poses repaired: %s", ", ".join(f"{n} of object {key}" for key, n in changed.items()))
     return sum(changed.values())

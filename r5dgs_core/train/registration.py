@@ -56,8 +56,9 @@ class BodyRegistration:
 
     def __init__(self, trainer: Trainer, motion: TracksRepresentation, body: int, knot: int, most: int):
         self._trainer, self._motion, self._body, self._knot = trainer, motion, body, knot
-        self._radius = float(trainer.places.radii[body - 1])
-        object_id, params = int(trainer.object_ids[body]), trainer.gaussians.params
+        owner = int(motion.tracks.owners[body])
+        self._radius = float(trainer.places.radii[owner - 1])
+        object_id, params = int(trainer.object_ids[owner]), trainer.gaussians.params
         rows = torch.from_numpy(np.flatnonzero(trainer.gaussians.motion_ids.numpy() == body))
         names = ("means", "quats", "log_scales", "opacity_logits", "shading")
         self._shape = {name: params[name].detach()[rows] for name in names}

@@ -3,7 +3,8 @@
 Once all times have entered and the tracks have settled, training continues for some steps with a residual field on all
 bodies. Then the residuals of each body are left out in turn, and the increase of the error on that body is measured on
 views that these steps did not use. The run then returns to its state before the trial, and only bodies with an increase
-above a threshold keep their residuals. If no body does, the run continues exactly as without a trial, bit for bit.
+above a threshold keep their residuals, or are divided into rigid parts if these explain the views as well
+(`part_trial`). If no body does, the run continues exactly as without a trial, bit for bit.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,8 @@ from ..config.config import Config
 from ..errors import TrainingError
 from ..model import residual_field
 from ..model.residual_field import ResidualField
+from . import part_trial
+from .checkpoint import Checkpoint
 from .representations import registry, residual
 from .trainer import Trainer
 
@@ -59,14 +63,51 @@ def decide(trainer: Trainer, progress: Progress) -> None:
         progress: Called with events during the trial.
     """
     before = trainer.state()
-    field, gains = _try(trainer, progress)
-    kept = flexible(gains, field, trainer.config)
-    added = {residual.GAINS: torch.from_numpy(gains)}
-    if kept:
-        added |= residual.tensors_of(field.only(kept))
-    trainer.restore(dataclasses.replace(before, tensors=before.tensors | added))
-    found = ", ".join(f"{i} {gain:+.2f} dB" for i, gain in zip(trainer.object_ids[1:], gains, strict=True))
-    log.info("residuals: gains by object %s; kept for %d", found or "none", len(kept))
+    trial = _try(trainer, progress)
+    kept = flexible(trial.gains, trial.field, trainer.config)
+    gains = {residual.GAINS: torch.from_numpy(trial.gains)}
+    state = dataclasses.replace(before, tensors=before.tensors | gains)
+    divided = _divided(trainer, state, trial, kept)
+    bent = [body for body in kept if body not in divided]
+    state = list(divided.values())[-1] if divided else state
+    if bent:
+        state = dataclasses.replace(state, tensors=state.tensors | residual.tensors_of(trial.field.only(bent)))
+    trainer.restore(state)
+    found = ", ".join(f"{i} {gain:+.2f} dB" for i, gain in zip(trainer.object_ids[1:], trial.gains, strict=True))
+    log.info("residuals: gains by object %s; kept for %d, parts for %d", found or "none", len(bent), len(divided))
+
+
+def _divided(trainer: Trainer, state: Checkpoint, trial: Trial, bodies: Sequence[int]) -> dict[int, Checkpoint]:
+    """Return the bodies that consist of parts, each with the state in which it and all before it are divided."""
+    found: dict[int, Checkpoint] = {}
+    if trainer.config.needs.residuals == "on":
+        return found
+    for body in bodies:
+        limit, steps = float(trial.errors[0, body - 1]), trial_steps(trainer.config)
+        field = trial.field.only([body])
+        divided = part_trial.divide(trainer, state, body, field, limit, trial.held, trial.used, steps)
+        if divided is not None:
+            found[body] = state = divided
+    return found
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Result of a trial.
+
+    Attributes:
+        field: Residuals of all bodies.
+        gains: Gain of each body, dB, nan if unknown. [B - 1]
+        errors: Summed squared errors of each body on the held-out views, with and without its residuals. [2, B - 1]
+        held: Held-out views.
+        used: Views used for training.
+    """
+
+    field: ResidualField
+    gains: np.ndarray
+    errors: np.ndarray
+    held: list[int]
+    used: list[int]
 
 
 def flexible(gains: np.ndarray, field: ResidualField, config: Config) -> list[int]:
@@ -81,8 +122,8 @@ def trial_steps(config: Config) -> int:
     return max(1, int(config.residual.trial_steps * min(1.0, config.train.iterations / 2000)))
 
 
-def _try(trainer: Trainer, progress: Progress) -> tuple[ResidualField, np.ndarray]:
-    """Return the field after the trial, and each body's gain from it, dB, nan if unknown. [B - 1]"""
+def _try(trainer: Trainer, progress: Progress) -> Trial:
+    """Train all bodies with residuals, and compare their errors with and without them."""
     config, g, ids = trainer.config, trainer.gaussians, trainer.object_ids[1:]
     opacities = torch.sigmoid(g.params["opacity_logits"].detach())
     bodies = list(range(1, len(ids) + 1))
@@ -93,8 +134,9 @@ def _try(trainer: Trainer, progress: Progress) -> tuple[ResidualField, np.ndarra
     draws = torch.Generator().manual_seed(config.train.seed + SEED_STEP)
     order = torch.randperm(len(trainer.views), generator=draws).tolist()
     held, used = split([i for i in order if _shows(trainer.views[i].mask, ids)])
+    nothing = Trial(field, unknown, np.zeros((2, len(ids))), held, used)
     if not field.bodies or not held:
-        return field, unknown
+        return nothing
     state = trainer.state()
     trainer.restore(dataclasses.replace(state, tensors=state.tensors | residual.tensors_of(field)))
     steps = trial_steps(config)
@@ -106,10 +148,11 @@ def _try(trainer: Trainer, progress: Progress) -> tuple[ResidualField, np.ndarra
                 progress({"event": TRIAL, "done": step, "total": steps, "unit": "steps"})
     except TrainingError as error:
         log.warning("the trial of residuals failed, all bodies stay rigid: %s", error)
-        return field, unknown
+        return nothing
     learned = residual.residual_of(trainer.state().tensors)
     assert learned is not None
-    return learned, _gains(trainer, learned, held)
+    gains, errors = _gains(trainer, learned, held)
+    return Trial(learned, gains, errors, held, used)
 
 
 def _shows(mask: np.ndarray | None, ids: np.ndarray) -> bool:
@@ -126,8 +169,11 @@ def split(order: Sequence[int]) -> tuple[list[int], list[int]]:
 
 
 @torch.no_grad()
-def _gains(trainer: Trainer, field: ResidualField, held: Sequence[int]) -> np.ndarray:
-    """Return the increase of the error on each body if only its residuals are left out, dB. [B - 1]"""
+def _gains(trainer: Trainer, field: ResidualField, held: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the increase of the error on each body if only its residuals are left out, dB, and both errors.
+
+    [B - 1], [2, B - 1]
+    """
     ids = trainer.object_ids[1:]
     errors, pixels = np.zeros((2, len(ids))), np.zeros(len(ids))
     for index in held:
@@ -145,7 +191,7 @@ def _gains(trainer: Trainer, field: ResidualField, held: Sequence[int]) -> np.nd
             errors[0, body - 1] += whole[region].sum()
             errors[1, body - 1] += _squares(trainer, others, index, truth)[region].sum()
     gains = 10 * np.log10(np.maximum(errors[1], 1e-12) / np.maximum(errors[0], 1e-12))
-    return np.where(pixels >= MIN_PIXELS, gains, np.nan)
+    return np.where(pixels >= MIN_PIXELS, gains, np.nan), errors
 
 
 def _squares(trainer: Trainer, field: ResidualField, index: int, truth: Tensor) -> np.ndarray:

@@ -109,7 +109,7 @@ class TracksRepresentation(Representation):
             poses,
             centers,
         )
-        gone = self._absent[:, nearest_knot(self.tracks.times, t)]
+        gone = self._absent[self.tracks.owners[1:].numpy() - 1, nearest_knot(self.tracks.times, t)]
         if not gone.any():
             return splats
         there = torch.from_numpy(np.concatenate([[1.0], ~gone])).float()
@@ -190,15 +190,16 @@ class TracksRepresentation(Representation):
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
         """See `Representation.group_classes`: the object of each body; background for shadows."""
-        bodies, shadows = len(tensors["tracks.centers"]), len(tensors["tracks.casters"])
-        return np.concatenate([np.arange(bodies), np.zeros(shadows, np.int64)])
+        owners = track_state.tracks_of(tensors).owners.numpy()
+        return np.concatenate([owners, np.zeros(len(tensors["tracks.casters"]), np.int64)])
 
     @staticmethod
     def observed_motion(
         tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
     ) -> ObservedMotion:
-        """See `Representation.observed_motion`: the pinned group, one body per object, then the shadows."""
+        """See `Representation.observed_motion`: the pinned group, the bodies, then the shadows."""
         tracks = track_state.tracks_of(tensors)
+        owners = tracks.owners.tolist()
         quats = tracks.knot_quats().detach().numpy().astype(np.float64)
         displacements = tracks.params["translations"].detach().numpy().astype(np.float64)
         centers = tracks.centers.numpy().astype(np.float64)
@@ -208,23 +209,23 @@ class TracksRepresentation(Representation):
         for body in range(1, tracks.bodies):
             groups.append(
                 GroupTrack(
-                    int(object_ids[body]),
+                    int(object_ids[owners[body]]),
                     "body",
                     centers[body],
                     quats[body],
                     displacements[body],
-                    observed[body - 1],
+                    observed[owners[body] - 1],
                 )
             )
         for caster in tracks.casters.tolist():
             groups.append(
                 GroupTrack(
-                    int(object_ids[caster]),
+                    int(object_ids[owners[caster]]),
                     "shadow",
                     centers[caster],
                     still,
                     displacements[caster] @ follow.T,
-                    observed[caster - 1],
+                    observed[owners[caster] - 1],
                     caster,
                     follow,
                 )

@@ -1,0 +1,38 @@
+"""Checks of motion models: rates that playback can use."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .. import findings
+from ..motion import models
+from . import cameras
+from .array_shapes import fail
+
+SPIN = 1e6  # maximum rad per unit of time, and per its square
+MOST_TIME = 1e12  # maximum time
+LEAST_LENGTH = 1e-30  # minimum radius
+LEAST_STEP = 1e-12  # minimum time
+
+
+def _limit(unit: models.Unit) -> float:
+    """Largest number of a rate."""
+    if unit.per_time < 0:
+        return MOST_TIME
+    return cameras.FARTHEST if unit.is_length else SPIN
+
+
+_LIMITS = {name: _limit(unit) for name, unit in {**models.VECTORS, **models.SCALARS}.items()}
+_LIMITS |= {"fade_time": MOST_TIME, "radius": cameras.FARTHEST}
+
+
+def check(model: models.MotionModel, place: str, guard: findings.Guard) -> None:
+    """Raise `SceneFileError` naming a rate that playback cannot use."""
+    for name, limit in _LIMITS.items():
+        with guard():
+            value = np.max(np.abs(getattr(model, name)))
+            if not value <= limit:
+                fail(place, name, f"numbers up to {limit:g}", f"{value:g}")
+    with guard():
+        if model.radius < LEAST_LENGTH or model.fade_time < LEAST_STEP:
+            fail(place, "radius and fade_time", f"{LEAST_LENGTH:g} and {LEAST_STEP:g} or more", "less")

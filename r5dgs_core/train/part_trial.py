@@ -1,0 +1,219 @@
+"""Trial of parts: a body that gains from residuals may be several rigid bodies, for example the links of an arm.
+
+The paths of the Gaussians in the trial of residuals propose the parts (`part_clusters`). The parts are then trained
+from the first time outwards, as at the start of a run: a knot that enters gets poses that its neighbours predict, which
+are registered to the images. Members join the part with whose motion they stay inside the masks and keep their colours.
+The body is divided if its parts explain held-out views as well as residuals do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy import ndimage
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from ..model import track_state
+from ..model.residual_field import ResidualField
+from ..motion import rotations
+from ..motion.se3 import Pose
+from ..scene import cameras, spherical_harmonics
+from . import part_clusters, registration, train_views
+from .checkpoint import Checkpoint
+from .registration import BodyRegistration
+from .representations import residual
+from .representations.tracks import TracksRepresentation
+from .trainer import Trainer
+
+log = logging.getLogger(__name__)
+
+RING_SHARE = 0.1  # steps for a pair of knots that enter, as a share of those of the trial of residuals
+NEWEST = 0.5  # share of these steps that draw a view of the knots that entered last
+SETTLED = 4  # rounds of training at all knots, each with half of the steps of the trial
+VIEWS, REFINEMENTS, PASSES = 3, 3, 2  # registration of knots that enter
+WIDE = 3  # number of knots in training from which members may join another part
+OUTSIDE = 0.25  # cost of a member outside the masks of its object, squared colour
+JOINS = 0.97  # maximum cost in another part, relative to that in the own part
+NEIGHBOURS = 8  # members over which costs are averaged
+WORSE = 1.02  # maximum error of the parts, relative to that of residuals
+
+
+def divide(
+    trainer: Trainer,
+    state: Checkpoint,
+    body: int,
+    field: ResidualField,
+    limit: float,
+    held: Sequence[int],
+    used: Sequence[int],
+    steps: int,
+) -> Checkpoint | None:
+    """Return a state in which a body is divided into parts; None if parts do not explain its images.
+
+    Args:
+        trainer: A run; its state is not restored.
+        state: The state to start from, without residuals of the body.
+        body: The body.
+        field: Residuals of the body, from their trial.
+        limit: Summed squared error of the body on the held-out views with residuals.
+        held: Views for the comparison.
+        used: Views for training.
+        steps: Steps of the trial of residuals.
+    """
+    rng = np.random.default_rng(trainer.config.train.seed + body)
+    found, _ = residual.point_motion(field, track_state.tracks_of(state.tensors), state.tensors)
+    weights = torch.sigmoid(state.tensors["gaussians.opacity_logits"]).numpy()[found.rows].astype(np.float64)
+    canonical = state.tensors["gaussians.means"].numpy()[found.rows].astype(np.float64)
+    paths = np.concatenate([canonical[:, None], found.means], axis=1)
+    labels = part_clusters.find(paths, weights, rng)
+    if labels is None:
+        return None
+    bodies = len(state.tensors["tracks.centers"])
+    parts = [body, *range(bodies, bodies + int(labels.max()))]
+    tensors = part_clusters.split(state.tensors, body, found.rows, labels, paths, weights)
+    trainer.restore(dataclasses.replace(state, tensors=tensors))
+    _Growth(trainer, parts, used, rng).run(steps)
+    object_id = int(trainer.object_ids[body])
+    error = error_of(trainer, object_id, held)
+    log.info(
+        "object %d: %d parts, error %.4g on held-out views, %.4g with residuals", object_id, len(parts), error, limit
+    )
+    if error > WORSE * limit:
+        return None
+    return dataclasses.replace(state, tensors=trainer.state().tensors)
+
+
+@torch.no_grad()
+def error_of(trainer: Trainer, object_id: int, views: Sequence[int]) -> float:
+    """Return the summed squared error of an object's pixels in some views."""
+    total = 0.0
+    for index in views:
+        view = trainer.views[index]
+        if view.mask is None or not (view.mask == object_id).any():
+            continue
+        region = np.asarray(ndimage.binary_dilation(view.mask == object_id, iterations=registration.MARGIN), bool)
+        truth = torch.from_numpy(view.image).float() / 255
+        squares = ((trainer.render(view.camera, view.t) - truth) ** 2).sum(-1).numpy().astype(np.float64)
+        total += float(squares[region].sum())
+    return total
+
+
+class _Growth:
+    """Training of parts from the first time outwards.
+
+    Args:
+        trainer: A run whose tracks have the parts.
+        parts: Their bodies.
+        used: Views for training.
+        rng: Random generator.
+    """
+
+    def __init__(self, trainer: Trainer, parts: Sequence[int], used: Sequence[int], rng: np.random.Generator):
+        assert isinstance(trainer.motion, TracksRepresentation)
+        self._trainer, self._motion, self._parts = trainer, trainer.motion, list(parts)
+        self._used, self._rng, self._start = np.array(used), rng, trainer.iteration
+        self._knots = np.array([train_views.nearest_knot(trainer.times, v.t) for v in trainer.views])
+        self._object_id = int(trainer.object_ids[int(trainer.motion.tracks.owners[parts[0]])])
+
+    def run(self, steps: int) -> None:
+        """Train; ``steps`` are those of the trial of residuals."""
+        ring, last = max(1, int(RING_SHARE * steps)), len(self._trainer.times) - 1
+        first = final = self._trainer.first_time
+        self._train(ring, first, final, [first])
+        while first > 0 or final < last:
+            new = [s for s in (first - 1, final + 1) if 0 <= s <= last]
+            for s in new:
+                self._enter(s, first, final)
+            first, final = min(first, *new), max(final, *new)
+            self._train(ring, first, final, new)
+            if final - first >= WIDE:
+                self._join(first, final)
+        for _ in range(SETTLED):
+            self._train(max(1, steps // 2), 0, last, [])
+            self._join(0, last)
+
+    def _train(self, steps: int, first: int, final: int, newest: Sequence[int]) -> None:
+        """Train with views of the knots ``first`` to ``final``, with more of the newest ones."""
+        knots = self._knots[self._used]
+        pool, new = self._used[(knots >= first) & (knots <= final)], self._used[np.isin(knots, newest)]
+        if len(pool) == 0:
+            return
+        chosen = [new if len(new) and self._rng.random() < NEWEST else pool for _ in range(steps)]
+        self._trainer.curriculum.queue = [int(self._rng.choice(views)) for views in chosen]
+        for _ in range(steps):
+            self._trainer.step()
+        self._trainer.iteration = self._start  # learning rates stay those of the start
+
+    def _enter(self, knot: int, first: int, final: int) -> None:
+        """Give all parts the poses that their neighbours predict at a knot, and register them to the images."""
+        for part in self._parts:
+            pose = self._predicted(part, knot, first, final)
+            if pose is not None:
+                BodyRegistration(self._trainer, self._motion, part, knot, VIEWS).write_pose(pose)
+        for part in PASSES * self._parts:
+            look = BodyRegistration(self._trainer, self._motion, part, knot, VIEWS)
+            if len(look) > 1:
+                look.write_pose(look.refined(look.pose, REFINEMENTS)[0])
+
+    def _predicted(self, part: int, knot: int, first: int, final: int) -> Pose | None:
+        """Pose at constant velocity from the two nearest knots in training; None if there is only one."""
+        side = 1 if knot > final else -1
+        near, next_near = knot - side, knot - 2 * side
+        if not first <= next_near <= final:
+            return None
+        self._motion.tracks.rebase()
+        times, quats = self._trainer.times, self._motion.tracks.base_quats[part].numpy().astype(np.float64)
+        moves = self._motion.tracks.params["translations"].detach()[part].numpy().astype(np.float64)
+        share = (times[knot] - times[near]) / (times[near] - times[next_near])
+        turn = rotations.quats_to_rotvecs(rotations.multiply(quats[near], rotations.conjugate(quats[next_near])))
+        quat = rotations.multiply(rotations.rotvecs_to_quats(share * turn), quats[near])
+        return rotations.normalize(quat), moves[near] + share * (moves[near] - moves[next_near])
+
+    def _join(self, first: int, final: int) -> None:
+        """Move members to the part in which they and their neighbours cost least at the knots in training."""
+        gaussians = self._trainer.gaussians
+        rows = np.flatnonzero(np.isin(gaussians.motion_ids.numpy(), self._parts))
+        points = gaussians.params["means"].detach().numpy()[rows].astype(np.float64)
+        weights = torch.sigmoid(gaussians.params["opacity_logits"].detach()).numpy()[rows]
+        near = np.asarray(KDTree(points).query(points, k=min(NEIGHBOURS, len(points)))[1])
+        share = weights[near] / weights[near].sum(1, keepdims=True)
+        costs = np.einsum("rk,rkp->rp", share, self._costs(rows, points, first, final)[near])
+        own = np.searchsorted(self._parts, gaussians.motion_ids.numpy()[rows])
+        best = costs.argmin(1)
+        every = np.arange(len(rows))
+        joins = costs[every, best] < JOINS * costs[every, own]
+        ids = np.array(self._parts)[np.where(joins, best, own)]
+        gaussians.motion_ids[torch.from_numpy(rows)] = torch.from_numpy(ids).to(gaussians.motion_ids.dtype)
+
+    def _costs(self, rows: np.ndarray, points: np.ndarray, first: int, final: int) -> np.ndarray:
+        """Mean cost of members with the motion of each part: misses of the masks, or differences of colours. [R, P]"""
+        tracks, found = self._motion.tracks, np.zeros((len(rows), len(self._parts)))
+        quats = rotations.normalize(tracks.knot_quats().detach().numpy().astype(np.float64))
+        moves, centers = tracks.params["translations"].detach().numpy(), tracks.centers.numpy()
+        colors = self._colors(rows)
+        for index in self._used:
+            view, s = self._trainer.views[index], self._knots[index]
+            if view.mask is None or not first <= s <= final:
+                continue
+            for k, part in enumerate(self._parts):
+                moved = centers[part] + rotations.rotate(quats[part, s][None], points - centers[part]) + moves[part, s]
+                pixels, depth = cameras.project(view.camera, moved)
+                x, y = (
+                    np.floor(np.nan_to_num(pixels))
+                    .clip(0, [view.camera.width - 1, view.camera.height - 1])
+                    .T.astype(int)
+                )
+                away = ((view.image[y, x] / 255.0 - colors) ** 2).sum(1)
+                inside = (view.mask[y, x] == self._object_id) & (depth > 0)
+                found[:, k] += np.where(inside, np.minimum(away, OUTSIDE), OUTSIDE)
+        return found
+
+    def _colors(self, rows: np.ndarray) -> np.ndarray:
+        """Colours of some Gaussians. [R, 3]"""
+        sh: Tensor = self._trainer.gaussians.params["sh"].detach()[torch.from_numpy(rows), 0]
+        return spherical_harmonics.dc_to_rgb(sh).numpy().astype(np.float64)
