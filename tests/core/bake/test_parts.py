@@ -6,7 +6,7 @@ import pytest
 from r5dgs_core.bake import parts
 from r5dgs_core.data.annotations import GroundTruth
 from r5dgs_core.evaluation import ground_truth_poses, scene_summary
-from r5dgs_core.motion import models
+from r5dgs_core.motion import models, se3
 from r5dgs_core.playback import scene_player
 from tests.support import arms
 
@@ -43,7 +43,7 @@ def test_true_bodies_of_one_object_are_compared_with_the_parts_that_move_alike()
     times = np.array([0.0, 0.2, 0.5, 0.75, 1.0])
     poses = [scene_player.group_poses(scene, float(t)) for t in times]
     truth = np.stack(
-        [np.stack([ground_truth_poses.matrix(scene.groups[g].pivot, q[g], d[g]) for q, d in poses]) for g in (2, 1)]
+        [np.stack([se3.pose_to_matrix(scene.groups[g].pivot, q[g], d[g]) for q, d in poses]) for g in (2, 1)]
     )
     known = GroundTruth(times, (1, 1), ("lower", "upper"), truth, 0.75)
     for every in (False, True):
