@@ -139,7 +139,7 @@ def _result(
     chosen, noise_level, level = selected.chosen, selected.noise_level, selected.noise
     variance = model_scores.covariance_factor(chosen, selected.track, level, noise_level)
     widths = bands.confidence_band(selected, variance, drift)
-    rule = simple_rules.better(selected.track, level) if widths.unknown else None
+    rule = simple_rules.better(selected.track, level, chosen) if widths.unknown else None
     predicted = rule or chosen
     model = fitted_motion.to_model(predicted, variance, radius, span)
     parts = [(part, fitted_motion.events(part, noise_level.variance, t_max, span)) for part in selected.earlier]

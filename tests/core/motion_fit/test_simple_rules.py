@@ -14,17 +14,28 @@ def track(path):
     return PoseTrack(TAU, rotations.identity(len(path)), path, np.ones(len(path)))
 
 
+def law(name, poses):
+    return candidates.solve(candidates.BY_NAME[name], poses, NOISE)
+
+
 def test_a_line_predicts_a_path_that_goes_on_and_rest_one_that_goes_back_and_forth():
     rng = np.random.default_rng(0)
     ahead = np.array([3.0, 0.0, 1.0]) * TAU[:, None] + 0.02 * rng.normal(size=(15, 3))
-    assert simple_rules.better(track(ahead), NOISE).candidate.name == "translation + spin"
+    assert simple_rules.better(track(ahead), NOISE, law("static", track(ahead))).candidate.name == "translation + spin"
     around = np.stack([np.sin(9 * TAU), np.cos(13 * TAU), 0 * TAU], -1)
-    assert simple_rules.better(track(around), NOISE).candidate.name == "static"
+    chosen = law("ballistic + spin", track(around))
+    assert simple_rules.better(track(around), NOISE, chosen).candidate.name == "static"
+
+
+def test_a_law_that_predicts_later_poses_better_stays():
+    rng = np.random.default_rng(0)
+    thrown = track(np.array([3.0, 0.0, 5.0]) * TAU[:, None] ** 2 + 0.02 * rng.normal(size=(15, 3)))
+    assert simple_rules.better(thrown, NOISE, law("ballistic + spin", thrown)) is None
 
 
 def test_short_tracks_have_no_rule():
     short = track(np.zeros((15, 3))).rows(slice(-7, None))
-    assert simple_rules.better(short, NOISE) is None
+    assert simple_rules.better(short, NOISE, law("static", short)) is None
 
 
 def test_a_motion_that_no_law_predicts_is_not_extrapolated_far():
