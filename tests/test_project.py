@@ -244,3 +244,20 @@ def test_quick_leaves_out_long_tests_whatever_markers_are_chosen():
         int, re.search(r"(\d+)/(\d+) tests collected \((\d+) deselected\)", quick).groups()
     )
     assert 0 < collected == found - left_out < found
+
+
+def test_files_and_functions_of_the_product_stay_short():
+    """At most 350 lines per file and 60 per function; kernels (`raster/cpu`) are exempt."""
+    kernels = ROOT / "r5dgs_core" / "raster" / "cpu"
+    files = [p for room in ("r5dgs_core", "r5dgs_addon", "operators") for p in (ROOT / room).rglob("*.py")]
+    long = []
+    for path in (p for p in files if kernels not in p.parents):
+        text = path.read_text(encoding="utf-8")
+        if text.count("\n") > 350:
+            long.append(f"{path.relative_to(ROOT)}: {text.count(chr(10))} lines")
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
+                if node.end_lineno - first + 1 > 60:
+                    long.append(f"{path.relative_to(ROOT)}: {node.name}, {node.end_lineno - first + 1} lines")
+    assert len(files) > 500 and long == []

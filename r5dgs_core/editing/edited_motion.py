@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -199,8 +200,7 @@ def _go_on(
         scene: The original scene.
         cluster: The cluster.
         course: Its motion in the observed time.
-        leaders: New versions of the group that its own follows: course, new group, True if that group's motion is
-            unchanged.
+        leaders: New versions of the group that its own follows: course, group, True if its motion is unchanged.
         later: Times since t_max. [L]
         notes: List to which losses are appended.
 
@@ -210,11 +210,7 @@ def _go_on(
     source, first = cluster.source, cluster.first
     rows = slice(len(scene.tracks.times), None)
     quats, moves = cluster.motion.quats[rows], cluster.motion.moves(course.pivot)[rows]
-    scale = float(abs(np.linalg.det(course.parent)) ** (1 / 3))
-    known = {"pivot": course.pivot, "id": cluster.id, "seen": source.seen}
-    known |= {"rigid_rms": scale * source.rigid_rms, "rigid_max": scale * source.rigid_max}
-    if source.id == 0:
-        known |= {"role": "body", "object_id": first.object_id, "rigid_rms": 0.0, "rigid_max": 0.0}
+    known = _known_fields(cluster, course)
 
     def shown(q: np.ndarray, d: np.ndarray) -> bool:
         return bool((fit_drawn_curve.pose_errors(q, d, quats, moves, course.reach) <= course.allowed).all())
@@ -232,8 +228,7 @@ def _go_on(
             matrix = course.parent @ source.follow_matrix @ np.linalg.inv(leading.parent)
             _, led = models.evaluate(leader.model, later)
             if shown(rotations.identity(len(later)), led @ matrix.T):
-                group = replace(source, **known, follows=leader.id, follow_matrix=matrix)
-                return group, course.same and as_before
+                return replace(source, **known, follows=leader.id, follow_matrix=matrix), course.same and as_before
     else:
         given = [] if first.model is None else [first.model]
         for model in (*given, source.model):
@@ -245,12 +240,21 @@ def _go_on(
                 return replace(source, **known, model=turned, history=history), course.same and turned == source.model
     model, error = fit_drawn_curve.fit(later, quats, moves, course.reach, course.allowed)
     if error > 10 * course.allowed:
-        notes.append(
-            f"{first.name}: no motion model matches its curves past t_max; the nearest one deviates by up to "
-            f"{error:.3g}"
-        )
+        miss = f"the nearest one deviates by up to {error:.3g}"
+        notes.append(f"{first.name}: no motion model matches its curves past t_max; {miss}")
     history = replace(source.history, band=None, errors=None)
     return replace(source, **known, model=model, follows=None, follow_matrix=None, history=history), False
+
+
+def _known_fields(cluster: Cluster, course: _Course) -> dict[str, Any]:
+    """Fields of the new group that do not depend on its motion past t_max."""
+    source = cluster.source
+    scale = float(abs(np.linalg.det(course.parent)) ** (1 / 3))
+    known = {"pivot": course.pivot, "id": cluster.id, "seen": source.seen}
+    known |= {"rigid_rms": scale * source.rigid_rms, "rigid_max": scale * source.rigid_max}
+    if source.id == 0:
+        known |= {"role": "body", "object_id": cluster.first.object_id, "rigid_rms": 0.0, "rigid_max": 0.0}
+    return known
 
 
 def _played(scene: Scene, group: int, later: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -126,12 +126,7 @@ def solve_linearized(
     point = problem.expand(starts, *linearized(starts, np.arange(count)))
     damping, growth, live = np.full(count, _FIRST_DAMPING), np.full(count, 2.0), np.arange(count)
     for number in range(steps):
-        diagonal = np.einsum("bii->bi", point.normal[live])
-        diagonal = diagonal + 1e-12 * diagonal.sum(1, keepdims=True) + np.finfo(float).tiny
-        damped = damping[live, None] * diagonal
-        gradient = point.gradient[live]
-        step = -np.linalg.solve(point.normal[live] + damped[:, :, None] * np.eye(size), gradient[..., None])[..., 0]
-        gain = (step * (damped * step - gradient)).sum(1)  # if the residuals were linear
+        step, gain = _damped_step(point, live, damping)
         moving = (gain > _TOLERANCE * point.cost[live] + enough) & np.isfinite(gain)
         if number >= _TRIAL_STEPS:
             moving &= ~problem.stalls(point, live, gain, min(hopeless, float(np.min(point.cost)) + behind))
@@ -151,6 +146,17 @@ def solve_linearized(
         damping[bad], growth[bad] = damping[bad] * growth[bad], 2 * growth[bad]
         live = live[damping[live] < _MOST_DAMPING]
     return point
+
+
+def _damped_step(point: Solution, live: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Steps of the live starts, and the gains that they would have if the residuals were linear. [L, P], [L]"""
+    normal, gradient = point.normal[live], point.gradient[live]
+    diagonal = np.einsum("bii->bi", normal)
+    diagonal = diagonal + 1e-12 * diagonal.sum(1, keepdims=True) + np.finfo(float).tiny
+    damped = damping[live, None] * diagonal
+    identity = np.eye(normal.shape[-1])
+    step = -np.linalg.solve(normal + damped[:, :, None] * identity, gradient[..., None])[..., 0]
+    return step, (step * (damped * step - gradient)).sum(1)
 
 
 @dataclass(frozen=True)

@@ -93,8 +93,7 @@ def fit(
             not nearly that of a ball, the free top is a candidate. [3, 3]
         least_noise: Lower bounds of the noise of displacements (per component, world units) and rotations (rad), for
             noise that the scatter about a smooth motion does not show.
-        drift: Standard deviations of the displacements and rotations from a slow drift of the track. They widen the
-            band alone.
+        drift: Standard deviations of displacements and rotations due to a slow drift; they widen the band alone.
         up: Upward direction, or None if unknown. A body that slows down on a vertical line falls back; on any other
             line, and if ``up`` is None, friction may stop it. [3]
 
@@ -122,14 +121,12 @@ def fit(
         family = (*family, replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64)))
     family = tuple(replace(candidate, window=track.window) for candidate in family)
     least = Noise(max(least_noise[0] / radius, noise.FLOOR), max(least_noise[1], noise.FLOOR))
-    few = len(track) < 4
-    selected = (
-        search.select_from_few_poses(track, family)
-        if few
-        else search.select(track, family, least, candidates is None, up)
-    )
-    drifts = Noise(drift[0] / radius, drift[1])
-    return _result(selected, family, float(times[-1]), radius, span, bands.drift_noise(least, drifts))
+    if len(track) < 4:
+        selected = search.select_from_few_poses(track, family)
+    else:
+        selected = search.select(track, family, least, candidates is None, up)
+    noise_of_drift = bands.drift_noise(least, Noise(drift[0] / radius, drift[1]))
+    return _result(selected, family, float(times[-1]), radius, span, noise_of_drift)
 
 
 def _result(

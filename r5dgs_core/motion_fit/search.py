@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..motion import models, rotations
+from ..motion import models
 from ..motion.pose_track import PoseTrack
-from . import backtest, breaks, model_scores, noise, slips
+from . import backtest, breaks, model_scores, noise, plausibility, slips
 from . import candidates as families
 from .candidates import Candidate, FittedCandidate, Noise
 from .model_scores import NoiseLevel
@@ -18,7 +18,6 @@ from .model_scores import NoiseLevel
 FREQUENCY_ERROR = 0.25  # maximum relative standard deviation of a determined frequency
 _FEW = 8  # number of poses below which neither breaks nor large candidates are tried
 _PER_POSE = 3  # maximum number of parameters per pose of a candidate for few poses
-STEEP = 0.9  # cosine of the angle to the vertical below which a motion is vertical
 _ROUNDS = 3  # rounds of noise estimation
 _MEDIAN_SQUARE = 0.455  # median square of a normal variable with unit variance
 _NOTHING_FITS = 9.0  # squared misfit of the best candidate above which the estimated noise is increased
@@ -33,8 +32,6 @@ _CUTS = 4  # number of breaks at which such a track is cut on trial
 _FEWEST = 4  # minimum number of poses of its parts
 _FEW_BLOCKS = {"v", "w"}  # blocks of laws for two or three poses
 _WELL = 1.5  # loss of a part, relative to that of noise, below which it is not searched again
-_AHEAD = 1 / 3  # time past t_max, in spans, over which a law must be plausible
-_RUNAWAY = 2.5  # distance in this time, relative to the largest observed, above which a law is not plausible
 _LEAST_PART = 7  # minimum number of poses after a break to search them for a separate law
 
 
@@ -99,8 +96,8 @@ def select(
         broken = breaks.search(track, finer) if searched else _refined(broken, best, track, level, finer)
         level = finer
     noise_level = NoiseLevel.of((*found, *broken, *slipped), _floor(level, least))
-    laws = [s for s in found if _determined(s, noise_level) and not _rises(s, up)] or found[:1]
-    plausible = [s for s in laws if not runs_away(s, track)] or laws[:1]
+    laws = [s for s in found if _determined(s, noise_level) and not plausibility.rises(s, up)] or found[:1]
+    plausible = [s for s in laws if not plausibility.runs_away(s, track)] or laws[:1]
     chosen = _simplest(plausible, noise_level, track, level)
     smooth = [s for s in plausible if not s.candidate.events(s.theta)]
     if chosen.candidate.events(chosen.theta) and smooth:
@@ -325,30 +322,6 @@ def _simplest(
     limit = _CONTRADICTED * max(min(misses), 1.0)
     fit = [s for s, miss in zip(near, misses, strict=True) if miss <= limit]
     return min(fit, key=lambda s: (s.parameters, noise_level.score(s)))
-
-
-def _rises(solution: FittedCandidate, up: np.ndarray | None) -> bool:
-    """Return True if a support would have to hold a body that moves on a vertical line, as one thrown upwards."""
-    candidate = solution.candidate
-    if up is None or not models.KINDS[candidate.kind].needs_support or "w" in candidate.blocks:
-        return False
-    v = candidate.parts(solution.theta)["v"]
-    return bool(abs(v @ up) > STEEP * np.linalg.norm(v) * np.linalg.norm(up))
-
-
-def runs_away(solution: FittedCandidate, track: PoseTrack) -> bool:
-    """Return True if the body would move or turn much further past t_max than in any equal observed time."""
-    ends = np.searchsorted(track.tau, track.tau + _AHEAD)
-    starts = np.flatnonzero(ends < len(track))
-    if len(starts) == 0:
-        return False
-    ends, tau = ends[starts], track.tau
-    ways = track.displacements[ends] - track.displacements[starts]
-    seen = (ways**2).sum(-1) + 2 / 3 * ((track.turned[ends] - track.turned[starts]) ** 2).sum(-1)
-    most = float(np.max(np.sqrt(seen) * _AHEAD / (tau[ends] - tau[starts])))
-    quats, d = solution.candidate.path(solution.theta, np.linspace(0.0, _AHEAD, 9))
-    angle = float(rotations.angle_between(quats[1:], quats[:-1]).sum())
-    return bool(math.hypot(float(np.linalg.norm(d[-1] - d[0])), angle * math.sqrt(2 / 3)) > _RUNAWAY * most)
 
 
 def select_from_few_poses(track: PoseTrack, family: tuple[Candidate, ...]) -> Selected:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import models, pose_track, rotations
-from r5dgs_core.motion_fit import breaks, candidates, fitted_motion, model_selection, search
+from r5dgs_core.motion_fit import breaks, candidates, fitted_motion, model_selection, plausibility
 from tests.support import problems
 from tests.support.problems import RADIUS, SIZE, T_MAX
 
@@ -238,4 +238,4 @@ def test_a_law_that_moves_a_body_further_than_ever_is_implausible(acceleration, 
     law = candidates.BY_NAME["translation, quadratic"]
     theta = law.pack({"r": ZERO, "e": ZERO, "v": np.array([3.0, 0, 0]), "a": np.array([0, acceleration, 0])})
     solution = candidates.FittedCandidate(law, theta, np.eye(len(theta)), np.zeros((15, 6)), np.ones(15))
-    assert search.runs_away(solution, track) == much
+    assert plausibility.runs_away(solution, track) == much
