@@ -142,9 +142,13 @@ def measure(scene: Scene, dataset: datasets.Dataset, config: Config, groups: Col
 
 
 def _surfaces(scene: Scene, group: int, looks: Sequence[Sequence[_BodyPixels]]) -> list[Surface]:
-    """Return the surface of a body at the knots that show it, from its pixels at each knot. [S]"""
+    """Return the surface of a body at the knots that show it, from its pixels at each knot [S]; empty if the body has
+    no Gaussians.
+    """
     rest = scene.gaussians.means[scene.gaussians.motion_ids == group].astype(np.float64)
     pivot, found = scene.groups[group].pivot, []
+    if len(rest) == 0:
+        return found
     for pose, own in zip(scene.tracks.poses[group], looks, strict=True):
         if own:
             center = pivot + rotations.rotate(pose[:4], np.median(rest, axis=0) - pivot) + pose[4:]
