@@ -1,6 +1,7 @@
 """Capture operator: render the scene as a training data set with images, exact masks, cameras, times and poses."""
 
 import dataclasses
+import math
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
@@ -30,13 +31,17 @@ class R5DGS_OT_capture_dataset(stepwise_operator.Stepwise, bpy.types.Operator):
     resolution_x: IntProperty(name="Width", description="Image width in pixels", default=256, min=1)
     resolution_y: IntProperty(name="Height", description="Image height in pixels", default=256, min=1)
     samples: IntProperty(name="Samples", description="Cycles samples per pixel", default=64, min=1)
-    denoise: BoolProperty(name="Denoise", default=True)
+    denoise: BoolProperty(name="Denoise", description="Denoise with OpenImageDenoise", default=True)
     transparent: BoolProperty(name="Transparent Sky", description="Write RGBA images", default=False)
-    seed: IntProperty(name="Seed", default=0, min=0)
+    seed: IntProperty(name="Seed", description="Sampling seed of the first image", default=0, min=0)
     view_transform: StringProperty(
         name="View Transform", description="Standard is plain sRGB; empty keeps the scene's", default="Standard"
     )
-    device: EnumProperty(name="Device", items=[("CPU", "CPU", ""), ("GPU", "GPU", "As set in the preferences")])
+    device: EnumProperty(
+        name="Device",
+        description="Device of Cycles",
+        items=[("CPU", "CPU", "Render on the processor"), ("GPU", "GPU", "As set in the preferences")],
+    )
     frame_start: IntProperty(name="First Frame", description="Frame of t = 0; the scene's start frame if not set")
     frame_end: IntProperty(name="Last Frame", description="Frame of t = 1; the scene's end frame if not set")
     frame_step: IntProperty(
@@ -71,6 +76,7 @@ class R5DGS_OT_capture_dataset(stepwise_operator.Stepwise, bpy.types.Operator):
     )
     rig: EnumProperty(
         name="Rig",
+        description="Cameras that are added for the capture",
         items=_items(
             cameras.RIGS,
             (
@@ -86,21 +92,40 @@ class R5DGS_OT_capture_dataset(stepwise_operator.Stepwise, bpy.types.Operator):
     rig_novel: IntProperty(name="Rig Novel", description="Generated novel cameras", default=2, min=0)
     rig_target: StringProperty(name="Rig Target", description="Object to look at; empty for the center of all objects")
     rig_radius: FloatProperty(
-        name="Rig Radius", description="Distance from the target; 0 to fit all objects into view", min=0.0
+        name="Rig Radius",
+        description="Distance from the target; 0 to fit all objects into view",
+        min=0.0,
+        subtype="DISTANCE",
     )
-    rig_elevation_deg: FloatProperty(name="Rig Elevation", description="Degrees above the target", default=30.0)
-    rig_elevation_spread_deg: FloatProperty(
-        name="Rig Elevation Spread", description="Difference in elevation between neighbors in degrees", default=0.0
+    rig_elevation: FloatProperty(
+        name="Rig Elevation",
+        description="Angle above the target",
+        default=math.radians(30.0),
+        subtype="ANGLE",
     )
-    rig_azimuth_deg: FloatProperty(
-        name="Rig Azimuth", description="Middle of the arc, degrees counter-clockwise from +X", default=-90.0
+    rig_elevation_spread: FloatProperty(
+        name="Rig Elevation Spread", description="Difference in elevation between neighbors", subtype="ANGLE"
     )
-    rig_arc_deg: FloatProperty(name="Rig Arc", description="Length of the arc in degrees", default=120.0)
-    rig_fov_deg: FloatProperty(
-        name="Rig Field of View", description="Horizontal field of view in degrees", default=45.0, min=1.0, max=170.0
+    rig_azimuth: FloatProperty(
+        name="Rig Azimuth",
+        description="Middle of the arc, counter-clockwise from +X",
+        default=math.radians(-90.0),
+        subtype="ANGLE",
+    )
+    rig_arc: FloatProperty(
+        name="Rig Arc", description="Length of the arc", default=math.radians(120.0), subtype="ANGLE"
+    )
+    rig_fov: FloatProperty(
+        name="Rig Field of View",
+        description="Horizontal field of view",
+        default=math.radians(45.0),
+        min=math.radians(1.0),
+        max=math.radians(170.0),
+        subtype="ANGLE",
     )
     objects: EnumProperty(
         name="Objects",
+        description="Selection of the objects of the data set",
         items=_items(
             captured_objects.CHOICES,
             (
@@ -116,7 +141,11 @@ class R5DGS_OT_capture_dataset(stepwise_operator.Stepwise, bpy.types.Operator):
 
     def settings(self) -> CaptureSettings:
         """Return the properties as settings; an unset frame range is that of the scene."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(CaptureSettings)}
+        values = {}
+        for field in dataclasses.fields(CaptureSettings):
+            name = field.name.removesuffix("_deg")
+            value = getattr(self, name)
+            values[field.name] = value if name == field.name else round(math.degrees(value), 4)  # stored in 32 bits
         values["directory"] = self.target_folder()
         for name in ("frame_start", "frame_end"):
             if not self.properties.is_property_set(name):

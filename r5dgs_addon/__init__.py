@@ -7,6 +7,7 @@ from .language import prompt_state
 from .motion import event_markers, exact_mode, extrapolate, motion_fields, pivot
 from .scene import click_select, evaluated_points, hidden_points, object_names, object_tint, properties, relink
 from .splats import viewport_splats
+from .ui import manual
 from .worker import jobs
 
 MODULES = (
@@ -30,6 +31,7 @@ MODULES = (
     criteria,
     overlay,
     panels,
+    manual,
     relink,
     click_select,
     jobs,

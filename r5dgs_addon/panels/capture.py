@@ -10,6 +10,7 @@ class R5DGS_PT_capture(sidebar.Sidebar, bpy.types.Panel):
 
     bl_idname = "R5DGS_PT_capture"
     bl_label = "Capture"
+    manual = "capture"
     bl_options = {"DEFAULT_CLOSED"}
 
     @classmethod

@@ -21,6 +21,7 @@ class R5DGS_PT_clean_up(sidebar.WithScene, bpy.types.Panel):
 
     bl_idname = "R5DGS_PT_clean_up"
     bl_label = "Clean Up"
+    manual = "clean_up"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context):

@@ -34,6 +34,7 @@ class R5DGS_PT_export(sidebar.WithScene, bpy.types.Panel):
 
     bl_idname = "R5DGS_PT_export"
     bl_label = "Export"
+    manual = "export"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context):

@@ -15,6 +15,7 @@ class R5DGS_PT_motion(sidebar.WithScene, bpy.types.Panel):
 
     bl_idname = "R5DGS_PT_motion"
     bl_label = "Motion"
+    manual = "motion"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context):

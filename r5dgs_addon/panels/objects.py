@@ -51,6 +51,7 @@ class R5DGS_PT_objects(sidebar.WithScene, bpy.types.Panel):
 
     bl_idname = "R5DGS_PT_objects"
     bl_label = "Objects"
+    manual = "blender"
 
     def draw(self, context):
         layout = self.layout

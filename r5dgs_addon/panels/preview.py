@@ -13,6 +13,7 @@ class R5DGS_PT_preview(sidebar.WithScene, bpy.types.Panel):
 
     bl_idname = "R5DGS_PT_preview"
     bl_label = "Preview"
+    manual = "rendering"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context):

@@ -26,6 +26,7 @@ class R5DGS_PT_prompt(sidebar.WithScene, bpy.types.Panel):
 
     bl_idname = "R5DGS_PT_prompt"
     bl_label = "Select by Prompt"
+    manual = "blender"
 
     def draw(self, context):
         layout, session = self.layout, context.window_manager.r5dgs_words

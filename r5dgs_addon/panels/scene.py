@@ -14,6 +14,7 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
 
     bl_idname = "R5DGS_PT_scene"
     bl_label = "Scene"
+    manual = "blender"
 
     def draw(self, context):
         layout = self.layout

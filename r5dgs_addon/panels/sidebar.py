@@ -11,6 +11,11 @@ class Sidebar:
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = TAB
+    manual = ""  # page of the manual, opened by a button in the header
+
+    def draw_header_preset(self, context):
+        if self.manual:
+            self.layout.operator("r5dgs.open_manual", text="", icon="HELP", emboss=False).page = self.manual
 
 
 class WithScene(Sidebar):

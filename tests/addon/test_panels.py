@@ -167,6 +167,50 @@ def test_labels_and_tooltips_follow_blenders_style(blender):
     assert len(texts) > 300 and [found for found in texts if wrong.search(found[1])] == []
 
 
+def test_visible_properties_of_operators_and_their_items_have_tooltips(blender):
+    missing = []
+    for name in dir(blender.ops.r5dgs):
+        rna = getattr(blender.ops.r5dgs, name).get_rna_type()
+        for item in rna.properties:
+            if item.identifier not in ("rna_type", "bl_idname") and not item.is_hidden:
+                parts = (item, *getattr(item, "enum_items_static", ()))
+                missing += [f"{name}.{item.identifier}" for part in parts if not part.description]
+    assert missing == []
+
+
+def test_angles_and_lengths_of_a_capture_have_units(blender):
+    properties = blender.ops.r5dgs.capture_dataset.get_rna_type().properties
+    units = {p.identifier: p.unit for p in properties if p.identifier.startswith("rig_") and p.type == "FLOAT"}
+    angles = ("rig_elevation", "rig_elevation_spread", "rig_azimuth", "rig_arc", "rig_fov")
+    assert units == {"rig_radius": "LENGTH", **dict.fromkeys(angles, "ROTATION")}
+
+
+def test_every_panel_and_operator_links_to_a_page_of_the_manual(blender, extension, monkeypatch):
+    manual = motions.addon("ui.manual")
+    named = sorted(name for names in manual.PAGES.values() for name in names)
+    assert named == sorted(dir(blender.ops.r5dgs))
+    assert all((manual.FOLDER / f"{page}.md").is_file() for page in manual.PAGES)
+    panels = [panel for module in motions.addon("panels").MODULES for panel in module.CLASSES]
+    top = [one for one in panels if getattr(one, "bl_region_type", "") == "UI" and not hasattr(one, "bl_parent_id")]
+    said = []
+    for panel in top:
+        assert panel.manual in manual.PAGES
+        panel.draw_header_preset(SimpleNamespace(layout=layouts.Layout(blender, said), manual=panel.manual), None)
+    assert said == ["r5dgs.open_manual"] * len(top)
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    assert blender.ops.r5dgs.open_manual(page="motion") == {"FINISHED"}
+    for button, page in (("r5dgs.add_shadows", "rendering"), ("R5DGS_PG_clean_up.opacity", "clean_up")):
+        assert blender.ops.wm.doc_view_manual(doc_id=button) == {"FINISHED"}
+        assert opened.pop() == manual.address(page)
+    assert opened == [manual.address("motion")] and opened[0].startswith("file://")
+    extension.unregister()
+    try:
+        assert manual.links not in blender.utils._manual_map
+    finally:
+        extension.register()
+
+
 def test_each_operator_has_a_file_of_its_own(extension):
     operators = importlib.import_module("r5dgs.operators")
     for module in operators.modules():

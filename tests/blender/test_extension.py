@@ -108,8 +108,10 @@ def test_the_archive_validates_and_holds_the_extension_only(archive):
     assert {"blender_manifest.toml", "__init__.py", "LICENSE", "operators", "r5dgs_addon", "r5dgs_core"} <= tops
     assert tops <= {
         "blender_manifest.toml", "__init__.py", "LICENSE", "README.md", "CHANGELOG.md",
-        "operators", "r5dgs_addon", "r5dgs_core",
+        "docs", "operators", "r5dgs_addon", "r5dgs_core",
     }  # fmt: skip
+    pages = {path.relative_to(ROOT).as_posix() for path in (ROOT / "docs" / "user").glob("*.md")}
+    assert {name for name in names if name.startswith("docs/") and not name.endswith("/")} == pages
     rooms = ("operators", "r5dgs_addon", *(f"r5dgs_core/{room}" for room in test_layers.PICTURE))
     needed = {path.relative_to(ROOT).as_posix() for room in rooms for path in (ROOT / room).rglob("*.py")}
     needed |= {f"r5dgs_core/{name}.py" for name in test_layers.PICTURE if (ROOT / f"r5dgs_core/{name}.py").exists()}
