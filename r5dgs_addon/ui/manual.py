@@ -8,12 +8,8 @@ from pathlib import Path
 import bpy
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "user"
-PAGES = {  # operators described on each page
-    "blender": (
-        *("load_scene", "fit_timeline", "set_display", "view_as_trained", "allow_scene_file", "select_by_prompt"),
-        *("select_object", "isolate", "unisolate", "add_alias", "remove_alias", "rename_object", "recolor"),
-        *("reset_color", "open_manual"),
-    ),
+PAGES = {  # operators described on each page; the others are described on the first
+    "blender": (),
     "motion": (
         *("re_extrapolate", "reset_motion", "simplify_keys", "replace_motion", "duplicate_object", "delete_object"),
         *("retime", "extrapolate_until", "show_confidence", "exact_mode", "pivot_to_cursor"),
@@ -24,7 +20,7 @@ PAGES = {  # operators described on each page
     ),
     "rendering": (
         *("preview", "live_preview", "use_engine", "show_colors_as_trained", "merge_with_meshes", "stop_merging"),
-        "add_shadows",
+        *("add_shadows", "viewport_render"),
     ),
     "export": ("export_ply", "export_format", "export_scene", "export_masks", "export_cameras"),
     "capture": ("capture_dataset",),
@@ -46,7 +42,11 @@ def links() -> tuple[str, tuple[tuple[str, str], ...]]:
     found = [(f"bpy.ops.r5dgs.{name}*", f"{page}.md") for page, names in PAGES.items() for name in names]
     found += [("bpy.types.r5dgs_pg_clean_up*", "clean_up.md"), ("bpy.types.r5dgs_pg_render*", "rendering.md")]
     found += [(f"bpy.types.r5dgs_pg_{name}*", "motion.md") for name in ("motion", "pivot", "exact")]
-    found += [("bpy.types.r5dgs_ap_preferences*", "install.md"), ("bpy.types.r5dgs_*", "blender.md")]
+    found += [
+        ("bpy.types.r5dgs_ap_preferences*", "install.md"),
+        ("bpy.types.r5dgs_*", "blender.md"),
+        ("bpy.ops.r5dgs.*", "blender.md"),
+    ]
     return FOLDER.as_uri() + "/", tuple(found)
 
 
