@@ -20,6 +20,7 @@ from ..r5dgs_core.playback import group_dynamics
 from ..r5dgs_core.scene import cameras, spherical_harmonics
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
 from ..r5dgs_core.scene.splats import to_opacities
+from ..r5dgs_core.shapes import object_hulls
 from . import compat
 from .motion import event_markers, exact_mode, keyframes, physics
 from .scene import (
@@ -190,6 +191,8 @@ def _objects(
                 object_names.fit(name if key[1] else name + object_names.OTHERS_SUFFIX)
             )
             above.children.link(children[key])
+    bodies = object_hulls.bodies(scene)
+    hulls = {(hull.object_id, hull.motion_id): hull.vertices.ravel().tolist() for hull in scene.hulls}
     anchors = {}
     depths = {group.id: number for number, (group, _) in enumerate(group_dynamics.parts_of(scene), start=1)}
     for part in sorted(anchor_ranges(scene, parts), key=lambda own: depths.get(own.motion_id, 0)):  # parents come first
@@ -202,7 +205,9 @@ def _objects(
         point_clouds.fill(data, scene, slice(part.start, part.start + part.count), extent, sh_degree)
         data.materials.append(material)
         home = children[part.object_id, part == largest[part.object_id]]
-        _cloud(home, anchors[_anchor_key(part)], scene, part, largest, data)
+        cloud = _cloud(home, anchors[_anchor_key(part)], scene, part, largest, data)
+        if (part.object_id, part.motion_id) in bodies:
+            cloud[loaded_scenes.HULL] = hulls.get((part.object_id, part.motion_id), [])
     return anchors
 
 

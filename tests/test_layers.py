@@ -71,7 +71,7 @@ ALLOWED = {
     "train": {"motion", "motion_fit", "scene", "data", "raster", "config", "model", "render"},
     "masks": {"data", "language"},
     "worker": {"scene", "raster", "playback", "editing", "protocol", "render", "language"},
-    "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train"},
+    "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train", "shapes"},
     "check": {"motion", "terminal", "scene", "data", "formats", "config", "train"},
     "stability": {"motion", "motion_fit", "scene", "data", "raster", "config", "playback", "render", "train"},
     "association": {"scene", "data", "raster", "playback", "render", "masks"},

@@ -17,7 +17,7 @@ import numpy as np
 from ...r5dgs_core.scene import cameras
 from ...r5dgs_core.shapes import convex_hull, depth_surface
 from .. import compat
-from ..scene import evaluated_points, point_clouds
+from ..scene import evaluated_points, loaded_scenes, point_clouds
 from ..worker import jobs
 from . import mesh_merge, render_request, view_cameras, visible_clouds
 
@@ -89,14 +89,25 @@ def add(
     assert meshes is not None
     proxies = bpy.data.collections.new(NAME)
     meshes.collection.children.link(proxies)
-    for cloud in clouds:
-        if cloud.object.r5dgs.object_id > 0 and cloud.parent is None:
-            _add_hull(proxies, cloud.object)
+    for cloud in bodies(clouds):
+        _add_hull(proxies, cloud)
     for parts, arrays in zip(background, pictures, strict=True):
         _add_surface(proxies, parts.view, arrays)
     _add_layer(meshes, proxies)
     _add_node(scene, meshes)
     return proxies
+
+
+def bodies(clouds: Sequence[visible_clouds.VisibleCloud]) -> list[visible_clouds.VisibleCloud]:
+    """Return the clouds that cast shadows: those of bodies, and all of scenes that an earlier version loaded."""
+    marked = {cloud.collection for cloud in clouds if loaded_scenes.HULL in cloud.object}
+    return [
+        cloud
+        for cloud in clouds
+        if cloud.object.r5dgs.object_id > 0
+        and cloud.parent is None
+        and (loaded_scenes.HULL in cloud.object or cloud.collection not in marked)
+    ]
 
 
 def remove(scene: bpy.types.Scene) -> None:
@@ -113,13 +124,12 @@ def remove(scene: bpy.types.Scene) -> None:
         bpy.data.batch_remove([*proxies.objects, *data, proxies])
 
 
-def _add_hull(proxies: bpy.types.Collection, cloud: bpy.types.Object) -> None:
+def _add_hull(proxies: bpy.types.Collection, visible: visible_clouds.VisibleCloud) -> None:
     """Add the convex hull of a point cloud as its child, so that it follows the cloud's motion."""
-    parts = {name: point_clouds.attribute(cloud.data, *kind[:2]) for name, kind in evaluated_points.PARTS.items()}
-    if any(part is None for part in parts.values()):
-        return
-    values = {name: point_clouds.read(part, *evaluated_points.PARTS[name][2:]) for name, part in parts.items()}
-    corners = convex_hull.vertices(values["means"], values["quats"], values["scales"], values["base"][:, 3])
+    cloud = visible.object
+    corners = np.reshape(cloud.get(loaded_scenes.HULL, ()), (-1, 3)) if visible.edit is None else ()
+    if not len(corners):
+        corners = _corners(cloud)
     built = bmesh.new()
     try:
         for corner in corners:
@@ -133,6 +143,15 @@ def _add_hull(proxies: bpy.types.Collection, cloud: bpy.types.Object) -> None:
     finally:
         built.free()
     _new_proxy(proxies, data).parent = cloud
+
+
+def _corners(cloud: bpy.types.Object) -> np.ndarray:
+    """Vertices of the hull of a point cloud's current points. [V, 3]"""
+    parts = {name: point_clouds.attribute(cloud.data, *kind[:2]) for name, kind in evaluated_points.PARTS.items()}
+    if any(part is None for part in parts.values()):
+        return np.zeros((0, 3))
+    values = {name: point_clouds.read(part, *evaluated_points.PARTS[name][2:]) for name, part in parts.items()}
+    return convex_hull.vertices(values["means"], values["quats"], values["scales"], values["base"][:, 3])
 
 
 def _add_surface(proxies: bpy.types.Collection, view: view_cameras.ViewCamera, arrays: dict[str, np.ndarray]) -> None:

@@ -11,6 +11,7 @@ SKY = "r5dgs_sky"  # custom property of the collection: coefficients of the sky
 # Custom property of the collection: pose of the best captured camera (OpenGL axes), distance to the objects, size of
 # the picture at distance 1.
 VIEW = "r5dgs_view"
+HULL = "r5dgs_hull"  # custom property of the clouds of bodies: vertices of their hull, empty if the file has none
 LIGHT = "r5dgs_light"  # custom property of the collection: direction of the light that shading depends on
 
 

@@ -48,7 +48,8 @@ def edit(
     kept, arrays, untouched = edited_gaussians.gather(scene, clusters)
     objects = _objects(scene, table, arrays["object_ids"])
     groups = _groups(clusters, scene, objects, kept, arrays["motion_ids"])
-    if not (untouched and all(cluster.same for cluster in clusters)):
+    same = untouched and all(cluster.same for cluster in clusters)
+    if not same:
         for name in ("dynamics", "canonical_means"):
             if arrays.get(name) is not None:
                 arrays[name] = None
@@ -63,6 +64,7 @@ def edit(
         objects=objects,
         groups=groups,
         lookup=lookup,
+        hulls=scene.hulls if same and all(cluster.id == cluster.source.id for cluster in clusters) else (),
     )
     return _with_representatives(result), notes
 

@@ -5,7 +5,7 @@
     "features": [{"name": "origin", "required": true, "since": "0.2.0"}]
 
 A reader rejects a file with a required feature that it does not support, and skips an optional one. Names reserved for
-later releases: hulls, trajectory, quantised.
+later releases: trajectory, quantised.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from .. import __version__, errors
-from . import scene_json
+from . import hull_json, scene_json
 from .scene import Scene
 
 VERSIONS = (1, 2)  # format versions that this release reads
@@ -42,7 +42,8 @@ ORIGIN = Feature("origin", required=True, since="0.2.0")
 MOTIONS = Feature("motions", required=True, since="0.2.0")
 EVENTS = Feature("events", required=False, since="0.2.0")
 PARTS = Feature("parts", required=False, since="0.2.0")
-_KNOWN_NAMES = {ORIGIN.name, MOTIONS.name, EVENTS.name, PARTS.name}
+HULLS = Feature("hulls", required=False, since="0.2.0")
+_KNOWN_NAMES = {ORIGIN.name, MOTIONS.name, EVENTS.name, PARTS.name, HULLS.name}
 
 
 def _used(scene: Scene) -> list[Feature]:
@@ -50,7 +51,8 @@ def _used(scene: Scene) -> list[Feature]:
     found = [ORIGIN] if scene.origin.any() else []
     found += [MOTIONS] if any(not group.model.is_basic for group in scene.groups) else []
     found += [EVENTS] if any(group.history.events for group in scene.groups) else []
-    return found + ([PARTS] if any(group.joint is not None for group in scene.groups) else [])
+    found += [PARTS] if any(group.joint is not None for group in scene.groups) else []
+    return found + ([HULLS] if scene.hulls else [])
 
 
 def version(scene: Scene) -> int:
@@ -64,12 +66,15 @@ def dump(scene: Scene) -> dict[str, Any]:
     if not used:
         return {}
     origin = {"origin": scene.origin.tolist()} if ORIGIN in used else {}
-    return {"features": [asdict(feature) for feature in used], **origin}
+    hulls = {"hulls": hull_json.dump(scene)} if HULLS in used else {}
+    return {"features": [asdict(feature) for feature in used], **origin, **hulls}
 
 
 def fields(top: scene_json.Row) -> dict[str, Any]:
     """Fields of `Scene` that belong to the features of a checked file. Raises as `check` does."""
-    return {"origin": top.numbers("origin", (3,))} if ORIGIN.name in _names(top.data) else {}
+    names = _names(top.data)
+    origin = {"origin": top.numbers("origin", (3,))} if ORIGIN.name in names else {}
+    return origin | ({"hulls": top.each("hulls", hull_json.read)} if HULLS.name in names else {})
 
 
 def skipped(data: dict[str, Any]) -> list[str]:

@@ -19,6 +19,7 @@ from ..motion import history
 from ..motion.joint import Joint
 from ..motion.models import MotionModel
 from .cameras import Camera
+from .hull import Hull
 from .lookup_table import Table
 
 ROLES = ("pinned", "body", "shadow")
@@ -273,6 +274,7 @@ class Scene:
         origin: Point of the data set's world from which all positions of the scene are measured:
             world = origin + position. Zero unless the world's origin is so far away that float32 would lose detail. [3]
             float64
+        hulls: Convex hulls of objects, at most one for each object and motion group. Empty in scenes without them.
     """
 
     name: str
@@ -300,6 +302,7 @@ class Scene:
     near_plane: float = NEAR_PLANE
     harmonics_turn: bool = True
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    hulls: tuple[Hull, ...] = ()
 
     @functools.cached_property
     def extent(self) -> float:

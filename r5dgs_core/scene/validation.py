@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors, findings
-from . import array_shapes, cameras, model_checks, part_checks
+from . import array_shapes, cameras, hull_json, model_checks, part_checks
 from .lookup_table import Table
 from .row_runs import runs
 from .scene import DTYPES, EMBEDDINGS, GROUPS, ROLES, MotionGroup, Scene
@@ -88,6 +88,7 @@ def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> 
         if group is not findings.UNREAD:
             _check_group(scene, place, row, group, object_ids, guard)
     part_checks.check(scene, place, guard)
+    hull_json.check(scene, place, guard)
     for camera in _listed(scene.cameras):
         with guard():
             try:

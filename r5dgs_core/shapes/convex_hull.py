@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..motion import rotations
+from ..scene.hull_json import MOST_VERTICES
 
 LEVEL = 0.15  # opacity at which the surface of a Gaussian is placed; between 0.1 and 0.25 hulls of objects fit best
-MOST_VERTICES = 64
 _DIRECTIONS = 1024  # directions in which the hull is tight
 _CELLS = 48  # most cells along the longest side of an object, for finding its connected part
 _AT_ONCE = 1 << 22  # products of Gaussians and directions that are held in memory

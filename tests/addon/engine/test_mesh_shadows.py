@@ -8,6 +8,7 @@ import pytest
 
 from r5dgs_core.data import images
 from r5dgs_core.scene import scene_file
+from r5dgs_core.shapes import object_hulls
 from tests.support import motions, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -172,3 +173,28 @@ def test_a_moving_camera_adds_surfaces_along_its_path(blender, scene):
 def test_eevee_has_no_shadow_catcher(blender, scene):
     blender.ops.r5dgs.merge_with_meshes(engine=motions.addon("compat").EEVEE)
     assert not blender.ops.r5dgs.add_shadows.poll()
+
+
+@pytest.mark.parametrize("stored", [True, False])
+def test_each_body_has_one_hull_and_shadows_and_fringes_have_none(blender, tmp_path, stored):
+    mixed = scenes.make_scene(n=900)
+    motions_of, mug = mixed.gaussians.motion_ids.copy(), mixed.object(1)
+    rows = np.arange(mug.start, mug.start + 60)
+    motions_of[rows] = np.repeat([0, 2, 4], 20)
+    rows = np.arange(mug.start, mug.start + mug.count)
+    motions_of[rows] = np.sort(motions_of[rows])
+    mixed = mixed.with_arrays(motion_ids=motions_of)
+    if stored:
+        mixed = dataclasses.replace(mixed, hulls=object_hulls.of(mixed))
+    motions.load(blender, scene_file.write(mixed, tmp_path / "mixed.r5dgs"))
+    blender.ops.r5dgs.merge_with_meshes()
+    visible, shadows = motions.addon("engine.visible_clouds"), motions.addon("engine.mesh_shadows")
+    _, clouds = visible.instances(blender.context.evaluated_depsgraph_get())
+    assert {"mug still", "mug with red apple", "mug with mug shadow"} < {cloud.object.name for cloud in clouds}
+    proxies = shadows.add(blender.context.scene, clouds, (), ())
+    assert {proxy.parent.name for proxy in proxies.objects} == {"mug", "red apple", "toy car"}
+    for proxy in proxies.objects:
+        hull = {h.object_id: h.vertices for h in object_hulls.of(mixed)}[proxy.parent.r5dgs.object_id]
+        found = np.array([vertex.co for vertex in proxy.data.vertices])
+        np.testing.assert_allclose(found.min(0), hull.min(0), atol=1e-3)
+        np.testing.assert_allclose(found.max(0), hull.max(0), atol=1e-3)

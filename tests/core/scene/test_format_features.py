@@ -105,7 +105,7 @@ def test_a_missing_required_feature_is_named_with_its_release(path, tmp_path):
     listed = [
         {"name": "origin", "required": True, "since": "0.2.0"},
         {"name": "quantised", "required": True, "since": "0.9.1"},
-        {"name": "hulls", "required": True, "since": "0.10.0"},
+        {"name": "trajectory", "required": True, "since": "0.10.0"},
     ]
     newer = with_features(path, tmp_path / "newer.r5dgs", listed, origin=[0, 0, 1e7])
     for reader in (scene_file.read, scene_file.read_embeddings, scene_file.is_exact):
@@ -115,10 +115,10 @@ def test_a_missing_required_feature_is_named_with_its_release(path, tmp_path):
 
 
 def test_optional_features_are_skipped_with_one_line(path, tmp_path, caplog):
-    listed = [{"name": name, "required": False, "since": "0.5.0"} for name in ("hulls", "trajectory")]
-    newer = with_features(path, tmp_path / "newer.r5dgs", listed, hulls=[1, 2, 3])
+    listed = [{"name": name, "required": False, "since": "0.5.0"} for name in ("colliders", "trajectory")]
+    newer = with_features(path, tmp_path / "newer.r5dgs", listed, colliders=[1, 2, 3])
     scene = scene_file.read(newer)
-    assert [record.getMessage().count("hulls, trajectory") for record in caplog.records] == [1]
+    assert [record.getMessage().count("colliders, trajectory") for record in caplog.records] == [1]
     assert members(scene_file.write(scene, tmp_path / "again.r5dgs")) == members(path)
 
 

@@ -1,0 +1,22 @@
+"""Convex hull of an object, which Blender uses as proxy for shadows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Hull:
+    """Convex hull of the Gaussians of an object that move with one motion group, in the bind state.
+
+    Attributes:
+        object_id: The object.
+        motion_id: The motion group.
+        vertices: Points whose convex hull it is, 4 to 64, world. [V, 3] float64
+    """
+
+    object_id: int
+    motion_id: int
+    vertices: np.ndarray
