@@ -9,8 +9,8 @@ import numpy as np
 from .. import errors, findings
 from . import cameras
 from .array_shapes import fail
-from .json_row import Row
 from .hull import Hull
+from .json_row import Row
 from .scene import Scene
 
 MOST_VERTICES = 64
