@@ -578,9 +578,11 @@ def test_a_capture_that_blender_cancels_leaves_nothing(service, blender, scene, 
 def test_the_operator_has_the_defaults_of_the_settings(service, blender):
     properties = blender.ops.r5dgs.capture_dataset.get_rna_type().properties
     for field in dataclasses.fields(service.settings.CaptureSettings):
-        default = getattr(properties[field.name], "default", None)
-        if field.name not in ("directory", "frame_start", "frame_end"):
-            assert default == pytest.approx(field.default), field.name
+        name = field.name.removesuffix("_deg")
+        default = getattr(properties[name], "default", None)
+        if name not in ("directory", "frame_start", "frame_end"):
+            expected = math.radians(field.default) if name != field.name else field.default
+            assert default == pytest.approx(expected), name
 
 
 # The bundled example

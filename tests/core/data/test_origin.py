@@ -161,6 +161,7 @@ def test_scenes_without_an_origin_are_measured_in_their_own_world(baked, tiny, t
         baked.with_arrays(means=(baked.gaussians.means.astype(np.float64) + 0.2 * FAR).astype(np.float32)),
         groups=tuple(dataclasses.replace(group, pivot=group.pivot + 0.2 * FAR) for group in baked.groups),
         cameras=tuple(cameras.moved(camera, 0.2 * FAR) for camera in baked.cameras),
+        hulls=(),
     )
     path = scene_file.write(older, tmp_path / "older.r5dgs")
     with zipfile.ZipFile(path) as archive:
