@@ -4,7 +4,7 @@
 
 A long run can be split: write parts with --tracks, and tabulate them with --merge.
 
-Tracks of 15 poses on [0, 0.75] are drawn by `simulated_motions` and fitted by `model_selection.fit`. Columns:
+Tracks of 15 poses on [0, 0.75] are drawn by `simulated_tracks` and fitted by `model_selection.fit`. Columns:
 
     error      median error at t = 1 over a ball of the body's radius, in % of the body's size; 90 % quantile
     line       median error of a straight line and a constant spin through the last five poses
@@ -38,7 +38,7 @@ from scipy.spatial.transform import Rotation
 from r5dgs_core.motion import models
 from r5dgs_core.motion_fit import model_selection
 
-from . import simulated_motions as simulated
+from . import simulated_tracks as simulated
 
 BAD = 20.0  # % of the size
 

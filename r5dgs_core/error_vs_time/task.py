@@ -16,7 +16,7 @@ Measured = tuple[list[Row], list[str]]  # rows, and the reasons for missing meas
 
 @dataclass(frozen=True)
 class Request:
-    """What a task measures, and how.
+    """Scene, data and settings that a task measures with.
 
     Attributes:
         scene: The scene.

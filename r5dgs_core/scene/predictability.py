@@ -1,4 +1,4 @@
-"""How far the predicted motion of each object can be trusted: warnings, half widths of bands, errors of poses."""
+"""Reliability of the predicted motion of each object: warnings, half widths of bands, errors of poses."""
 
 from __future__ import annotations
 

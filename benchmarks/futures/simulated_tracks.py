@@ -1,0 +1,131 @@
+"""Named simulated motions, and noisy observations of them with known truth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from . import simulated_events as events
+from . import simulated_motions as motions
+from .simulated_motions import POSES, RADIUS, T_MAX, Maker, Motion, box_inertia, grid, turned
+
+MOTIONS: dict[str, Maker] = {
+    "steady": motions.steady,
+    "ballistic": motions.ballistic,
+    "hinge": motions.hinge,
+    "pendulum": motions.pendulum,
+    "circle": motions.circle,
+    "tumbling": motions.tumbling,
+    "static": motions.static,
+    "slow": motions.slow,
+    "late start": events.within(events.starts, 0.15, 0.5),
+    "collision": events.within(events.collides, 0.15, 0.55),
+    "drag": motions.drag,
+    "fall with drag": motions.falls_with_drag,
+    "gyroscope": motions.gyroscope,
+    "friction, stops after t_max": motions.rolls_until(0.8, 1.0),
+    "friction, stops inside": motions.rolls_until(0.35, 0.6),
+    "friction, slides": motions.slides_until(0.8, 1.0),
+    "bounces": motions.bounces,
+    "one bounce": events.within(events.bounces_once, 0.25, 0.5),
+    "damped spring": motions.damped_spring,
+    "damped pendulum": motions.damped_pendulum,
+    "Lissajous": motions.lissajous,
+    "double pendulum": motions.double_pendulum,
+    "slow Lissajous": motions.slow_lissajous,
+    "collision, 3 left": events.left(events.collides, 3),
+    "late start, 3 left": events.left(events.starts, 3),
+    "stop, 3 left": events.left(events.stops, 3),
+    "one bounce, 3 left": events.left(events.bounces_once, 3),
+    "falls from a table, 5 left": events.left(events.leaves_table, 5),
+    "steady, last one slipped": events.slipped(motions.steady, 1),
+    "steady, last 3 slipped": events.slipped(motions.steady, 3),
+    "ballistic, last 3 slipped": events.slipped(motions.ballistic, 3),
+    "ballistic, last 5 slipped": events.slipped(motions.ballistic, 5),
+}
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of observed poses.
+
+    Attributes:
+        place: Standard deviation per component, in body sizes (2 `RADIUS`).
+        degrees: The same of rotations.
+        correlation: Correlation with the previous pose.
+        outliers: Share of poses that are ten times as noisy.
+    """
+
+    place: float
+    degrees: float
+    correlation: float = 0.0
+    outliers: float = 0.0
+
+
+NOISES = {
+    "white": Noise(0.005, 0.8),
+    "correlated": Noise(0.005, 0.8, correlation=0.7),
+    "heavy": Noise(0.005, 0.8, outliers=0.05),
+    "coarse": Noise(0.02, 3.0),
+    "low": Noise(0.001, 0.2),
+}
+
+
+@dataclass(frozen=True)
+class Draw:
+    """An observed track and its true future.
+
+    Attributes:
+        times: Observed times. [S]
+        places: Observed places. [S, 3]
+        turns: Observed rotations. [S]
+        later: Times after `T_MAX`; the last is 1. [H]
+        true_places: True places there. [H, 3]
+        true_turns: True rotations there. [H]
+        motion: The motion.
+        inertia: Inertia of the body in its last observed pose, world axes. [3, 3]
+    """
+
+    times: np.ndarray
+    places: np.ndarray
+    turns: Rotation
+    later: np.ndarray
+    true_places: np.ndarray
+    true_turns: Rotation
+    motion: Motion
+    inertia: np.ndarray
+
+
+def draw(name: str, noise: Noise, seed: int, poses: int = POSES) -> Draw:
+    """Observe a random motion of a kind; equal arguments give equal draws."""
+    rng = np.random.default_rng([seed, sum(name.encode())])
+    motion = MOTIONS[name](rng)
+    times = grid(poses)
+    later = np.linspace(T_MAX, 1.0, 6)[1:]
+    places, turns = motion.path(times)
+    matrix = turns[-1].as_matrix()
+    values = rng.normal(size=(poses, 6))
+    rho = noise.correlation
+    for i in range(1, poses):
+        values[i] = rho * values[i - 1] + math.sqrt(1 - rho**2) * values[i]
+    values *= np.where(rng.uniform(size=(poses, 1)) < noise.outliers, 10.0, 1.0)
+    slip = np.where(np.arange(poses)[:, None] >= poses - motion.slipped, motion.slip, 0.0)
+    return Draw(
+        times,
+        places + noise.place * 2 * RADIUS * values[:, :3],
+        turned(math.radians(noise.degrees) * values[:, 3:]) * turns * turned(slip),
+        later,
+        *motion.path(later),
+        motion,
+        matrix @ box_inertia() @ matrix.T,
+    )
+
+
+def errors(places: np.ndarray, turns: Rotation, truth: Draw) -> np.ndarray:
+    """Root mean square error over the surface of the body's ball at the later times, in % of its size. [H]"""
+    angle = (turns * truth.true_turns.inv()).magnitude()
+    turned = 2 / 3 * (2 * RADIUS * np.sin(0.5 * angle)) ** 2
+    return 50 / RADIUS * np.sqrt(((places - truth.true_places) ** 2).sum(-1) + turned)
