@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..motion import joint as joints
-from ..motion import rotations, se3
+from ..motion import robust_weights, rotations, se3
 from ..motion.history import Band, History
 from ..motion.joint import BALL, HINGE, SLIDER, Joint
 from ..motion.pose_track import PoseTrack
@@ -68,6 +68,33 @@ class Found:
     place_error: float
     turn_error: float
     history: History
+
+
+@dataclass(frozen=True)
+class _RelativeMotion:
+    """Motion of the child relative to the parent, about c.
+
+    Attributes:
+        poses: Q and D. [S, 4], [S, 3]
+        weights: Confidence of the poses. [S]
+        c: Reference point, the child's pivot. [3]
+        middle: Middle of both pivots. [3]
+        sigmas: Noise of displacements, world units, and rotations, rad.
+    """
+
+    poses: se3.Pose
+    weights: np.ndarray
+    c: np.ndarray
+    middle: np.ndarray
+    sigmas: tuple[float, float]
+
+    def squares(self, closed: se3.Pose) -> np.ndarray:
+        """Return the squared errors of the poses from closed ones, in units of the noise. [S]"""
+        return (se3.differences(self.poses, closed, *self.sigmas) ** 2).sum(-1)
+
+    def reweighted(self, closed: se3.Pose, count: int) -> np.ndarray:
+        """Return robust weights of errors from closed poses that have ``count`` components. [S]"""
+        return self.weights * robust_weights.cauchy_weights(self.squares(closed), 4.0 * count)
 
 
 @dataclass(frozen=True)
@@ -122,12 +149,12 @@ def find(
     quats, moves = joints.relative(poses[0], parent.pivot, poses[1], child.pivot, c)
     quats = rotations.make_continuous(quats[::-1])[::-1]
     sigmas = _noise(times[used], quats[used], moves[used], child.radius, least_noise)
-    middle = 0.5 * (c + parent.pivot)
+    motion = _RelativeMotion((quats, moves), weights, c, 0.5 * (c + parent.pivot), sigmas)
     best, least = None, 0.0
     price = math.log(6.0 * used.sum())
     for fit in (_hinge, _ball, _slider):
-        trial = fit(quats, moves, weights, c, middle, sigmas)
-        squares = _squares(trial.closed, (quats, moves), sigmas)[used]
+        trial = fit(motion)
+        squares = motion.squares(trial.closed)[used]
         freed = 6 - (3 if trial.kind == BALL else 1)
         cost = float(np.minimum(squares, _CAP * freed * price).sum()) + price * (trial.parameters - 6 * used.sum())
         if (
@@ -137,7 +164,7 @@ def find(
             and _moves(trial, sigmas)
         ):
             best, least = trial, cost
-    return None if best is None else _result(times, best, least, (quats, moves), child, weights, sigmas)
+    return None if best is None else _result(times, best, least, motion, child)
 
 
 def _noise(
@@ -149,61 +176,41 @@ def _noise(
     return _BOTH * max(radius * found.place, least[0]), _BOTH * max(found.turn, least[1])
 
 
-def _hinge(
-    quats: np.ndarray,
-    moves: np.ndarray,
-    weights: np.ndarray,
-    c: np.ndarray,
-    middle: np.ndarray,
-    sigmas: tuple[float, float],
-) -> _Trial:
+def _hinge(motion: _RelativeMotion) -> _Trial:
+    (quats, moves), robust = motion.poses, motion.weights
     pairs = rotations.multiply(quats[:, None], rotations.conjugate(quats))[..., 1:]  # sin(angle / 2) axis
-    robust, axis, shift, angles, closed = weights, np.zeros(3), np.zeros(3), np.zeros(len(quats)), (quats, moves)
+    axis, shift, angles, closed = np.zeros(3), np.zeros(3), np.zeros(len(quats)), motion.poses
     for _ in range(_ROUNDS):
-        axis = np.linalg.eigh(np.einsum("s,r,srx,sry->xy", robust, robust, pairs, pairs))[1][:, -1]
-        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-        angles = np.unwrap(2 * np.arctan2(quats[:, 1:] @ axis, quats[:, 0]))
+        axis = _main_axis(np.einsum("s,r,srx,sry->xy", robust, robust, pairs, pairs))
+        angles = _angles(quats, axis)
         angles = angles - angles[-1]
         closed_quats = rotations.rotvecs_to_quats(angles[:, None] * axis)
         shift = _pivot(closed_quats, moves, robust)
         closed = closed_quats, shift - rotations.rotate(closed_quats, shift)
-        robust = _reweighted(weights, _squares(closed, (quats, moves), sigmas), 5)
-    point = c + shift
-    point = point + axis * (axis @ (middle - point))  # of the points of the axis, the nearest to the middle
+        robust = motion.reweighted(closed, 5)
+    point = motion.c + shift
+    point = point + axis * (axis @ (motion.middle - point))  # of the points of the axis, the nearest to the middle
     return _Trial(HINGE, point, axis, closed, angles, len(quats) + 4)
 
 
-def _ball(
-    quats: np.ndarray,
-    moves: np.ndarray,
-    weights: np.ndarray,
-    c: np.ndarray,
-    middle: np.ndarray,
-    sigmas: tuple[float, float],
-) -> _Trial:
-    robust, shift, closed = weights, np.zeros(3), (quats, moves)
+def _ball(motion: _RelativeMotion) -> _Trial:
+    (quats, moves), robust = motion.poses, motion.weights
+    shift, closed = np.zeros(3), motion.poses
     for _ in range(_ROUNDS):
         shift = _pivot(quats, moves, robust)
         closed = quats, shift - rotations.rotate(quats, shift)
-        robust = _reweighted(weights, _squares(closed, (quats, moves), sigmas), 3)
-    return _Trial(BALL, c + shift, None, closed, np.zeros(0), 3 * len(quats) + 3)
+        robust = motion.reweighted(closed, 3)
+    return _Trial(BALL, motion.c + shift, None, closed, np.zeros(0), 3 * len(quats) + 3)
 
 
-def _slider(
-    quats: np.ndarray,
-    moves: np.ndarray,
-    weights: np.ndarray,
-    c: np.ndarray,
-    middle: np.ndarray,
-    sigmas: tuple[float, float],
-) -> _Trial:
-    robust, axis, closed = weights, np.zeros(3), (quats, moves)
+def _slider(motion: _RelativeMotion) -> _Trial:
+    (quats, moves), robust = motion.poses, motion.weights
+    axis, closed = np.zeros(3), motion.poses
     for _ in range(_ROUNDS):
-        axis = np.linalg.eigh(np.einsum("s,sx,sy->xy", robust, moves, moves))[1][:, -1]
-        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+        axis = _main_axis(np.einsum("s,sx,sy->xy", robust, moves, moves))
         closed = rotations.identity(len(quats)), np.outer(moves @ axis, axis)
-        robust = _reweighted(weights, _squares(closed, (quats, moves), sigmas), 5)
-    return _Trial(SLIDER, middle, axis, closed, moves @ axis, len(quats) + 2)
+        robust = motion.reweighted(closed, 5)
+    return _Trial(SLIDER, motion.middle, axis, closed, moves @ axis, len(quats) + 2)
 
 
 def _pivot(quats: np.ndarray, moves: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -213,14 +220,15 @@ def _pivot(quats: np.ndarray, moves: np.ndarray, weights: np.ndarray) -> np.ndar
     return np.linalg.lstsq(arms, (moves * root).ravel(), rcond=0.03)[0]
 
 
-def _squares(closed: se3.Pose, poses: se3.Pose, sigmas: tuple[float, float]) -> np.ndarray:
-    """Return the squared errors of poses from closed ones, in units of the noise. [S]"""
-    return (se3.differences(poses, closed, *sigmas) ** 2).sum(-1)
+def _main_axis(moments: np.ndarray) -> np.ndarray:
+    """Return the direction of the largest second moment; its largest component is positive. [3, 3] -> [3]"""
+    axis = np.linalg.eigh(moments)[1][:, -1]
+    return axis * np.sign(axis[np.argmax(np.abs(axis))])
 
 
-def _reweighted(weights: np.ndarray, squares: np.ndarray, count: int) -> np.ndarray:
-    """Return Cauchy weights of errors with ``count`` components. [S]"""
-    return weights / (1 + squares / (4.0 * count))
+def _angles(quats: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Return the angles of rotations about an axis, without jumps. [S, 4] -> [S]"""
+    return np.unwrap(2 * np.arctan2(quats[:, 1:] @ axis, quats[:, 0]))
 
 
 def _near(trial: _Trial, parent: Link, child: Link) -> bool:
@@ -238,22 +246,15 @@ def _moves(trial: _Trial, sigmas: tuple[float, float]) -> bool:
     return float(np.ptp(trial.coordinates)) > LEAST_RANGE * sigma
 
 
-def _result(
-    times: np.ndarray,
-    trial: _Trial,
-    cost: float,
-    poses: se3.Pose,
-    child: Link,
-    weights: np.ndarray,
-    sigmas: tuple[float, float],
-) -> Found:
+def _result(times: np.ndarray, trial: _Trial, cost: float, motion: _RelativeMotion, child: Link) -> Found:
     """Return the joint with the motion model of its coordinate."""
-    errors = se3.differences(poses, trial.closed, 1.0, 1.0)[weights > 0]
+    weights = motion.weights
+    errors = se3.differences(motion.poses, trial.closed, 1.0, 1.0)[weights > 0]
     place, turn = (float(np.sqrt((part**2).sum(1).mean())) for part in (errors[:, :3], errors[:, 3:]))
     quats = trial.closed[0] if trial.kind != SLIDER else rotations.identity(len(times))
     moves = trial.closed[1] if trial.kind == SLIDER else np.zeros((len(times), 3))
     radius = max(child.radius, float(np.linalg.norm(child.pivot - trial.point)))
-    least = sigmas[0] / _BOTH, sigmas[1] / _BOTH
+    least = motion.sigmas[0] / _BOTH, motion.sigmas[1] / _BOTH
     fit = model_selection.fit(times, quats, moves, radius=radius, weights=weights, least_noise=least)
     model = joints.closed(trial.kind, trial.axis, fit.model)
     limits = None if trial.kind == BALL else (float(trial.coordinates.min()), float(trial.coordinates.max()))
@@ -274,10 +275,7 @@ def _stop_time(joint: Joint, coordinates: np.ndarray, span: float) -> float | No
     turned = inner.min(initial=np.inf) <= low + 1e-12, inner.max(initial=-np.inf) >= high - 1e-12
     tau = np.linspace(0.0, _HORIZON * span, 2048)
     quats, moves = joint.poses(tau)
-    if joint.kind == SLIDER:
-        path = moves @ joint.axis
-    else:
-        path = np.unwrap(2 * np.arctan2(quats[:, 1:] @ joint.axis, quats[:, 0]))
+    path = moves @ joint.axis if joint.kind == SLIDER else _angles(quats, joint.axis)
     beyond = (turned[0] & (path < low - slack)) | (turned[1] & (path > high + slack))
     return float(tau[np.argmax(beyond)]) if beyond.any() else None
 
