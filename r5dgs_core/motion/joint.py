@@ -15,10 +15,23 @@ from . import models, rotations, se3
 from .models import MotionModel
 
 HINGE, BALL, SLIDER = KINDS = ("hinge", "ball", "slider")
-_CENTERS = ("velocity", "acceleration", "center_offset", "offset_displacement", "second_velocity")
-_CENTERS = (*_CENTERS, "second_acceleration")  # vectors that move the joint's point
-_TURNS = ("angular_velocity", "angular_acceleration", "offset_rotvec", "precession")
-_TURNS = (*_TURNS, "second_angular_velocity", "second_angular_acceleration")
+# Vectors of a motion model that move the joint's point, and those that turn the part.
+_CENTERS = (
+    "velocity",
+    "acceleration",
+    "center_offset",
+    "offset_displacement",
+    "second_velocity",
+    "second_acceleration",
+)
+_TURNS = (
+    "angular_velocity",
+    "angular_acceleration",
+    "offset_rotvec",
+    "precession",
+    "second_angular_velocity",
+    "second_angular_acceleration",
+)
 
 
 @dataclass(frozen=True, eq=False)

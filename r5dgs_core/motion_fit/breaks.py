@@ -98,15 +98,15 @@ BREAKS = {
 
 @dataclass(frozen=True)
 class BreakCandidate(Candidate):
-    """A break between two neighbouring poses, or one such break per start if the limits are arrays [B, 1, 1, 1].
+    """A break between two neighbouring poses.
 
     Attributes:
         low, high: Times of the poses before and after the gap.
         gap: Index of the first pose after it.
     """
 
-    low: np.ndarray | float = -1.0
-    high: np.ndarray | float = 0.0
+    low: float = -1.0
+    high: float = 0.0
     gap: int = 0
 
     @property

@@ -10,9 +10,9 @@ from ..motion import models, rotations
 from ..motion.pose_track import PoseTrack
 from .candidates import FittedCandidate
 
-_RUNAWAY = 2.5  # distance in this time, relative to the largest observed, above which a law is not plausible
-STEEP = 0.9  # cosine of the angle to the vertical below which a motion is vertical
+STEEP = 0.9  # cosine of the angle to the vertical above which a motion is vertical
 _AHEAD = 1 / 3  # time past t_max, in spans, over which a law must be plausible
+_RUNAWAY = 2.5  # distance in this time, relative to the largest observed, above which a law is not plausible
 
 
 def rises(solution: FittedCandidate, up: np.ndarray | None) -> bool:

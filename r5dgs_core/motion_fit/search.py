@@ -76,9 +76,8 @@ def select(
     tried = [c for c in family if c.parameters <= most] or [min(family, key=lambda c: c.parameters)]
     found, broken, slipped = _try_all(tried, track, level, try_breaks)
     coarser = _misfit((*found, *broken, *slipped))
-    if (
-        max(coarser) > _NOTHING_FITS
-    ):  # if the noise is underestimated, the robust losses of all candidates are nearly equal
+    # If the noise is underestimated, the robust losses of all candidates are nearly equal.
+    if max(coarser) > _NOTHING_FITS:
         level = level.scaled(*(math.sqrt(max(ratio, 1.0)) for ratio in coarser))
         found, broken, slipped = _try_all(tried, track, level, try_breaks)
     for _ in range(_ROUNDS):
