@@ -77,10 +77,12 @@ def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> t
     for object_id in dict.fromkeys(ground_truth.object_ids):
         rows = [row for row, key in enumerate(ground_truth.object_ids) if key == object_id]
         main = _body(scene, object_id)
+        if main is None:
+            continue
         parts = [g for g in scene.groups if g.role == "body" and g.object_id == object_id]
-        groups = parts if parts and (every or len(rows) > 1) else [] if main is None else [main]
+        groups = parts if parts and (every or len(rows) > 1) else [main]
         pairs = [[_paired(scene, ground_truth, group, row, observed) for row in rows] for group in groups]
-        found += [body for body, _ in _matched(pairs, every)]
+        found += _matched(pairs, every)
     return tuple(found)
 
 
@@ -102,15 +104,13 @@ def _paired(
     return body, float(np.mean(places) / size + np.mean(np.radians(angles)))
 
 
-def _matched(pairs: Sequence[Sequence[tuple[Body, float]]], every: bool) -> list[tuple[Body, float]]:
-    """Return the pairs of groups and rows of one object that are nearest: one for each group, or one to one."""
-    costs = np.array([[cost for _, cost in row] for row in pairs]).reshape(len(pairs), -1)
+def _matched(pairs: Sequence[Sequence[tuple[Body, float]]], every: bool) -> list[Body]:
+    """Return the nearest pairs of groups and rows of one object: one for each group, or one to one, ordered by row."""
     if every:
-        return [row[int(np.argmin(own))] for row, own in zip(pairs, costs, strict=True)]
-    return sorted(
-        (pairs[g][k] for g, k in zip(*optimize.linear_sum_assignment(costs), strict=True)),
-        key=lambda pair: pair[0].name,
-    )
+        return [min(own, key=lambda pair: pair[1])[0] for own in pairs]
+    costs = np.array([[cost for _, cost in own] for own in pairs])
+    rows, groups = optimize.linear_sum_assignment(costs.T)
+    return [pairs[group][row][0] for row, group in zip(rows, groups, strict=True)]
 
 
 def motion(scene: Scene, groups: Sequence[MotionGroup], times: np.ndarray) -> np.ndarray:

@@ -52,6 +52,8 @@ def test_true_bodies_of_one_object_are_compared_with_the_parts_that_move_alike()
         assert max(body.turn_error_deg for body in found) < 1e-4
     single = dataclasses.replace(known, object_ids=(1,), names=("lower",), matrices=truth[:1])
     assert len(ground_truth_poses.bodies(scene, single)) == 1
+    turned = dataclasses.replace(known, names=("upper", "lower"))  # of the groups 2 and 1
+    assert [body.name for body in ground_truth_poses.bodies(scene, turned)] == ["upper", "lower"]
 
 
 def test_a_root_at_rest_carries_the_part():

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from r5dgs_core.data import dataset, images, masks
-from r5dgs_core.evaluation import evaluate, evaluation_table
+from r5dgs_core.evaluation import evaluate, evaluation_table, ground_truth_poses
 from tests.support import pictures, scenes
 
 BACKEND = pictures.BACKEND
@@ -96,6 +96,20 @@ def test_an_object_that_the_scene_lacks_counts_as_missed(scene, data, tmp_path):
     result = evaluate.evaluate(scene, dataset.read(tmp_path / "more"), splits=("val",), backend=BACKEND)
     assert result["splits"]["val"]["rigid"]["miou"] == pytest.approx(2 / 3)
     assert result["splits"]["val"]["rigid"]["miou_matched"] == 1.0
+
+
+def test_a_true_object_that_the_scene_lacks_has_no_errors(scene, data):
+    known = data.ground_truth
+    more = dataclasses.replace(
+        known,
+        object_ids=(*known.object_ids, 99),
+        names=(*known.names, "lost"),
+        matrices=np.concatenate([known.matrices, known.matrices[:1]]),
+    )
+    rows = {row["id"]: row for row in evaluate.object_errors(scene, more)}
+    assert rows[99]["name"] == "lost" and rows[99]["position_error"] is None
+    assert [rows[row["id"]] for row in evaluate.object_errors(scene, known)] == list(rows.values())[:-1]
+    assert len(ground_truth_poses.bodies(scene, more, every=True)) == len(known.object_ids)
 
 
 def test_metrics_without_reference_data_are_none(scene, data):
