@@ -8,14 +8,13 @@ import numpy as np
 
 from ..findings import Collector, Finding
 from ..motion import key_reduction, models
-from ..scene import scene_file
+from ..scene import predictability, scene_file
 from ..scene.scene import Scene
 from ..scene.splats import to_opacities
 from ..terminal import printable
 from .codes import CODES
 
 LAST_FRAME = 1_048_574  # Blender's last frame
-_AHEAD = 1 / 3  # extrapolated share of the observed span; Blender's default in the extension
 _SEEN = 1 / 255  # minimum opacity that is drawn
 _FEW_SEEN = 0.05  # share of visible Gaussians below which S16 is reported
 _MOST_STEPS = 1 << 16  # maximum number of integration steps per motion
@@ -56,7 +55,7 @@ def _check_gaussians(scene: Scene, path: Path, collect: Collector) -> None:
 
 def _check_motion(scene: Scene, path: Path, collect: Collector) -> None:
     start = float(scene.tracks.times[0])
-    end = max(scene.t_max + _AHEAD * (scene.t_max - start), 1.0)
+    end = predictability.horizon(scene)
     last = max(abs(t) * scene.frames_per_unit for t in (start, end))
     if last > LAST_FRAME:
         collect.add("S15", f"{path}: expected frames up to {LAST_FRAME:,}, found {last:.4g}")
