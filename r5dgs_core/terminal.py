@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
@@ -25,6 +25,12 @@ def printable(text: str, keep: str = "") -> str:
         return text
     kept = keep + _JOINERS
     return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text)
+
+
+def print_lines(texts: Iterable[str]) -> None:
+    """Print each text on one line, with invisible characters escaped."""
+    for text in texts:
+        print(printable(text))
 
 
 class _SafeStream:

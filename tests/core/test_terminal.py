@@ -29,6 +29,13 @@ def test_half_a_surrogate_pair_is_escaped():
     assert terminal.printable("a\ud800b") == "a\\ud800b"
 
 
+def test_a_printed_text_is_one_line(capsys):
+    terminal.print_lines([f"{EVIL}: not predictable past 0.85", "mug"])
+    captured = capsys.readouterr()
+    assert_harmless(captured)
+    assert len(captured.out.splitlines()) == 2
+
+
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     scene = scenes.make_scene(n=120, objects=2)

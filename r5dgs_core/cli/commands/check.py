@@ -7,9 +7,9 @@ import dataclasses
 import json
 from pathlib import Path
 
+from ... import terminal
 from ...check import check
 from ...findings import ERROR
-from ...terminal import printable
 from ..exit_status import ExitStatus
 
 NAME = "check"
@@ -41,8 +41,7 @@ def run_check(path: Path, *, as_json: bool = False) -> bool:
         rows = [dataclasses.asdict(finding) for finding in found]
         print(json.dumps({"errors": failed, "warnings": len(found) - failed, "findings": rows}, indent=2))
     else:
-        for finding in found:
-            print(printable(str(finding)))
+        terminal.print_lines(map(str, found))
         print(f"{_count(failed, 'error')}, {_count(len(found) - failed, 'warning')}")
     return failed == 0
 

@@ -106,8 +106,7 @@ def run_demo(
             scene, dataset, result = _bake_and_evaluate(trained, data, scene_path, progress)
     if progress_kind != "json":
         terminal.console().print(evaluation_table.make(result))
-        for line in predictability.warnings(scene):
-            print(line)
+        terminal.print_lines(predictability.warnings(scene))
     stopped = f"stopped before the contact sheet; continue with: {resume_command}"
     with make(progress_kind) as progress, interrupt.at_once(stopped), folder_lock.hold(out):
         json_path = evaluate.write(result, out / checkpoint.EVALUATION_FILE)

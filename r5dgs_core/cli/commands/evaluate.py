@@ -87,8 +87,7 @@ def run_evaluate(
     path = json_path or default
     if progress_kind != "json":
         terminal.console().print(evaluation_table.make(result))
-        for line in predictability.warnings(scene):
-            print(line)
+        terminal.print_lines(predictability.warnings(scene))
     evaluate.write(result, path)
     if progress_kind != "json":
         print(f"written: {path}")

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from ... import terminal
 from .. import inputs, options
 
 NAME = "train"
@@ -64,5 +65,4 @@ def run_train(
             for line in lines:
                 progress({"event": "warning", "text": line})
     if progress_kind == "auto":
-        for line in lines:
-            print(line)
+        terminal.print_lines(lines)
