@@ -18,7 +18,7 @@ from .. import atomic_files, errors
 from ..data import dataset as datasets
 from ..data import mask_notes, masks
 from ..data.annotations import OBJECTS
-from ..render import viewpoints
+from ..scene import sampling
 from ..scene.scene import Scene
 from . import associate, mending, render_segments, render_votes
 
@@ -104,7 +104,7 @@ def repair(
     _, neighbours = KDTree(scene.gaussians.means).query(
         scene.gaussians.means, min(NEIGHBOURS + 1, len(scene.gaussians.means)), workers=-1
     )
-    times = viewpoints.spread(np.unique([view.t for view in views]).tolist(), TIMES)
+    times = sampling.spread(np.unique([view.t for view in views]).tolist(), TIMES)
     result = associate.associate(
         images,
         neighbours.reshape(len(scene.gaussians.means), -1)[:, 1:],

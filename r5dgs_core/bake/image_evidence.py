@@ -25,9 +25,9 @@ from ..errors import DatasetError
 from ..motion import rotations
 from ..playback import scene_player
 from ..render import scene_renderer
+from ..scene.sampling import spread
 from ..scene.scene import Scene
 from ..train import train_views
-from ..train.train_views import spread
 
 log = logging.getLogger(__name__)
 

@@ -28,7 +28,7 @@ from ..motion.history import UNKNOWN_TURN, PoseErrors
 from ..playback import scene_player
 from ..render import posed_scene, scene_renderer
 from ..render.posed_scene import PosedScene
-from ..scene import cameras
+from ..scene import cameras, sampling
 from ..scene.scene import Scene
 from ..train import train_views
 from . import unseen_rotations
@@ -114,7 +114,7 @@ def measure(scene: Scene, dataset: datasets.Dataset, config: Config, groups: Col
     misfits = []
     for knot in range(len(scene.tracks.times)) if groups else ():
         views = [view for view, k in zip(dataset.train, knots, strict=True) if k == knot]
-        shown = train_views.spread(views, VIEWS)
+        shown = sampling.spread(views, VIEWS)
         posed: dict[float, list[PosedScene]] = {}
         for number, view in enumerate(shown):
             if view.t not in posed:

@@ -13,7 +13,8 @@ from ..data.dataset import Dataset, View
 from ..evaluation import evaluate, ground_truth_poses
 from ..motion import se3
 from ..playback import scene_player
-from ..render import scene_renderer, viewpoints
+from ..render import scene_renderer
+from ..scene import sampling
 from ..scene.scene import Scene
 from .report_rows import Row
 from .task import Goal, Measured, Panel, Request, Task, decibels
@@ -160,7 +161,7 @@ def _times(
     scene: Scene, views: Sequence[View], moves: dict[str, evaluate.Move], rounds: int, backend: str, clock: str
 ) -> dict[str, dict[str, Any]]:
     """Return the columns of a `Row` that hold times per frame, of motion and of color rasterization, by mode."""
-    some = viewpoints.spread(views, FRAMES)
+    some = sampling.spread(views, FRAMES)
     calls: dict[tuple[str, str], Callable[[], object]] = {}
     for mode, move in moves.items():
         frames = [move(view.t, view.camera.center) for view in some]

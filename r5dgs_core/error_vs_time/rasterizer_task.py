@@ -12,7 +12,8 @@ from ..data import dataset as datasets
 from ..evaluation import evaluate, metrics
 from ..playback import scene_player
 from ..raster import RasterSettings, backends
-from ..render import scene_renderer, viewpoints
+from ..render import scene_renderer
+from ..scene import sampling
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from .report_rows import Row, spread
@@ -55,7 +56,7 @@ def measure(
     shots = shots or [(camera, scene.t_max) for camera in scene.cameras]
     if not shots:
         return [], ["raster: neither the scene nor a data set gives a camera"]
-    kept = viewpoints.spread(range(len(shots)), VIEWS)
+    kept = sampling.spread(range(len(shots)), VIEWS)
     shots = [shots[i] for i in kept]
     frames = [player.frame(t, camera.center) for camera, t in shots]
     truths = [datasets.load_image(views[i], evaluate.truth_background(scene)) for i in kept] if views else []

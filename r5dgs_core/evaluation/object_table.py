@@ -15,7 +15,7 @@ from rich.text import Text
 from ..data import dataset as datasets
 from ..playback import scene_player
 from ..render import viewpoints
-from ..scene import predictability
+from ..scene import predictability, sampling
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
 from . import evaluate, miou
@@ -115,7 +115,7 @@ def measure(
 def own_views(scene: Scene) -> list[viewpoints.Viewpoint]:
     """Return views of the scene's own cameras at distinct observed times, or overviews if it stores no cameras."""
     first = float(scene.tracks.times[0])
-    cameras = viewpoints.spread(scene.cameras, MOST_VIEWS) or [viewpoints.overview(scene)] * 3
+    cameras = sampling.spread(scene.cameras, MOST_VIEWS) or [viewpoints.overview(scene)] * 3
     # Golden-ratio steps keep camera order and time order uncorrelated.
     shares = (0.5 + 0.6180339887 * np.arange(len(cameras))) % 1.0
     times = first + shares * (scene.t_max - first)

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..playback import scene_player
 from ..render import highlight, scene_renderer, viewpoints
+from ..scene import sampling
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
 
@@ -97,7 +98,7 @@ def crops(
 
 
 def _viewpoints(scene: Scene) -> list[viewpoints.Viewpoint]:
-    some = viewpoints.spread(scene.cameras, _CAMERAS) or [viewpoints.overview(scene)]
+    some = sampling.spread(scene.cameras, _CAMERAS) or [viewpoints.overview(scene)]
     times = np.unique(np.linspace(scene.tracks.times[0], scene.t_max, _TIMES))
     return [viewpoints.Viewpoint(camera, float(t)) for t in times for camera in some]
 

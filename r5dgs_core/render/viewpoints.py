@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Sequence
-from typing import TypeVar
 
 import numpy as np
 
@@ -15,14 +14,13 @@ from .. import errors
 from ..playback import scene_player
 from ..scene import cameras as axes
 from ..scene.cameras import Camera
+from ..scene.sampling import spread
 from ..scene.scene import Scene
 from . import scene_renderer
 
 THUMBNAIL_SIDE = 160  # longest side of the small pictures, pixels
 MOST_CAMERAS = 16  # maximum number of cameras to try
 NOTICED = 5e-4  # minimum share of the picture that counts as visible
-
-Item = TypeVar("Item")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,12 +101,6 @@ def best(
     player = scene_player.Player(scene, mode)
     scores = [_score(player, viewpoint, object_ids, backend) for viewpoint in among]
     return among[max(range(len(among)), key=lambda k: scores[k])]
-
-
-def spread(items: Sequence[Item], most: int) -> list[Item]:
-    """Select at most ``most`` items, evenly spaced, including the first and the last."""
-    at = np.linspace(0, max(len(items) - 1, 0), min(most, len(items))).round()
-    return [items[int(k)] for k in at]
 
 
 def resized(camera: Camera, longest: int) -> Camera:

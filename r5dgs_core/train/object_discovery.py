@@ -22,12 +22,13 @@ from ..data.dataset import Dataset
 from ..motion import rotations
 from ..raster import rasterize_splats
 from ..scene import visibility
+from ..scene.sampling import spread
 from . import motion_clusters
 from .identity import packed_masks
 from .representations import gating
 from .representations.field import FieldRepresentation
 from .representations.fused_posing import PosedSplats
-from .train_views import TrainView, spread
+from .train_views import TrainView
 from .trainer import Trainer
 
 log = logging.getLogger(__name__)

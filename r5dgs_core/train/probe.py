@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ..data import dataset as datasets
-from .train_views import spread
+from ..scene.sampling import spread
 
 if TYPE_CHECKING:
     from .trainer import Trainer

@@ -17,7 +17,7 @@ from ..model.group_poses import GroupPoses
 from ..motion import rotations
 from ..motion.se3 import Pose
 from ..raster import rasterize_splats
-from ..scene import cameras, spherical_harmonics
+from ..scene import cameras, sampling, spherical_harmonics
 from ..scene.cameras import Camera
 from . import train_views
 from .representations import fused_posing
@@ -63,7 +63,7 @@ class BodyRegistration:
         names = ("means", "quats", "log_scales", "opacity_logits", "shading")
         self._shape = {name: params[name].detach()[rows] for name in names}
         self._shape["colors"] = spherical_harmonics.dc_to_rgb(params["sh"].detach()[rows, 0])
-        shown = train_views.spread(
+        shown = sampling.spread(
             [v for v in views_at(trainer, knot) if (v.mask == object_id).sum() >= FEWEST_PIXELS], most
         )
         self._looks = [self._look(view, view.mask == object_id) for view in shown]
@@ -174,7 +174,7 @@ def errors(trainer: Trainer, knot: int, most: int) -> np.ndarray:
     """Return the mean squared error of each body's pixels at a knot in the tracks; nan if no mask shows it. [B - 1]"""
     ids = [int(i) for i in trainer.object_ids[1:]]
     sums, pixels = np.zeros(len(ids)), np.zeros(len(ids))
-    for view in train_views.spread(views_at(trainer, knot), most):
+    for view in sampling.spread(views_at(trainer, knot), most):
         squares = (trainer.render(view.camera, view.t).numpy() - view.image / 255.0) ** 2
         for row, object_id in enumerate(ids):
             mine = view.mask == object_id

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -13,9 +12,8 @@ from ..config.config import Config
 from ..data import dataset as datasets
 from ..errors import DatasetError
 from ..scene.cameras import Camera
+from ..scene.sampling import spread
 from .normalization import Normalization
-
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -77,13 +75,6 @@ def behind(dataset: datasets.Dataset, config: Config) -> np.ndarray | None:
 def with_masks(views: Sequence[TrainView], masks: Sequence[np.ndarray]) -> list[TrainView]:
     """Return the views with other masks. Each [H, W]"""
     return [dataclasses.replace(view, mask=mask) for view, mask in zip(views, masks, strict=True)]
-
-
-def spread(items: Sequence[Item], limit: int) -> list[Item]:
-    """Return all items, or ``limit`` of them spread evenly if there are more."""
-    if len(items) <= limit:
-        return list(items)
-    return [items[i] for i in np.linspace(0, len(items) - 1, limit).round().astype(int)]
 
 
 def nearest_knot(times: np.ndarray, t: float) -> int:

@@ -65,7 +65,7 @@ def run_objects(
     inputs.check_mode(mode)
     inputs.check_target(target, data)
     from ...evaluation import object_table
-    from ...render import viewpoints
+    from ...scene import sampling
 
     options.use_threads(threads)
     scene, dataset = inputs.open_target(target, data)
@@ -77,7 +77,7 @@ def run_objects(
     if dataset is None:
         views: list[Any] = object_table.own_views(scene)
     else:
-        views = viewpoints.spread((*dataset.val, *dataset.test) or dataset.train, object_table.MOST_VIEWS)
+        views = sampling.spread((*dataset.val, *dataset.test) or dataset.train, object_table.MOST_VIEWS)
     rows = object_table.measure(scene, views, mode)
     result = object_table.to_json(scene, rows, len(views))
     if as_json:

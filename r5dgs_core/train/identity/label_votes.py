@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from ...render.segment_weights import segment_weights
+from ...scene.sampling import spread
 from ..representations.fused_posing import PosedSplats
-from ..train_views import TrainView, spread
+from ..train_views import TrainView
 
 VOTE_VIEWS = 80
 

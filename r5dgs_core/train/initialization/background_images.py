@@ -10,7 +10,8 @@ from scipy import ndimage
 
 from ...data import masks
 from ...scene import cameras
-from ..train_views import TrainView, by_camera, spread
+from ...scene.sampling import spread
+from ..train_views import TrainView, by_camera
 
 MAX_CAMERAS = 24
 MAX_FRAMES = 31  # frames per camera for the median

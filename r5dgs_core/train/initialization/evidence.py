@@ -17,7 +17,8 @@ from scipy import ndimage
 
 from ...data import masks
 from ...scene import cameras
-from ..train_views import TrainView, by_camera, nearest_knot, spread
+from ...scene.sampling import spread
+from ..train_views import TrainView, by_camera, nearest_knot
 from .triangulation import ObjectPositions
 
 TEXTURE = 0.1  # change of colour per radian (root mean square) that makes rotation observable

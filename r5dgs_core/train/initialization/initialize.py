@@ -14,8 +14,9 @@ import numpy as np
 from ...config.config import Config
 from ...config.sections.training import InitSection
 from ...model.gaussians import Gaussians
+from ...scene.sampling import spread
 from ..representations.representation import Representation
-from ..train_views import TrainView, by_camera, nearest_knot, spread
+from ..train_views import TrainView, by_camera, nearest_knot
 from . import background_images, evidence, place_gaussians, plane_sweep, scatter, shadows, triangulation, visual_hull
 
 log = logging.getLogger(__name__)
