@@ -136,14 +136,6 @@ def multiply(p: Array, q: Array) -> Array:
     xp = array_namespace(p, q)
     pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    if xp is np:
-        w = pw * qw - px * qx - py * qy - pz * qz
-        product = np.empty((*w.shape, 4), w.dtype)
-        product[..., 0] = w
-        product[..., 1] = pw * qx + px * qw + py * qz - pz * qy
-        product[..., 2] = pw * qy - px * qz + py * qw + pz * qx
-        product[..., 3] = pw * qz + px * qy - py * qx + pz * qw
-        return product
     return xp.stack(
         [
             pw * qw - px * qx - py * qy - pz * qz,
@@ -165,14 +157,6 @@ def rotate(quats: Array, vectors: Array) -> Array:
 def rotvecs_to_quats(rotvecs: Array) -> Array:
     """Exponential map, rotation vectors to unit quaternions; zero gives exactly (1, 0, 0, 0). [..., 3] -> [..., 4]"""
     xp = array_namespace(rotvecs)
-    if xp is np:
-        half = 0.5 * np.sqrt(np.einsum("...i,...i->...", rotvecs, rotvecs))
-        quats = np.empty((*rotvecs.shape[:-1], 4), half.dtype)
-        np.cos(half, out=quats[..., 0])
-        safe = np.where(half > 0, half, 1.0)
-        ratio = np.where(half > 0, np.sin(safe) / safe, 1.0)
-        np.multiply(rotvecs, (0.5 * ratio)[..., None], out=quats[..., 1:], casting="same_kind")
-        return quats
     quarter = 0.25 * (rotvecs * rotvecs).sum(-1)[..., None]
     return xp.concatenate([cosine(quarter), 0.5 * sine_ratio(quarter) * rotvecs], -1)
 
@@ -180,14 +164,6 @@ def rotvecs_to_quats(rotvecs: Array) -> Array:
 def quats_to_rotvecs(quats: Array) -> Array:
     """Logarithm map, unit quaternions to rotation vectors of angle at most pi. [..., 4] -> [..., 3]"""
     xp = array_namespace(quats)
-    if xp is np:  # only gradients need the series
-        w, vec = quats[..., 0], quats[..., 1:]
-        norm = np.sqrt(np.einsum("...i,...i->...", vec, vec))
-        size = np.abs(w)
-        tiny = norm < 1e-30
-        ratio = 2 * np.arctan2(norm, size) / np.where(tiny, 1.0, norm)
-        ratio = np.where(tiny, 2 / np.where(tiny, size, 1.0), ratio)
-        return vec * np.where(w < 0, -ratio, ratio)[..., None]
     flipped = xp.where(quats[..., :1] < 0, -quats, quats)
     w, vec = flipped[..., :1], flipped[..., 1:]
     norm2 = (vec * vec).sum(-1)[..., None]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from .. import rotations, se3
+from .. import rotations
 from ..pose_track import PoseTrack, Window
 from . import first_guesses
 from .base import LOGARITHMS, Block, Curve, MotionKind, Rates
@@ -26,11 +26,6 @@ class Drag(MotionKind):
     fits = {"drag": ("v", "w", "log_c"), "fall with drag": ("v", "w", "log_c", "terminal")}
     plain_fits = ("drag",)
     blocks = {"log_c": Block(1, 2.0), "terminal": Block(3, 100.0)}
-
-    def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:
-        exponent = np.minimum(-rates.damping * span, _MOST_EXPONENT)
-        once, twice = span * _first(exponent), span**2 * _second(exponent)
-        return rotations.rotvecs_to_quats(rates.w * once), rates.v * once + rates.a * twice
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
         exponent = np.minimum(-rates.damping * span, _MOST_EXPONENT)

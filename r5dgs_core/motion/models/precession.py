@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import rotations, se3
+from .. import rotations
 from ..pose_track import PoseTrack, Window
 from . import first_guesses
 from .base import Block, Curve, MotionKind, MotionModel, Rates
@@ -25,11 +25,6 @@ class Precession(MotionKind):
     fields = ("angular_velocity", "precession", "center_offset")
     fits = {"precession": ("p", "s", "u")}
     blocks = {"p": Block(3, 30.0), "s": Block(3, 30.0)}
-
-    def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:
-        turn, own = rates.p * span, (rates.w - rates.p) * span
-        quats = rotations.multiply(rotations.rotvecs_to_quats(turn), rotations.rotvecs_to_quats(own))
-        return quats, rates.u - rotations.rotate(quats, rates.u + 0 * turn)
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
         zero = 0 * span

@@ -35,21 +35,15 @@ class TwoOscillations(MotionKind):
 
     frequency_blocks = ("pace", "pace2")
 
-    def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:
-        once, twice = clocks(rates.frequency, span)
-        once2, twice2 = clocks(rates.frequency2, span)
-        phi = rates.w * once + rates.eps * twice + rates.w2 * once2 + rates.eps2 * twice2
-        return rotations.rotvecs_to_quats(phi), rates.v * once + rates.a * twice + rates.v2 * once2 + rates.a2 * twice2
-
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
-        quats, d = self.poses(rates, span)
         once, twice = clocks(rates.frequency, span)
         once2, twice2 = clocks(rates.frequency2, span)
         slope, slope2 = (clock_slopes(f, span, 0.0)[0] for f in (rates.frequency, rates.frequency2))
         phi = rates.w * once + rates.eps * twice + rates.w2 * once2 + rates.eps2 * twice2
+        d = rates.v * once + rates.a * twice + rates.v2 * once2 + rates.a2 * twice2
         rate = rates.w * slope + rates.eps * once + rates.w2 * slope2 + rates.eps2 * once2
         velocity = rates.v * slope + rates.a * once + rates.v2 * slope2 + rates.a2 * once2
-        return quats, d, se3.v_matrix_times(phi, rate), velocity
+        return rotations.rotvecs_to_quats(phi), d, se3.v_matrix_times(phi, rate), velocity
 
     def rates(self, parts: Mapping[str, np.ndarray], window: Window) -> Rates:
         rest = {name: parts[name] for name in ("v2", "a2", "w2", "eps2") if name in parts}
