@@ -157,8 +157,7 @@ def _merge_group() -> bpy.types.NodeTree:
     """Node group that merges pictures as described above.
 
     With a foreground of alpha 0, the node *Alpha Over* adds foreground and background. `render_passes.FRONT` holds the
-    visible part of the meshes
-    as its alpha.
+    visible part of the meshes as its alpha.
     """
     group = bpy.data.node_groups.new(NAME, "CompositorNodeTree")
     for name, kind in _INPUTS:

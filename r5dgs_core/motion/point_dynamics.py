@@ -44,8 +44,8 @@ def rk2(
     """Integrate points by the midpoint rule and rotations by exponentials of the midpoint spin: TRACE's integrator.
 
     Points and rotations are integrated separately, so a body is rigid only to second order in the step; `propagate`
-    keeps it exactly rigid. Supports numpy and torch. For numpy arrays it warns, once per step
-    length, about rotations of more than `MAX_TURN` per step, because bodies then grow visibly in playback.
+    keeps it exactly rigid. Supports numpy and torch. For numpy arrays it warns, once per step length, about
+    rotations of more than `MAX_TURN` per step, because bodies then grow visibly in playback.
 
     Args:
         points: Start positions. [..., 3]

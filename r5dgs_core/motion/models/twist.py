@@ -1,8 +1,7 @@
 """Rotation centre and axis of kinds whose points move with the velocity field of a twist.
 
 The velocity of a twist at a point y is v + w x y, and its rate a + eps x y. Its centre is the point nearest to the
-pivot that
-moves only along the axis, c = w x v / |w|^2, and the whole velocity field moves with it.
+pivot that moves only along the axis, c = w x v / |w|^2, and the whole velocity field moves with it.
 """
 
 from __future__ import annotations

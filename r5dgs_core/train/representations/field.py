@@ -1,13 +1,12 @@
 """Representation `field`: a deformation field for the observed time, and the TRD for extrapolation (5DGS, R5DGS).
 
 Notation: N Gaussians, R of them moved by the networks, T the horizon of the deformation field. Network times are scene
-times, shifted and scaled so that the observed ones lie in [0, 1]; if they already do and fill at
-least a quarter of it, they are used unchanged.
+times, shifted and scaled so that the observed ones lie in [0, 1]; if they already do and fill at least a quarter of it,
+they are used unchanged.
 
 Within the horizon, a share of the training steps (`field.trd_share`) draws a start t' = t -+ h; the field moves the
-Gaussians to t', and the TRD from
-there to t in one step. Past the horizon, the TRD moves them from T to t. The TRD starts at positions without gradient:
-its displacement trains the TRD, the position itself trains the field.
+Gaussians to t', and the TRD from there to t in one step. Past the horizon, the TRD moves them from T to t. The TRD
+starts at positions without gradient: its displacement trains the TRD, the position itself trains the field.
 
 Source: TRACE's training scheme, with these additions: the restriction to movers, the fits to positions and to motion
     without images, and the cross-Gaussian twist loss.

@@ -1,8 +1,7 @@
 """Deformation field and TRD combined: states of Gaussians at any time, observed or extrapolated.
 
 Notation: R moved Gaussians, T the horizon of the deformation field. Network times are scene times, shifted and scaled
-so that the observed ones lie in [0, 1]; if they already do and fill at
-least a quarter of it, they are used unchanged.
+so that the observed ones lie in [0, 1]; if they already do and fill at least a quarter of it, they are used unchanged.
 """
 
 from __future__ import annotations
