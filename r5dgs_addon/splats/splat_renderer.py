@@ -116,7 +116,8 @@ class SplatTable:
         wide = width // gaussian_table.GEOMETRY
         padded = np.zeros((max(-(-count // wide), 1) * wide, gaussian_table.GEOMETRY, 4), np.float32)
         padded[:count] = table.geometry
-        self._table = dataclasses.replace(table, geometry=padded, looks=table.looks[:0])
+        none = np.zeros((0, *table.looks.shape[1:]), np.float32)  # not a slice, which would keep all looks in memory
+        self._table = dataclasses.replace(table, geometry=padded, looks=none)
         self._geometry: gpu.types.GPUTexture | None = None
 
     def move(self, group: int, geometry: gaussian_table.Geometry) -> None:

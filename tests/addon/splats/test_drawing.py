@@ -4,6 +4,7 @@ A render engine with `bl_use_gpu_context` may draw in background mode; everywher
 """
 
 import dataclasses
+import weakref
 
 import numpy as np
 import pytest
@@ -290,6 +291,21 @@ def test_one_shader_draws_tables_of_any_length(blender, on_card, tmp_path, monke
     monkeypatch.setattr(shaders, "width", lambda: 16)
     with pytest.raises(errors.ConfigError, match="400 Gaussians .* expected at most 32 as splats"):
         on_card(picture_of)
+
+
+def test_a_table_on_the_graphics_card_does_not_keep_the_looks_in_memory(blender, on_card, tmp_path):
+    renderer, tables = motions.addon("splats.splat_renderer"), motions.addon("splats.gaussian_table")
+    motions.load(blender, scene_file.write(scenes.make_scene(n=100, sh_degree=2), tmp_path / "scene.r5dgs"))
+
+    def keeps_looks(depsgraph):
+        picture_of(depsgraph)
+        data = next(iter(motions.addon("splats.visible_splats")._layers.values())).clouds.values()
+        packed = tables.pack([*data])
+        looks, table = weakref.ref(packed.looks), renderer.SplatTable(packed)
+        del packed
+        return table.starts[-1] == 100, looks() is not None
+
+    assert on_card(keeps_looks) == (True, False)
 
 
 def test_nearer_than_the_clip_start_of_the_camera_is_nothing(blender, drawn, tmp_path):
