@@ -2,6 +2,7 @@
 
 import math
 import statistics
+from collections.abc import Iterable
 
 import bpy
 
@@ -20,7 +21,12 @@ def of_anchor(anchor: bpy.types.Object | None) -> str:
 
 def of_object(collection: bpy.types.Collection, object_id: int) -> str:
     """Warning of the first of an object's anchors that has one, or ""."""
-    anchors = {cloud.parent for cloud in object_names.clouds(collection, object_id)} - {None}
+    return of_clouds(object_names.clouds(collection, object_id))
+
+
+def of_clouds(clouds: Iterable[bpy.types.Object]) -> str:
+    """Warning of the first of the anchors of point clouds that has one, or ""."""
+    anchors = {cloud.parent for cloud in clouds} - {None}
     found = [(anchor.name, warning) for anchor in anchors if (warning := of_anchor(anchor))]
     return min(found)[1] if found else ""
 

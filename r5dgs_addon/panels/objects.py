@@ -27,7 +27,7 @@ class R5DGS_UL_objects(bpy.types.UIList):
         if not own:
             row.label(text="deleted")
             return
-        if warnings.of_object(item.id_data, item.object_id):
+        if warnings.of_clouds(own):
             row.operator("r5dgs.explain_warning", text="", icon="ERROR", emboss=False).object_id = item.object_id
         count = row.row()
         count.alignment = "RIGHT"
