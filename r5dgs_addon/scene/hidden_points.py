@@ -12,7 +12,8 @@ from . import loaded_scenes, viewport_display
 _collections = [0]  # number of collections at the last update
 
 
-def hide() -> None:
+@persistent
+def hide(*_) -> None:
     """Hide the points of all loaded scenes shown as splats."""
     _collections[0] = len(bpy.data.collections)
     for collection in loaded_scenes.scene_collections():
@@ -21,7 +22,8 @@ def hide() -> None:
             _switch(obj, True)
 
 
-def show() -> None:
+@persistent
+def show(*_) -> None:
     """Show the points of all clouds, also of those that are not in a loaded scene any more."""
     for obj in bpy.data.objects:
         _switch(obj, False)
@@ -34,32 +36,18 @@ def _switch(obj: bpy.types.Object, on: bool) -> None:
 
 
 @persistent
-def _hide(*_):
-    hide()
-
-
-@persistent
-def _show(*_):
-    show()
-
-
-@persistent
 def _notice_import(*_):
     """Hide the points of scenes that were appended or linked. Blender has no event for this before 4.3."""
     if len(bpy.data.collections) != _collections[0]:
         hide()
 
 
-def _hide_later() -> None:
-    hide()
-
-
 def _hooks():
     handlers = bpy.app.handlers
     after = ("load_post", "undo_post", "redo_post", "save_post", "save_post_fail")
     return (
-        *((getattr(handlers, name), _hide) for name in after),
-        (handlers.save_pre, _show),
+        *((getattr(handlers, name), hide) for name in after),
+        (handlers.save_pre, show),
         (handlers.depsgraph_update_post, _notice_import),
     )
 
@@ -71,7 +59,7 @@ def register():
     if hasattr(bpy.data, "collections"):
         hide()
     else:
-        bpy.app.timers.register(_hide_later, first_interval=0.0)
+        bpy.app.timers.register(hide, first_interval=0.0)
 
 
 def unregister():
@@ -79,6 +67,6 @@ def unregister():
     for events, handler in _hooks():
         if handler in events:
             events.remove(handler)
-    if bpy.app.timers.is_registered(_hide_later):
-        bpy.app.timers.unregister(_hide_later)
+    if bpy.app.timers.is_registered(hide):
+        bpy.app.timers.unregister(hide)
     show()
