@@ -7,7 +7,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
 from ..r5dgs_addon import build_scene
 from ..r5dgs_addon.motion import keyframes, physics, warnings
-from ..r5dgs_addon.scene import captured_images, loaded_scenes, timeline, viewport_display
+from ..r5dgs_addon.scene import captured_images, loaded_scenes, viewport_display
 from ..r5dgs_addon.ui import plural, stepwise_operator
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import scene_file
@@ -146,9 +146,8 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         if self.images and self.cameras and scene.cameras:
-            t = timeline.of_collection(collection).time(context.scene.frame_current_final)
             try:
-                captured_images.show(collection, Path(bpy.path.abspath(self.images)), t)
+                captured_images.show(collection, self.images, context.scene.frame_current_final)
             except errors.R5dgsError as error:
                 self.report({"WARNING"}, str(error))
         named = sum(entry.object_id > 0 for entry in collection.r5dgs.table)

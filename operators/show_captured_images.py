@@ -1,11 +1,9 @@
 """Show Captured Images operator: images of the data set as backgrounds of the captured cameras."""
 
-from pathlib import Path
-
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..r5dgs_addon.scene import captured_images, loaded_scenes, polls, timeline
+from ..r5dgs_addon.scene import captured_images, loaded_scenes, polls
 from ..r5dgs_addon.ui import plural
 from ..r5dgs_core import errors
 
@@ -28,9 +26,8 @@ class R5DGS_OT_show_captured_images(polls.NeedsCapturedCameras, bpy.types.Operat
 
     def execute(self, context):
         collection = loaded_scenes.active_collection(context)
-        t = timeline.of_collection(collection).time(context.scene.frame_current_final)
         try:
-            count = captured_images.show(collection, Path(bpy.path.abspath(self.directory)), t)
+            count = captured_images.show(collection, self.directory, context.scene.frame_current_final)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -17,13 +17,13 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
 OPACITY = 0.5
 
 
-def show(collection: bpy.types.Collection, folder: Path, t: float) -> int:
-    """Show in each captured camera its image nearest to a time, in place of images shown before.
+def show(collection: bpy.types.Collection, folder: str, frame: float) -> int:
+    """Show in each captured camera its image nearest to a frame, in place of images shown before.
 
     Args:
         collection: Loaded scene.
-        folder: Folder of the data set.
-        t: Scene time.
+        folder: Folder of the data set; ``//`` is the folder of the .blend.
+        frame: Frame of the timeline.
 
     Returns:
         Number of cameras with an image.
@@ -31,15 +31,16 @@ def show(collection: bpy.types.Collection, folder: Path, t: float) -> int:
     Raises:
         ConfigError: There is no such folder, or no image of any camera in it.
     """
-    if not folder.is_dir():
-        raise errors.ConfigError(f"{folder}: expected the folder of the data set, found none; choose another")
+    home = Path(bpy.path.abspath(folder))
+    if not home.is_dir():
+        raise errors.ConfigError(f"{home}: expected the folder of the data set, found none; choose another")
     cameras = captured_cameras.all_of(collection)
     times = timeline.of_collection(collection)
-    named = _named_in_files(folder)
+    named, t = _named_in_files(home), times.time(frame)
     shown = 0
     for camera in cameras:
         name = captured_cameras.name_of(camera)
-        found = named.get(name) or _named_by_path(folder, name, times.t_start, times.t_max)
+        found = named.get(name) or _named_by_path(home, name, times.t_start, times.t_max)
         if not found:
             continue
         _, path = min(found, key=lambda one: (abs(one[0] - t), one[1]))
@@ -52,7 +53,7 @@ def show(collection: bpy.types.Collection, folder: Path, t: float) -> int:
         shown += 1
     if not shown:
         raise errors.ConfigError(
-            f"{folder}: found no image of a captured camera such as '{captured_cameras.name_of(cameras[0])}'; choose "
+            f"{home}: found no image of a captured camera such as '{captured_cameras.name_of(cameras[0])}'; choose "
             "the folder that the scene was trained on"
         )
     return shown
