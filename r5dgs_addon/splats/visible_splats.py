@@ -177,11 +177,10 @@ def _groups(numbers: list[int], clouds: list[visible_clouds.VisibleCloud]) -> tu
     rotations, found = affine_transform.nearest_rotation(linear), []
     turns = np.swapaxes(rotations[len(clouds) :], -1, -2) @ rotations[: len(clouds)]
     for number, cloud, turn in zip(numbers, clouds, turns, strict=True):
-        light, change = loaded_scenes.light(cloud.collection), (0.0, 0.0, 0.0)
+        light, lit = loaded_scenes.light(cloud.collection), {}
         if light is not None:
-            change = tuple(posing.light_change(light, turn))
-        source = (0.0, 0.0, 0.0) if light is None else tuple(light)
-        found.append(renderer.Group(number, cloud.matrix, cloud.tint, change, source, cloud.holdout))
+            lit = {"light_change": tuple(posing.light_change(light, turn)), "light": tuple(light)}
+        found.append(renderer.Group(number, cloud.matrix, cloud.tint, holdout=cloud.holdout, **lit))
     return tuple(found)
 
 
