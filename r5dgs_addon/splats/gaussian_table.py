@@ -214,8 +214,9 @@ def pack(clouds: Sequence[CloudData]) -> Table:
     looks = np.zeros((total, rest + HARMONICS[degree], 4), np.float32)
     geometry, positions = np.zeros((total, GEOMETRY, 4), np.float32), np.zeros((total, 3), np.float32)
     table = Table(geometry, looks, positions, starts, degree, shaded, turned)
-    for group, (cloud, look) in enumerate((cloud, cloud.look) for cloud in clouds):
+    for group, cloud in enumerate(clouds):
         table.move(group, cloud.geometry)
+        look = cloud.look
         part = looks[starts[group] : starts[group + 1]]
         part[:, 0] = look.base
         if shaded:
