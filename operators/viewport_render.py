@@ -61,8 +61,8 @@ class R5DGS_OT_viewport_render(stepwise_operator.Stepwise, polls.NeedsScene, bpy
         if path is not None:
             return stepwise_operator.Outcome(f"{plural.of(len(frames), 'frame')} saved in {path.parent}")
         image = render_request.write_image(IMAGE, color)
-        shown = render_request.show(context, image)
-        return stepwise_operator.Outcome(f"{IMAGE}" + ("" if shown else f": open an Image Editor and choose '{IMAGE}'"))
+        hint = "" if render_request.show(context, image) else f": open an Image Editor and choose '{IMAGE}'"
+        return stepwise_operator.Outcome(IMAGE + hint)
 
 
 CLASSES = (R5DGS_OT_viewport_render,)
