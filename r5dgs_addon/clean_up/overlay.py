@@ -51,15 +51,16 @@ def _draw_corners(context: bpy.types.Context) -> None:
         return
     theme, active = context.preferences.themes[0].view_3d, context.view_layer.objects.active
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+    gpu.state.depth_test_set("NONE")
+    shader.bind()
     for obj in context.selected_objects:
-        clouds = [one for one in (obj, *obj.children) if one.r5dgs.role == "CLOUD"]
-        for cloud in clouds if obj.r5dgs.role in ("CLOUD", "ANCHOR") else ():
+        if obj.r5dgs.role not in ("CLOUD", "ANCHOR"):
+            continue
+        color = theme.object_active if obj == active else theme.object_selected
+        for cloud in (one for one in (obj, *obj.children) if one.r5dgs.role == "CLOUD"):
             if viewport_display.draws_splats(cloud) and cloud.visible_get(viewport=context.space_data):
-                lines = batch_for_shader(shader, "LINES", {"pos": _corners(cloud)})
-                gpu.state.depth_test_set("NONE")
-                shader.bind()
-                shader.uniform_float("color", (*(theme.object_active if obj == active else theme.object_selected), 1.0))
-                lines.draw(shader)
+                shader.uniform_float("color", (*color, 1.0))
+                batch_for_shader(shader, "LINES", {"pos": _corners(cloud)}).draw(shader)
 
 
 def _corners(cloud: bpy.types.Object) -> list[tuple[float, ...]]:
