@@ -1,4 +1,4 @@
-"""Explain Warning operator: icon in the list of objects at motion that is not predictable; its tooltip says why."""
+"""Explain Warning operator: icon of objects with unpredictable motion in the list; the tooltip gives the reason."""
 
 import bpy
 from bpy.props import IntProperty

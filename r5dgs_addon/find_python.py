@@ -53,7 +53,7 @@ def environment(python: str = "") -> dict[str, str]:
 
 
 def own_numba() -> str:
-    """Return where Blender's own Python has numba from: "bundled" wheels, "installed", or "" if it has none."""
+    """Return the origin of numba in Blender's own Python: "bundled" with the zip, "installed", or "" if missing."""
     spec = importlib.machinery.PathFinder.find_spec("numba")
     if spec is None or not spec.origin:
         return ""

@@ -62,7 +62,7 @@ def followers(anchors: Iterable[bpy.types.Object]) -> list[bpy.types.Object]:
 
 
 def with_parts(anchors: Iterable[bpy.types.Object]) -> list[bpy.types.Object]:
-    """The given anchors, and those of the parts that they carry."""
+    """Return the given anchors, followed by those of the parts that they carry."""
     found = list(dict.fromkeys(anchors))
     for anchor in found:
         found += [child for child in anchor.children if child.r5dgs.role == "ANCHOR" and child not in found]

@@ -85,9 +85,8 @@ def _digest(anchor: bpy.types.Object) -> str:
     others = {name: value for name, value in stored(state).items() if name not in models.RATES and np.any(value)}
     frequency = others.pop("frequency", 0.0)
     more = [{name: np.asarray(value).tolist() for name, value in others.items()}] if others else []
-    text = json.dumps(
-        [state.taken, state.kind, *fields, frequency, leader, *more]
-    )  # without `more`, the text of older versions
+    # Without `more`, this is the text of older versions.
+    text = json.dumps([state.taken, state.kind, *fields, frequency, leader, *more])
     return hashlib.sha1(text.encode(), usedforsecurity=False).hexdigest()
 
 

@@ -1,6 +1,6 @@
 """Captured images of a data set as backgrounds of the captured cameras.
 
-The data set is that of `transforms_*.json` files, whose frames name their camera, or a folder of images named like the
+The data set is a folder with `transforms_*.json` files, whose frames name their camera, or with images named like the
 cameras: ``CAMERA.png``, or a folder ``CAMERA`` of images in the order of time.
 """
 
@@ -67,7 +67,7 @@ def _named_in_files(folder: Path) -> dict[str, list[tuple[float, Path]]]:
             frames = json.loads(file.read_text(encoding="utf-8"))["frames"]
             listed = [(one, str(one["file_path"]), float(one.get("time", 0.0))) for one in frames]
         except (OSError, ValueError, KeyError, TypeError):
-            continue  # no file of a data set
+            continue  # not a data set's file
         for frame, given, t in listed:
             path = _image(folder, given)
             if path is None or not math.isfinite(t):

@@ -20,7 +20,7 @@ HARMONICS = "radiance:sh_"
 SHADING, SHADING_REST = "shading", "shading_rest"
 BIND = "bind_state:"  # prefix of attributes that keep the values overwritten by Exact Mode
 FINGERPRINTS = "r5dgs_fingerprints"  # custom property of point clouds
-WRITTEN = "r5dgs_exact_written"  # as well: fingerprints and time of what Exact Mode wrote
+WRITTEN = "r5dgs_exact_written"  # custom property of point clouds: fingerprints and time of what Exact Mode wrote
 _BLOCK = 2048
 # Display radius of Gaussians in viewports without splats, limited so that large or faint ones hide little.
 DISPLAY_SIGMAS = 1.2

@@ -77,7 +77,7 @@ def read(cloud: bpy.types.PointCloud, color: Sequence[float], known: CloudData |
     Args:
         cloud: Evaluated point cloud.
         color: Linear color and opacity of points without any.
-        known: What was read before; its look is kept if the attributes are unchanged, as those of objects that bend.
+        known: Earlier result, whose look is kept if its attributes are unchanged, as while an object bends.
     """
     source = _look_source(cloud, color)
     look = known.look if known is not None and known.look.source == source else _look(cloud, color, source)

@@ -74,7 +74,7 @@ class ViewMatrices:
 
 
 def matrix(values: np.ndarray) -> Matrix:
-    """Matrix of Blender. [4, 4]"""
+    """Convert an array to a matrix of Blender. [4, 4]"""
     return Matrix(values.tolist())
 
 
@@ -128,7 +128,7 @@ class SplatTable:
 
     @property
     def geometry(self) -> gpu.types.GPUTexture:
-        """Texture of the geometry; textures cannot be changed, so that it is a new one after `move`."""
+        """Texture of the geometry, a new one after each `move`, because textures cannot be changed."""
         if self._geometry is None:
             width = shaders.width() // gaussian_table.GEOMETRY * gaussian_table.GEOMETRY
             self._geometry = texture(self._table.geometry.reshape(-1, 4), width, "RGBA32F")
