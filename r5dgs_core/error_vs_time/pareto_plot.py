@@ -47,9 +47,9 @@ def png(report: dict[str, Any], name: str) -> bytes:
     from matplotlib.figure import Figure
 
     scene = next(scene for scene in report["scenes"] if scene["name"] == name)
-    groups = report_rows.by_task([row for row in report_rows.from_dicts(report["rows"]) if row.scene == name])
-    panels = {task: found for task, rows in groups.items() if (found := _points(tasks.BY_NAME[task], rows))}
-    references = {name: error for name, rows in groups.items() if (error := _reference(name, rows)) is not None}
+    own = report_rows.by_task([row for row in report_rows.from_dicts(report["rows"]) if row.scene == name])
+    groups = [(tasks.BY_NAME[key], rows) for key, rows in own.items()]
+    panels = [(task, points, _reference(task.panel, rows)) for task, rows in groups if (points := _points(task, rows))]
     columns = min(2, max(1, len(panels)))
     lines = max(1, math.ceil(len(panels) / 2))
     figure = Figure(figsize=(9.2 * columns, 6.9 * lines), dpi=_DPI, layout="constrained")
@@ -65,53 +65,49 @@ def png(report: dict[str, Any], name: str) -> bytes:
     if not panels:
         figure.text(0.5, 0.5, "nothing could be timed", ha="center")
     grid = figure.subplots(lines, columns, squeeze=False).ravel() if panels else []
-    drawn = []
-    for axes, (name, points) in zip(grid, panels.items(), strict=False):
-        _draw(axes, tasks.BY_NAME[name], points, scene)
-        if name in references:
-            axes.axhline(references[name], color="0.35", linestyle="--", linewidth=1, zorder=0)
-        drawn.append((axes, name, points))
+    for axes, (task, points, reference) in zip(grid, panels, strict=False):
+        _draw(axes, task, points, scene)
+        if reference is not None:
+            axes.axhline(reference, color="0.35", linestyle="--", linewidth=1, zorder=0)
     for axes in grid[len(panels) :]:
         axes.set_axis_off()
     canvas.draw()  # computes the layout, so that pixel positions are known
     figure.set_layout_engine("none")
-    for axes, name, points in drawn:
-        _name(axes, canvas.get_renderer(), tasks.BY_NAME[name].panel, points, references.get(name))
+    for axes, (task, points, reference) in zip(grid, panels, strict=False):
+        _name(axes, canvas.get_renderer(), task.panel, points, reference)
     buffer = io.BytesIO()
     canvas.print_png(buffer)
     return buffer.getvalue()
 
 
-def _reference(name: str, rows: Sequence[Row]) -> float | None:
-    """Return the pixel error of the reference method of a task, or None."""
-    panel = tasks.BY_NAME[name].panel
-    found = [row.error for row in rows if row.method == panel.reference and row.error_kind == panel.kind]
-    return _pixel_error(found[-1]) if found else None
+def _reference(panel: Panel, rows: Sequence[Row]) -> float | None:
+    """Return the error of the reference method as drawn, or None."""
+    found = [row for row in rows if row.method == panel.reference and row.error_kind == panel.kind]
+    return _drawn(panel, found[-1], found[-1].error) if found else None
 
 
 def _points(task: Task, rows: Sequence[Row]) -> list[_Point]:
     panel = task.panel
     shown = [row for row in rows if row.error_kind == panel.kind and math.isfinite(row.ms) and math.isfinite(row.error)]
     series = list(dict.fromkeys(panel.series(row) for row in shown))
+    _, factor = task.time_unit
     points = []
     for row in shown:
-        values = (row.error, row.error_min, row.error_max)
-        drawn = [_pixel_error(v) if row.kind.more_is_better else panel.factor * v for v in values]
+        drawn = [_drawn(panel, row, value) for value in (row.error, row.error_min, row.error_max)]
         y, low, high = (max(v, panel.floor) if math.isfinite(v) else math.nan for v in drawn)
         color = _COLORS[series.index(panel.series(row)) % len(_COLORS)]
-        scale = 1e-3 if task.in_seconds else 1.0
-        points.append(_Point(scale * row.ms, y, min(low, high), max(low, high), row, panel.name(row), color))
+        points.append(_Point(factor * row.ms, y, min(low, high), max(low, high), row, panel.name(row), color))
     return points
 
 
-def _pixel_error(psnr: float) -> float:
-    """Convert PSNR in dB to RMS error in 8-bit levels."""
-    return 255 * 10 ** (-psnr / 20)
+def _drawn(panel: Panel, row: Row, error: float) -> float:
+    """Return an error in the unit of the axis; a PSNR in dB becomes an RMS error in 8-bit levels."""
+    return 255 * 10 ** (-error / 20) if row.kind.more_is_better else panel.factor * error
 
 
 def _draw(axes: Any, task: Task, points: Sequence[_Point], scene: dict[str, Any]) -> None:
     panel, first = task.panel, points[0].row
-    time_label = f"{timing.CLOCKS[first.clock]} of {panel.subject}"
+    time_label = f"{timing.CLOCKS[first.clock]} of {panel.subject}, {task.time_unit[0]}"
     axes.set(xscale="log", yscale="log", xlabel=time_label, ylabel=panel.label)
     axes.set_title(panel.title(first, scene), fontsize=11, loc="left")
     if panel.in_line is not None:

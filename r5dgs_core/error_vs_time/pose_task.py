@@ -298,5 +298,4 @@ TASK = Task(
     ),
     needs_data=True,
     over_objects=True,
-    names_worst=True,
 )

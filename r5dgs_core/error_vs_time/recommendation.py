@@ -89,5 +89,5 @@ def _text(task: Task, pick: Row, best: Row, loss: float, own: Mapping[int, Line]
 
 
 def _time(task: Task, row: Row) -> str:
-    value = f"{row.ms / 1e3:.3g} s" if task.in_seconds else f"{row.ms:.3g} ms"
-    return f"{value} ({timing.SHORT_CLOCKS[row.clock]})"
+    unit, factor = task.time_unit
+    return f"{factor * row.ms:.3g} {unit} ({timing.SHORT_CLOCKS[row.clock]})"

@@ -144,7 +144,7 @@ class _Column:
 
 def _columns(task: Task, rows: Sequence[Row]) -> list[_Column]:
     """Return the columns of times, labelled with their clock and unit."""
-    unit, factor = ("s", 1e-3) if task.in_seconds else ("ms", 1.0)
+    unit, factor = task.time_unit
     clock = timing.SHORT_CLOCKS[rows[0].clock]
 
     def column(label: str, name: str) -> _Column:
@@ -210,9 +210,8 @@ def _error(row: Row | None) -> str:
     text = form(row.error)
     if math.isfinite(row.error_min):
         text += f" [{form(row.error_min)}..{form(row.error_max)}]"
-    task = tasks.BY_NAME[row.task]
-    if task.over_objects and math.isfinite(row.error_worst):
-        name = f" {row.worst_name}" if task.names_worst and row.worst_name else ""
+    if tasks.BY_NAME[row.task].over_objects and math.isfinite(row.error_worst):
+        name = f" {row.worst_name}" if row.worst_name else ""
         text += f" ({form(row.error_worst)}{name})"
     return text + (f" {FRONT}" if row.pareto else "")
 

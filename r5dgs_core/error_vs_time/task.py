@@ -66,7 +66,7 @@ class Panel:
         name: Label of a point.
         floor: Error at which smaller ones are drawn.
         factor: Factor on the errors.
-        subject: What takes the time, with the unit.
+        subject: What takes the time.
         series: Key of the rows that share a color.
         in_line: True for the points that the line of their series connects; None for a panel without lines.
         line_name: Label of the line of a series; None for lines without labels.
@@ -81,7 +81,7 @@ class Panel:
     name: Callable[[Row], str]
     floor: float
     factor: float = 1.0
-    subject: str = "a frame, ms"
+    subject: str = "a frame"
     series: Callable[[Row], tuple[str, str]] = by_mode
     in_line: Callable[[Row], bool] | None = None
     line_name: Callable[[tuple[str, str]], str] | None = None
@@ -126,7 +126,6 @@ class Task:
         needs_data: True if the task compares with a data set.
         counts: True if the task reports its progress by `Request.count`.
         over_objects: True if errors are medians over objects.
-        names_worst: True if the table names the object with the worst error.
         in_seconds: True if times are shown in seconds.
         has_quartiles: False if times are taken once.
     """
@@ -139,9 +138,13 @@ class Task:
     needs_data: bool = False
     counts: bool = False
     over_objects: bool = False
-    names_worst: bool = False
     in_seconds: bool = False
     has_quartiles: bool = True
+
+    @property
+    def time_unit(self) -> tuple[str, float]:
+        """Unit in which times are shown, and one millisecond in this unit."""
+        return ("s", 1e-3) if self.in_seconds else ("ms", 1.0)
 
 
 def percent(value: float) -> str:

@@ -92,7 +92,7 @@ TASK = Task(
         lambda row, scene: f"Training ({row.method}; numbers: steps)",
         lambda row: row.setting.removeprefix("step "),
         floor=1e-3,
-        subject="training, s",
+        subject="training",
         series=lambda row: (row.mode, row.method),
         in_line=lambda row: True,
     ),
