@@ -27,7 +27,7 @@ from tests.blender import check_playback  # noqa: E402
 from tests.support import scenes  # noqa: E402
 
 WIDTH, HEIGHT, ROUNDS = 1280, 800, 3
-MOST_DIFFERENT = 1e-4  # of the selected Gaussians, by rounding at edges
+MAX_DIFFERENT = 1e-4  # of the selected Gaussians, by rounding at edges
 
 
 def seconds(work: Callable[[], object], rounds: int = ROUNDS) -> float:
@@ -122,7 +122,7 @@ def main(count: int) -> None:
             wanted = expected(collection, view, stroke, view_selection)
             kind = "front" if front else "through"
             print(f"{name:9} {kind:8} {took:.3f} s, {selected:,} selected, {wanted:,} by brute force")
-            if abs(selected - wanted) > MOST_DIFFERENT * max(wanted, 1):
+            if abs(selected - wanted) > MAX_DIFFERENT * max(wanted, 1):
                 sys.exit("the selection differs from brute force")
     print(f"floaters           {seconds(bpy.ops.r5dgs.select_floaters):.3f} s")
     print(f"delete             {seconds(bpy.ops.r5dgs.delete_gaussians, 1):.3f} s")

@@ -17,7 +17,7 @@ from . import errors
 
 T = TypeVar("T")
 ERROR, WARNING = "error", "warning"
-MOST_FINDINGS = 10_000  # per file, so that a malicious file cannot fill the memory
+MAX_FINDINGS = 10_000  # per file, so that a malicious file cannot fill the memory
 Guard = Callable[[], AbstractContextManager[Any]]
 _NOTHING = contextlib.nullcontext()
 
@@ -132,7 +132,7 @@ class Collector:
                 raise
 
     def add(self, code: str, message: str) -> None:
-        """Record a fault; beyond `MOST_FINDINGS`, record once that there are more.
+        """Record a fault; beyond `MAX_FINDINGS`, record once that there are more.
 
         Args:
             code: Code of the fault.
@@ -146,9 +146,9 @@ class Collector:
         place, _, problem = body.strip().rstrip(".").partition(": ")
         if not problem:
             place, problem = place, kind.meaning
-        if len(self._known) == MOST_FINDINGS:
-            problem, remedy = f"more than {MOST_FINDINGS} faults; the others are not listed", ""
+        if len(self._known) == MAX_FINDINGS:
+            problem, remedy = f"more than {MAX_FINDINGS} faults; the others are not listed", ""
         finding = Finding(code, kind.severity, place, problem, remedy.strip() or kind.remedy)
-        if finding not in self._known and len(self._known) <= MOST_FINDINGS:
+        if finding not in self._known and len(self._known) <= MAX_FINDINGS:
             self._known.add(finding)
             self.findings.append(finding)

@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 LOCK_FILE = ".lock"
 _PLACE = 1 << 30  # offset of the locked byte, past the description: Windows blocks reads of a locked range
-_MOST_BYTES = 1 << 16  # maximum size of the holder's description
+_MAX_BYTES = 1 << 16  # maximum size of the holder's description
 
 
 @contextlib.contextmanager
@@ -181,7 +181,7 @@ def _holder(path: Path) -> str:
     """Return a description of the process that holds a lock; "another process" if the lock file cannot be read."""
     try:
         with open(path, "rb") as stream:
-            found = strict_json.parse(stream.read(_MOST_BYTES), str(path), CheckpointError)
+            found = strict_json.parse(stream.read(_MAX_BYTES), str(path), CheckpointError)
         return f"process {found['pid']} on {found['host']} since {found['since']} ({found['command']})"
     except (OSError, CheckpointError, KeyError, TypeError):
         return "another process"

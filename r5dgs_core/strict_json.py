@@ -12,11 +12,11 @@ from typing import Any
 
 from .errors import R5dgsError
 
-MOST_BYTES = 64 << 20  # per file
-MOST_MEMORY = 256 << 20  # bytes of parsed values, as estimated by `memory_of`
-MOST_DEPTH = 64  # nesting levels
+MAX_BYTES = 64 << 20  # per file
+MAX_MEMORY = 256 << 20  # bytes of parsed values, as estimated by `memory_of`
+MAX_DEPTH = 64  # nesting levels
 _DAMAGED = "write the file again, or copy it again"  # default remedy
-_MOST_DIGITS = 19  # of a 64-bit integer; longer text is not converted, because that takes quadratic time
+_MAX_DIGITS = 19  # of a 64-bit integer; longer text is not converted, because that takes quadratic time
 
 
 def parse(
@@ -26,8 +26,8 @@ def parse(
     remedy: str = _DAMAGED,
     *,
     finite: bool = True,
-    memory: int = MOST_MEMORY,
-    size: int = MOST_BYTES,
+    memory: int = MAX_MEMORY,
+    size: int = MAX_BYTES,
 ) -> Any:
     """Parse JSON.
 
@@ -44,7 +44,7 @@ def parse(
         Dictionaries, lists, strings, 64-bit integers, finite floats, booleans and None.
 
     Raises:
-        R5dgsError: Of class ``kind``: invalid JSON, too large, nested deeper than `MOST_DEPTH`, a repeated key in an
+        R5dgsError: Of class ``kind``: invalid JSON, too large, nested deeper than `MAX_DEPTH`, a repeated key in an
             object, an unpaired surrogate, an integer of more than 64 bits, or a float that ``finite`` rejects.
     """
     needed = memory_of(data)
@@ -67,7 +67,7 @@ def parse(
         fault = f"not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}"
         raise kind(f"{place}: damaged, {fault}; {remedy}") from error
     except RecursionError as error:
-        raise kind(f"{place}: damaged, JSON nested deeper than {MOST_DEPTH} levels; {remedy}") from error
+        raise kind(f"{place}: damaged, JSON nested deeper than {MAX_DEPTH} levels; {remedy}") from error
     except ValueError as error:  # from `decode` and the hooks
         raise kind(f"{place}: damaged, {error}; {remedy}") from error
     return content
@@ -77,12 +77,12 @@ def read(path: Path, kind: type[R5dgsError], remedy: str = _DAMAGED, *, finite: 
     """Parse a JSON file, see `parse`; a missing or unreadable file is also an error of class ``kind``."""
     try:
         with open(path, "rb") as stream:
-            data = stream.read(MOST_BYTES + 1)
+            data = stream.read(MAX_BYTES + 1)
     except FileNotFoundError as error:
         raise kind(f"{path}: the file is missing") from error
     except OSError as error:
         raise kind(f"{path}: cannot be read ({error})") from error
-    return parse(data, str(path), kind, remedy, finite=finite, size=MOST_BYTES)
+    return parse(data, str(path), kind, remedy, finite=finite, size=MAX_BYTES)
 
 
 def memory_of(data: bytes) -> int:
@@ -103,7 +103,7 @@ def _float(text: str) -> float:
 
 
 def _integer(text: str) -> int:
-    value = int(text) if len(text) <= _MOST_DIGITS + 1 else 1 << 63
+    value = int(text) if len(text) <= _MAX_DIGITS + 1 else 1 << 63
     if not -(1 << 63) <= value < 1 << 63:
         raise ValueError(f"the integer {text[:40]} has more than 64 bits")
     return value
@@ -119,7 +119,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _check_depth(content: Any) -> None:
     nodes = [content]
-    for _ in range(MOST_DEPTH + 1):
+    for _ in range(MAX_DEPTH + 1):
         nodes = [
             child
             for node in nodes

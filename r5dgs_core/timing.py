@@ -15,7 +15,7 @@ import numpy as np
 CLOCKS = {"wall": "wall time", "cpu": "processor time over all threads"}
 SHORT_CLOCKS = {"wall": "wall", "cpu": "processor"}
 SAMPLE_MS = 4.0  # minimum duration of a turn, milliseconds; shorter calls are repeated
-MOST_CALLS = 1000  # maximum calls per turn
+MAX_CALLS = 1000  # maximum calls per turn
 PATIENCE_MS = 30_000.0  # time of a contender's turns after which it takes at most `ENOUGH`
 ENOUGH = 3
 BUSY = 1.25  # ratio of wall to single-thread processor time above which the machine counts as busy
@@ -84,12 +84,12 @@ class Contender:
         start = time.perf_counter()
         self.run()
         once = 1e3 * (time.perf_counter() - start)
-        self.calls = int(np.clip(np.ceil(SAMPLE_MS / max(once, 1e-6)), 1, MOST_CALLS))
+        self.calls = int(np.clip(np.ceil(SAMPLE_MS / max(once, 1e-6)), 1, MAX_CALLS))
 
     def take_turn(self) -> tuple[float, float]:
         """Return the wall time of the fastest, undisturbed call and the mean processor time, milliseconds."""
         fastest, began, spent, done = float("inf"), time.process_time(), 0.0, 0
-        while done < self.calls or (spent == 0 and done < MOST_CALLS):  # some clocks advance by 10 ms at a time
+        while done < self.calls or (spent == 0 and done < MAX_CALLS):  # some clocks advance by 10 ms at a time
             start = time.perf_counter()
             self.run()
             fastest = min(fastest, time.perf_counter() - start)

@@ -13,11 +13,11 @@ from scipy import optimize
 from r5dgs_core.association import leave_one_out, segment_stack
 
 THRESHOLD = 0.25
-FEWEST = 4
+MIN_IMAGES = 4
 PASSES = 3
 
 
-def associate(stack: segment_stack.SegmentStack, threshold: float = THRESHOLD, fewest: int = FEWEST) -> np.ndarray:
+def associate(stack: segment_stack.SegmentStack, threshold: float = THRESHOLD, fewest: int = MIN_IMAGES) -> np.ndarray:
     """Object of each segment, 0 = background, -1 = none. [S]"""
     labels = np.where(stack.ids > 0, -1, 0)
     most = int((stack.ids > 0).sum())

@@ -52,7 +52,7 @@ KINDS = ("borders", "unseen sides", "objects", "shadows", "background")
 NEAR = math.cos(math.radians(30))
 VISIBLE = 0.2  # of what a Gaussian would show alone, from which on a view has seen it
 SHADOW_LEVEL = 3 / 255
-FEWEST_PIXELS = 30  # to which a change of colour is fitted
+MIN_PIXELS = 30  # to which a change of colour is fitted
 
 Move = Callable[..., scene_player.Frame]  # from a time, and an origin or none
 
@@ -195,7 +195,7 @@ def recolored(shown: Sequence[Picture], regions: Sequence[np.ndarray]) -> float:
     x = np.concatenate([p.drawn[region] for p, region in zip(shown, regions, strict=True)]).astype(np.float64)
     y = np.concatenate([p.truth[region] for p, region in zip(shown, regions, strict=True)]).astype(np.float64)
     fitted = x
-    if len(x) >= FEWEST_PIXELS:
+    if len(x) >= MIN_PIXELS:
         basis = np.concatenate([x, np.ones((len(x), 1))], axis=1)
         fitted = basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
     return float(((fitted - y) ** 2).mean(-1).sum()) if len(x) else 0.0

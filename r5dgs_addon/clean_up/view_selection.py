@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 FRONT = 0.5  # a Gaussian is in front if the Gaussians before it let at least this share of its light through
-_DEPTH_BITS, _LEAST_DEPTH_BITS = 32, 20  # resolution of depths in sorting
+_DEPTH_BITS, _MIN_DEPTH_BITS = 32, 20  # resolution of depths in sorting
 _FINEST = 4.0  # smallest cell in which Gaussians hide each other, in pixels
 
 
@@ -126,7 +126,7 @@ def _by_cell_and_depth(keys: np.ndarray, depths: np.ndarray) -> np.ndarray:
     """
     row_bits, key_bits = len(keys).bit_length(), int(keys.max()).bit_length()
     depth_bits = min(63 - row_bits - key_bits, _DEPTH_BITS)
-    if depth_bits < _LEAST_DEPTH_BITS:
+    if depth_bits < _MIN_DEPTH_BITS:
         return np.lexsort((depths, keys))
     ahead = depths - depths.min()
     steps = (ahead * ((1 << depth_bits) - 1) / max(float(ahead.max()), 1e-300)).astype(np.int64)

@@ -23,7 +23,7 @@ from . import mesh_merge, render_request, view_cameras, visible_clouds
 
 NAME = f"{mesh_merge.NAME} Shadows"
 LONGEST = 240  # pixels of the longer side of the pictures of the background
-MOST_VIEWS = 5  # pictures of the background along the path of the camera
+MAX_VIEWS = 5  # pictures of the background along the path of the camera
 SOLID = 0.9  # minimum alpha of pixels of the background's surface
 
 
@@ -31,7 +31,7 @@ def views(context: bpy.types.Context) -> list[render_request.VisibleParts]:
     """Return the background as the camera sees it: at the current frame, and along its path if it moves."""
     scene = context.scene
     frame, subframe = scene.frame_current, scene.frame_subframe
-    ends = np.linspace(scene.frame_start, scene.frame_end, MOST_VIEWS - 1).round().astype(int)
+    ends = np.linspace(scene.frame_start, scene.frame_end, MAX_VIEWS - 1).round().astype(int)
     found = [_background(context)]
     try:
         for other in dict.fromkeys(ends.tolist()):

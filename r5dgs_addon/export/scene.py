@@ -31,8 +31,8 @@ from . import frame_range
 
 TOLERANCE = 1e-5  # tolerated difference between Blender and playback without keys, as a fraction of the scene's extent
 KEY_TOLERANCE_SHARE = 1.5  # further tolerance, as a share of the key tolerance
-MOST_LATER = 64  # maximum number of sampled times past t_max
-MOST_EARLIER = 16  # maximum number of sampled frames before the first observed time
+MAX_LATER = 64  # maximum number of sampled times past t_max
+MAX_EARLIER = 16  # maximum number of sampled frames before the first observed time
 _STILL = 1e-6  # maximum deviation of a parent's linear part that counts as the identity
 
 
@@ -185,14 +185,14 @@ def _later(times: timeline.Times) -> np.ndarray:
     first, last = times.frame(times.t_max), times.frame(times.t_end)
     if last <= first + 1e-6:
         return np.zeros(0)
-    count = int(min(max(np.ceil(last - first), 8), MOST_LATER))
+    count = int(min(max(np.ceil(last - first), 8), MAX_LATER))
     return times.t_max + (times.t_end - times.t_max) * np.arange(1, count + 1) / count
 
 
 def _earlier(scene: bpy.types.Scene, times: timeline.Times) -> list[int]:
     """Frames before the first observed time, which a scene file cannot hold."""
     first, end = scene.frame_start, int(np.ceil(times.frame(times.t_start) - 1e-6))
-    return sorted({int(frame) for frame in np.linspace(first, end - 1, MOST_EARLIER)}) if first < end else []
+    return sorted({int(frame) for frame in np.linspace(first, end - 1, MAX_EARLIER)}) if first < end else []
 
 
 def _go_to(

@@ -15,7 +15,7 @@ from .. import compat
 from ..scene import timeline
 from . import curve_place, fcurves, physics
 
-_MOST_STEPS = 1 << 16  # maximum integration steps of a path, because its uncertainty takes hundreds of integrations
+_MAX_STEPS = 1 << 16  # maximum integration steps of a path, because its uncertainty takes hundreds of integrations
 STEPS = 32  # number of rings past t_max
 SIDES = 12
 THINNEST = 0.004  # minimum radius as a fraction of the object's reach, so that certain paths stay visible
@@ -100,7 +100,7 @@ def path(anchor: bpy.types.Object, times: timeline.Times) -> tuple[np.ndarray, n
     model = physics.model(physics.mover(anchor))
     end = times.t_end - times.t_max
     tau = np.union1d(np.linspace(0.0, end, STEPS + 1), models.kinks(model, end))
-    if models.steps_needed(model, tau[-1:])[0] > _MOST_STEPS:
+    if models.steps_needed(model, tau[-1:])[0] > _MAX_STEPS:
         raise errors.ConfigError(f"{anchor.name}: moves too fast for a path; lower the rates under Motion")
     _, displacements = models.evaluate(model, tau)
     band = physics.band(physics.mover(anchor))

@@ -21,7 +21,7 @@ from .. import compat
 from ..scene import loaded_scenes, timeline
 from . import confidence_tubes, curve_place, fcurves, keyframes, motion_fields, physics
 
-MOST_STEPS = 1024  # maximum integration steps per observed span; exceeded only by orbits about far-away points
+MAX_STEPS = 1024  # maximum integration steps per observed span; exceeded only by orbits about far-away points
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def _sampler(
         turn = rotations.quats_to_rotmats(rotations.normalize(quat))
         model = replace(model, inertia=turn @ model.inertia @ turn.T)
     span = min(times.t_end - times.t_max, max(times.t_max - times.t_start, 1 / times.frames_per_unit))
-    if models.steps_needed(model, np.array([span]))[0] > MOST_STEPS:
+    if models.steps_needed(model, np.array([span]))[0] > MAX_STEPS:
         raise errors.ConfigError(
             f"{mover.name}: the orbit is too fast or too large to integrate; lower the rates, or choose Throw and Spin"
         )

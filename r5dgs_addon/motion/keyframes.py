@@ -103,7 +103,7 @@ def stopped(sample: reduction.Sampler, start: float, stop_time: float | None) ->
 
 def intervals_per_object(objects: int) -> int:
     """Maximum number of key intervals per object, passed to `reduced_keys`."""
-    return min(max(_INTERVALS // max(objects, 1), reduction.FEWEST_INTERVALS), reduction.MOST_INTERVALS)
+    return min(max(_INTERVALS // max(objects, 1), reduction.MIN_INTERVALS), reduction.MAX_INTERVALS)
 
 
 def reduced_keys(
@@ -168,7 +168,7 @@ def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Cu
         unit = raw / norm
         return unit, moved, (raw_slopes - unit * (unit * raw_slopes).sum(-1, keepdims=True)) / norm, moved_slopes
 
-    most = min(max(_PER_KNOT * len(times), reduction.FEWEST_INTERVALS), reduction.MOST_INTERVALS)
+    most = min(max(_PER_KNOT * len(times), reduction.MIN_INTERVALS), reduction.MAX_INTERVALS)
     fewer = reduction.reduce(sample, float(times[0]), float(times[-1]), allowed, radius, most=most)
     if not fewer.followed:
         return exact

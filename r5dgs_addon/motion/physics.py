@@ -24,7 +24,7 @@ from ..ui import plural
 from . import curve_place, fcurves, motion_fields
 
 RATES = tuple(motion_fields.VECTORS)
-_LEAST_MOMENT = 1e-3  # minimum moment of inertia of flat or thin bodies, as a fraction of the largest
+_MIN_MOMENT = 1e-3  # minimum moment of inertia of flat or thin bodies, as a fraction of the largest
 _parsed = functools.lru_cache(maxsize=1024)(json.loads)  # for panels; callers must not change the result
 
 
@@ -227,7 +227,7 @@ def inertia(anchor: bpy.types.Object) -> np.ndarray:
     if len(points) == 0:
         return np.eye(3) / 3
     body = free_top.inertia(points)
-    return body + _LEAST_MOMENT * float(np.linalg.eigvalsh(body)[-1]) * np.eye(3)
+    return body + _MIN_MOMENT * float(np.linalg.eigvalsh(body)[-1]) * np.eye(3)
 
 
 def set_allowed_error(anchor: bpy.types.Object, error: float) -> None:

@@ -15,7 +15,7 @@ from ..playback import scene_player
 from ..render import scene_renderer
 from ..scene.scene import Scene
 
-LEAST_FRAMES = 60  # per mode, unless the time limit is reached
+MIN_FRAMES = 60  # per mode, unless the time limit is reached
 TIME_LIMIT_S = 20.0  # per mode
 
 
@@ -48,7 +48,7 @@ def measure(
     began = time.monotonic()
     for taken in itertools.count():
         in_time = time.monotonic() - began < TIME_LIMIT_S * len(modes)
-        if taken * len(ordered) >= LEAST_FRAMES or (taken and not in_time):
+        if taken * len(ordered) >= MIN_FRAMES or (taken and not in_time):
             break
         for mode, found in times.items():
             found += [_draw(players[mode], view, backend) for view in ordered]

@@ -16,8 +16,8 @@ from ..findings import Collector, Finding, coded
 from ..terminal import printable
 from .codes import CODES
 
-FEWEST_CAMERAS, FEWEST_IMAGES = 3, 3
-LEAST_SPACE = 1 << 30  # bytes
+MIN_CAMERAS, MIN_IMAGES = 3, 3
+MIN_SPACE = 1 << 30  # bytes
 _PARALLEL = 1e-6  # minimum eigenvalue per camera; below it, all optical axes are parallel
 _LISTED = 5  # names per finding
 _OF_ALL_TRAINING_IMAGES = {"D41", "D42", "D43", "D47"}
@@ -38,7 +38,7 @@ def check(root: Path, train_masks: str = dataset.MASKS, min_registered: float = 
     faulty = {finding.code for finding in collect.findings if finding.place == cameras_file}
     if faulty - {"D24"}:  # the frames are missing because they have faults
         collect.findings = [finding for finding in collect.findings if finding.code != "D24"]
-    if shutil.disk_usage(root).free < LEAST_SPACE:
+    if shutil.disk_usage(root).free < MIN_SPACE:
         collect.add("D53", f"{root}: expected at least 1 GB of free disk space, found less")
     if found is None:
         return collect.findings
@@ -104,10 +104,10 @@ def _check_times(found: Dataset, collect: Collector) -> None:
 
 def _check_cameras(found: Dataset, collect: Collector) -> None:
     cameras = list({view.camera.name: view.camera for view in found.train}.values())
-    if len(cameras) < FEWEST_CAMERAS or len(found.train) < FEWEST_IMAGES:
+    if len(cameras) < MIN_CAMERAS or len(found.train) < MIN_IMAGES:
         collect.add(
             "D47",
-            f"{found.root}: expected at least {FEWEST_CAMERAS} places of cameras and {FEWEST_IMAGES} training images, "
+            f"{found.root}: expected at least {MIN_CAMERAS} places of cameras and {MIN_IMAGES} training images, "
             f"found {len(cameras)} and {len(found.train)}",
         )
     if len(cameras) < 2:

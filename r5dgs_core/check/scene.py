@@ -17,7 +17,7 @@ from .codes import CODES
 LAST_FRAME = 1_048_574  # Blender's last frame
 _SEEN = 1 / 255  # minimum opacity that is drawn
 _FEW_SEEN = 0.05  # share of visible Gaussians below which S16 is reported
-_MOST_STEPS = 1 << 16  # maximum number of integration steps per motion
+_MAX_STEPS = 1 << 16  # maximum number of integration steps per motion
 
 
 def check(path: Path) -> list[Finding]:
@@ -63,7 +63,7 @@ def _check_motion(scene: Scene, path: Path, collect: Collector) -> None:
     for group in scene.groups:
         place = f"{path}: motion group {group.id}"
         with np.errstate(all="ignore"):
-            quats, moved, spins, _ = models.curve(group.model, taus, _MOST_STEPS)
+            quats, moved, spins, _ = models.curve(group.model, taus, _MAX_STEPS)
         if not (np.isfinite(quats).all() and np.isfinite(moved).all()):
             collect.add("S13", f"{place}: not finite between t_max and {end:g}")
         elif float(np.linalg.norm(spins, axis=-1).max()) / scene.frames_per_unit > key_reduction.MAX_FRAME_TURN_RAD:

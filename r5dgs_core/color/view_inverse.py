@@ -20,7 +20,7 @@ Forward = Callable[[np.ndarray], np.ndarray]  # scene linear [N, 3] to display, 
 
 KNEE = 0.05  # scene-linear colour at which codes turn from linear to logarithmic
 BRIGHTEST = 16.3  # scene-linear colour that most view transforms display as white, 6.5 stops above mid-grey
-MOST = 16.0  # white of the softest looks, in multiples of BRIGHTEST
+MAX_WHITE = 16.0  # white of the softest looks, in multiples of BRIGHTEST
 SIZE = 33  # grid nodes per channel
 STEP = 1 / 255  # 8-bit display step, the unit of errors
 VISIBLE = 1.5 * STEP  # minimum visible error
@@ -104,7 +104,7 @@ def invert(forward: Forward, scale: float = 1.0) -> Inverse:
     Args:
         forward: Maps scene-linear to display colours; called a few dozen times with up to 110,000 colours.
         scale: Factor on the colours, 2 ** -exposure, such that ``forward(scale * BRIGHTEST)`` is about white; up to
-            `MOST` times as bright is allowed.
+            `MAX_WHITE` times as bright is allowed.
     """
 
     def shown(codes: np.ndarray) -> np.ndarray:
@@ -132,7 +132,7 @@ def invert(forward: Forward, scale: float = 1.0) -> Inverse:
 
 def _top(shown: Forward) -> float:
     """Code of white: the smallest grey code at or above `BRIGHTEST` that displays like the brightest tested one."""
-    tried = np.arcsinh(BRIGHTEST * np.geomspace(1.0, MOST, 17) / KNEE)
+    tried = np.arcsinh(BRIGHTEST * np.geomspace(1.0, MAX_WHITE, 17) / KNEE)
     white = shown(np.repeat(tried[:, None], 3, axis=1))
     return float(tried[np.argmax(_far(white, white[-1]) < SOLVED)])
 

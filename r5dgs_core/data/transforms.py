@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors, findings, strict_json
-from ..scene.model_checks import MOST_TIME
+from ..scene.model_checks import MAX_TIME
 
 RIGID_TOLERANCE = 1e-3
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -227,8 +227,8 @@ def _lens_keys(source: dict) -> dict[str, Any]:
 def time_of(place: str, key: str, value: Any) -> float:
     """Return the value of a key as a scene time; DatasetError if a scene file cannot hold it."""
     t = finite(place, key, value)
-    if abs(t) > MOST_TIME:
-        raise errors.DatasetError(f"{place}: '{key}' must be a time up to {MOST_TIME:g}, found {t:g}", code="D03")
+    if abs(t) > MAX_TIME:
+        raise errors.DatasetError(f"{place}: '{key}' must be a time up to {MAX_TIME:g}, found {t:g}", code="D03")
     return t
 
 

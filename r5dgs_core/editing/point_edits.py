@@ -20,7 +20,7 @@ from ..scene.splats import to_opacities
 from . import edited_gaussians
 
 ROUNDING = 2e-6  # maximum residual of centres under a map, relative to the largest coordinate
-FEWEST = 5  # number of points that determine and confirm an affine map
+MIN_POINTS = 5  # number of points that determine and confirm an affine map
 TRIALS = 40  # number of RANSAC trials
 SAMPLE = 4096  # number of points that each map is tested on
 SAME = 1e-6  # relative tolerance of scales and opacities
@@ -119,7 +119,7 @@ def affine_between(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, n
     Returns:
         The map [4, 4] and a mask of the points that it moves [n]; None if there is no such invertible map.
     """
-    if len(before) < FEWEST:
+    if len(before) < MIN_POINTS:
         return None
     a, b = before.astype(np.float64), after.astype(np.float64)
     still = (a == b).all(-1)
@@ -133,13 +133,13 @@ def affine_between(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, n
     for _ in range(TRIALS):
         if 2 * count >= len(some):
             break
-        chosen = random.choice(some, FEWEST, replace=False)
+        chosen = random.choice(some, MIN_POINTS, replace=False)
         tried = _fit(a[chosen], b[chosen])
         found = _explained(tried, a[some], b[some], allowed).sum()
         best, count = (tried, found) if found > count else (best, count)
     inside = _explained(best, a, b, allowed)
     for _ in range(3):  # refine, because a map through few points is imprecise
-        if inside.sum() < FEWEST:
+        if inside.sum() < MIN_POINTS:
             return None
         best = _fit(a[inside], b[inside])
         inside = _explained(best, a, b, allowed)

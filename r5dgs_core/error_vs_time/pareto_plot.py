@@ -20,7 +20,7 @@ from .task import Panel, Task
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F7F7F", "#000000")
 _FRONT = "#B00020"
 _DPI = 110
-LEAST_SPAN = 2.0  # minimum ratio between the ends of a time axis
+MIN_SPAN = 2.0  # minimum ratio between the ends of a time axis
 
 
 @dataclass(frozen=True)
@@ -129,9 +129,9 @@ def _draw(axes: Any, task: Task, points: Sequence[_Point], scene: dict[str, Any]
         axes.step([p.x for p in front], [p.y for p in front], where="post", color=_FRONT, linewidth=1.2, zorder=1)
     axes.margins(x=0.16, y=0.12)
     low, high = axes.get_xlim()
-    if high < LEAST_SPAN * low:  # a narrow axis would make noise look like a difference
+    if high < MIN_SPAN * low:  # a narrow axis would make noise look like a difference
         middle = math.sqrt(low * high)
-        axes.set_xlim(middle / math.sqrt(LEAST_SPAN), middle * math.sqrt(LEAST_SPAN))
+        axes.set_xlim(middle / math.sqrt(MIN_SPAN), middle * math.sqrt(MIN_SPAN))
     axes.grid(alpha=0.25, which="major")
     _ticks(axes)
     if first.kind.more_is_better:

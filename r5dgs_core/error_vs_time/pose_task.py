@@ -24,7 +24,7 @@ ALONE = "for all objects"  # setting of a row of one model; the best of them is 
 CHOSEN = "chosen of the family"
 STEADY = {"spring": "translation, quadratic", "pendulum": "hinge"}  # fallback of a model for objects that do not swing
 _SAME = 1e-9  # tolerance for equal times
-_LEAST_MOMENT = 1e-6  # added to the inertia, which is singular for collinear members but must not be for a free top
+_MIN_MOMENT = 1e-6  # added to the inertia, which is singular for collinear members but must not be for a free top
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -
     # Only a free top needs the inertia, so it is computed only if that model is a candidate.
     shape = None
     if names is None or names == (candidates.FREE_TOP.name,):
-        shape = free_top.inertia(scene.gaussians.means[rows] - group.pivot, weights) + _LEAST_MOMENT * np.eye(3)
+        shape = free_top.inertia(scene.gaussians.means[rows] - group.pivot, weights) + _MIN_MOMENT * np.eye(3)
     seen = (scene.tracks.times >= first - _SAME) & (scene.tracks.times <= last + _SAME)
     return model_selection.fit(
         scene.tracks.times,

@@ -26,7 +26,7 @@ LONGEST = 1024  # minimum pixels along the longer side, so that names are legibl
 TINT = 0.3  # share of an object's color mixed into its pixels
 ROOM = 0.9  # share of a name's box that its object must cover for the name to be written on it
 BEHIND = 0.6  # brightness factor of the background
-LEAST_LETTERS = 10.0  # minimum height of letters, pixels
+MIN_LETTER_HEIGHT = 10.0  # minimum height of letters, pixels
 DPI = 100
 _DARK, _LIGHT, _FAINT = "#101014", "#ffffff", "#8c8c94"
 
@@ -80,7 +80,7 @@ def annotate(scene: Scene, color: np.ndarray, ids: np.ndarray, title: str) -> np
 
 def _annotate(scene: Scene, color: np.ndarray, ids: np.ndarray, title: str) -> np.ndarray:
     height, width = ids.shape
-    font_px = max(max(width, height) / 60, LEAST_LETTERS)
+    font_px = max(max(width, height) / 60, MIN_LETTER_HEIGHT)
     listed = [item for item in scene.objects if item.id > 0]
     strip = _Strip(listed, set(np.unique(ids).tolist()), title, width, font_px)
     figure = Figure(figsize=(width / DPI, (height + strip.height) / DPI), dpi=DPI, facecolor=_DARK)

@@ -21,7 +21,7 @@ from ..scene.splats import to_opacities
 from . import evaluate, miou
 from .scene_summary import motion_of
 
-MOST_VIEWS = 24  # maximum number of views in which pixels are counted
+MAX_VIEWS = 24  # maximum number of views in which pixels are counted
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def measure(
 def own_views(scene: Scene) -> list[viewpoints.Viewpoint]:
     """Return views of the scene's own cameras at distinct observed times, or overviews if it stores no cameras."""
     first = float(scene.tracks.times[0])
-    cameras = sampling.spread(scene.cameras, MOST_VIEWS) or [viewpoints.overview(scene)] * 3
+    cameras = sampling.spread(scene.cameras, MAX_VIEWS) or [viewpoints.overview(scene)] * 3
     # Golden-ratio steps keep camera order and time order uncorrelated.
     shares = (0.5 + 0.6180339887 * np.arange(len(cameras))) % 1.0
     times = first + shares * (scene.t_max - first)

@@ -44,7 +44,7 @@ _TYPES = {
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _HEADER_LIMIT = 1 << 16
 _LONGEST_NUMBER = 400  # characters, including the separator
-_MOST_DIGITS = 18  # digits of a row count
+_MAX_DIGITS = 18  # digits of a row count
 
 
 def write(splats: Splats, path: str | Path, *, plain: bool = False, origin: np.ndarray | None = None) -> Path:
@@ -151,7 +151,7 @@ def _read_header(
             break
         if words[0] == "format" and len(words) == 3 and words[1] in _ORDERS:
             layout = words[1]
-        elif words[0] == "element" and len(words) == 3 and words[2].isdigit() and len(words[2]) <= _MOST_DIGITS:
+        elif words[0] == "element" and len(words) == 3 and words[2].isdigit() and len(words[2]) <= _MAX_DIGITS:
             elements.append((words[1], int(words[2]), []))
         elif words[0] == "property" and elements and len(words) == 3 and words[1] in _TYPES:
             elements[-1][2].append((words[2], _TYPES[words[1]]))

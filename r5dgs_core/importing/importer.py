@@ -21,7 +21,7 @@ from . import assembly, cameras_json, deformable, freegave, gaussian_splatting, 
 from .foreign_run import ForeignRun
 from .run_folder import RunFolder
 
-MOST_KNOTS = 10_000  # limit without --knots
+MAX_KNOTS = 10_000  # limit without --knots
 ROUNDING = 1e-9  # minimum motion, as a share of the extent
 _log = logging.getLogger(__name__)
 
@@ -147,9 +147,9 @@ def _times(run: RunFolder, foreign: ForeignRun, dataset: Dataset | None, options
         return np.linspace(0.0, t_max, options.knots)
     if dataset is None:
         knots = max(2, round(datasets.FRAMES_PER_UNIT * t_max) + 1)
-        if knots > MOST_KNOTS:
+        if knots > MAX_KNOTS:
             raise CheckpointError(
-                f"{run.folder}: the last time {t_max:g} requires more than {MOST_KNOTS} knots; give their number "
+                f"{run.folder}: the last time {t_max:g} requires more than {MAX_KNOTS} knots; give their number "
                 "with --knots, or the time with --t-max"
             )
         return np.linspace(0.0, t_max, knots)

@@ -21,7 +21,7 @@ DISTINCT = 0.1  # minimum relative difference of moments for a visible tumble
 LINE = 1e-3  # minimum ratio of the smallest to the largest moment; collinear bodies are below it
 _GAP = 1e-9  # minimum relative gap between moments; Euler's solution divides by their differences
 _SAMPLES = 256  # per period; the Fourier series converges like exp(-n), more slowly near a separatrix
-_LEAST = 1e-300
+_TINY = 1e-300
 _LEAST_M1 = 1e-20  # keeps spins off the separatrix, where the period is infinite
 
 
@@ -133,17 +133,17 @@ class _Path:
         length = squares.sum(-1)
         across = length - np.take_along_axis(squares, k, -1)[..., 0]
         energy = energies.sum(-1) - np.take_along_axis(energies, k, -1)[..., 0]
-        return np.sqrt(length) * energy / np.maximum(across, _LEAST)
+        return np.sqrt(length) * energy / np.maximum(across, _TINY)
 
     def at(self, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations from the principal axes to a world-fixed frame [B, S, 3, 3] and spins [B, S, 3]."""
         u = self.rate[..., None] * tau + self.phase[..., None]
         spins = self.spins(u)
         momenta = self.moments[..., None, :] * spins
-        up = momenta / np.maximum(np.linalg.norm(momenta, axis=-1, keepdims=True), _LEAST)
+        up = momenta / np.maximum(np.linalg.norm(momenta, axis=-1, keepdims=True), _TINY)
         poles = np.eye(3)[self.pole][..., None, :]
         east = poles - (poles * up).sum(-1)[..., None] * up
-        east = east / np.maximum(np.linalg.norm(east, axis=-1, keepdims=True), _LEAST)
+        east = east / np.maximum(np.linalg.norm(east, axis=-1, keepdims=True), _TINY)
         body = np.stack([east, rotations.cross(up, east), up], -2)
         angle = self._angle(tau, u)
         c, s, zero = np.cos(angle), np.sin(angle), 0 * angle
@@ -196,8 +196,8 @@ def _solve(body: np.ndarray, w: np.ndarray) -> _Path:
     peaks = np.sqrt(np.stack([low / (i1 * gap13), low / (i2 * gap23), high / (i3 * gap13)], -1))
     peaks = peaks * np.stack([np.ones_like(side), side * order, side], -1)
     rate = np.sqrt(high * gap23 / (i1 * i2 * i3))
-    m = np.where(high > 0, low * gap12 / np.maximum(high * gap23, _LEAST), 0.0)
-    m1 = np.abs(circling) * gap13 / np.maximum(high * gap23, _LEAST)
+    m = np.where(high > 0, low * gap12 / np.maximum(high * gap23, _TINY), 0.0)
+    m1 = np.abs(circling) * gap13 / np.maximum(high * gap23, _TINY)
     m1 = np.where(high > 0, np.clip(np.where(m < 0.5, 1 - m, m1), _LEAST_M1, 1.0), 1.0)
     amplitude = np.arctan2(side * order * spins[..., 1] * np.sqrt(i2 * gap23), spins[..., 0] * np.sqrt(i1 * gap13))
     squares = (moments * peaks) ** 2

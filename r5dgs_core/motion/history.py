@@ -11,7 +11,7 @@ import numpy as np
 from .models import VECTORS
 
 EVENTS = ("start", "stop", "impact", "change")
-MOST_KNOTS = 16
+MAX_KNOTS = 16
 UNKNOWN_TURN = 1.0  # standard deviation of a rotation that the images do not determine, rad
 _DONE = {"start": "set off", "stop": "stopped", "impact": "hit", "change": "changed"}
 
@@ -65,7 +65,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Band:
-    """Confidence band of the motion past t_max, at most `MOST_KNOTS` knots; linear in between and after the last one.
+    """Confidence band of the motion past t_max, at most `MAX_KNOTS` knots; linear in between and after the last one.
 
     Attributes:
         times: Scene times, increasing, the first is t_max. [H]

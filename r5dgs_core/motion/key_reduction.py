@@ -18,9 +18,9 @@ from . import cubic_curves, models, rotations
 MAX_STEP_RAD = math.radians(120.0)
 # per frame; near half a turn, the direction of rotation between two frames is ambiguous
 MAX_FRAME_TURN_RAD = math.radians(160.0)
-FEWEST_INTERVALS = 64  # first grid between two kinks
-MOST_INTERVALS = 1 << 15
-FEWEST_KINKS = 16  # lowest limit of the number of kinks
+MIN_INTERVALS = 64  # first grid between two kinks
+MAX_INTERVALS = 1 << 15
+MIN_KINKS = 16  # lowest limit of the number of kinks
 _BESIDE = 1e-7  # distance from a kink at which its slopes are sampled, as a fraction of the time between two kinks
 _REST = 1e-3  # largest change of a curve that counts as constant, as a fraction of the tolerance
 _FINER = 4  # checking grid points per candidate key time
@@ -42,7 +42,7 @@ class FrameTimes:
     duration: float
 
 
-def model_sampler(model: models.MotionModel, t_max: float, most: int = MOST_INTERVALS) -> Sampler:
+def model_sampler(model: models.MotionModel, t_max: float, most: int = MAX_INTERVALS) -> Sampler:
     """Return a sampler of a motion model at scene times >= t_max, for `reduce` with the same ``most``."""
 
     def sample(times: np.ndarray) -> Samples:
@@ -64,12 +64,12 @@ def reduce(
     kinks: Sequence[float] = (),
     nearest: float = 0.0,
     frames: FrameTimes | None = None,
-    most: int = MOST_INTERVALS,
+    most: int = MAX_INTERVALS,
 ) -> cubic_curves.Curves:
     """Choose keys so that every point of the body stays within ``tolerance`` of the motion.
 
     The number of samples is bounded by a constant times ``most``; with ``frames``, also by a constant times the number
-    of frames (and at least that of `FEWEST_INTERVALS`).
+    of frames (and at least that of `MIN_INTERVALS`).
 
     Args:
         sample: Function of times [S] that gives quaternions [S, 4], displacements [S, 3] and their slopes per unit of
@@ -80,11 +80,11 @@ def reduce(
         radius: Largest distance of a point from the pivot, world units.
         kinks: Increasing times at which slopes jump. Those inside (t0, t1) get a key with the slopes of both sides,
             except those within ``nearest`` of the previous one or of an end, and those beyond the first
-            max(`FEWEST_KINKS`, ``most`` / `FEWEST_INTERVALS`).
+            max(`MIN_KINKS`, ``most`` / `MIN_INTERVALS`).
         nearest: Minimum time between candidate keys, for editors that merge closer keys.
         frames: Frames of the editor. A curve that four keys per frame do not reproduce, or a rotation of more than
             `MAX_FRAME_TURN_RAD` per frame, gets one key per frame.
-        most: Maximum number of intervals between keys, >= `FEWEST_INTERVALS`. If there are more frames, a curve with
+        most: Maximum number of intervals between keys, >= `MIN_INTERVALS`. If there are more frames, a curve with
             one key per frame gets a key at every n-th frame.
 
     Returns:
@@ -96,12 +96,12 @@ def reduce(
     """
     if not (math.isfinite(t0) and math.isfinite(t1) and t1 > t0):
         raise ValueError(f"t0, t1: expected t0 < t1, got {t0} and {t1}")
-    if not (tolerance > 0 and radius >= 0 and nearest >= 0 and most >= FEWEST_INTERVALS):
+    if not (tolerance > 0 and radius >= 0 and nearest >= 0 and most >= MIN_INTERVALS):
         raise ValueError(
-            f"tolerance, radius, nearest, most: expected > 0, >= 0, >= 0 and >= {FEWEST_INTERVALS}, got {tolerance}, "
+            f"tolerance, radius, nearest, most: expected > 0, >= 0, >= 0 and >= {MIN_INTERVALS}, got {tolerance}, "
             f"{radius}, {nearest} and {most}"
         )
-    bounds, most_kinks = [t0], max(FEWEST_KINKS, most // FEWEST_INTERVALS)
+    bounds, most_kinks = [t0], max(MIN_KINKS, most // MIN_INTERVALS)
     for kink in kinks:
         if bounds[-1] + nearest < kink < t1 - nearest and len(bounds) <= most_kinks:
             bounds.append(float(kink))
@@ -152,9 +152,9 @@ def _sampled(sample: Sampler, t0: float, t1: float, limits: _Limits) -> tuple[tu
         Location and rotation; for each, True if single intervals follow it.
     """
     nearest, frames, limit = limits.nearest, limits.frames, limits.most
-    intervals = min(FEWEST_INTERVALS, max(1, int((t1 - t0) / nearest))) if nearest > 0 else FEWEST_INTERVALS
+    intervals = min(MIN_INTERVALS, max(1, int((t1 - t0) / nearest))) if nearest > 0 else MIN_INTERVALS
     if frames is not None:
-        limit = int(min(limit, max(FEWEST_INTERVALS, _PER_FRAME * (t1 - t0) / frames.duration)))
+        limit = int(min(limit, max(MIN_INTERVALS, _PER_FRAME * (t1 - t0) / frames.duration)))
     while True:
         grid = np.linspace(t0, t1, intervals * _FINER + 1)
         location, rotation = _Curve.pair(sample(grid), grid, limits)

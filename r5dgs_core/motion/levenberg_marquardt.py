@@ -16,7 +16,7 @@ from . import robust_weights
 
 _DIFFERENCE = 1e-6
 _FIRST_DAMPING = 1e-4
-_LEAST_DAMPING, _MOST_DAMPING = 1e-10, 1e10
+_MIN_DAMPING, _MAX_DAMPING = 1e-10, 1e10
 _TOLERANCE = 1e-5  # predicted gain / cost at which iteration ends
 _TRIAL_STEPS = 2  # number of steps before a hopeless start may end
 _STALLING = 0.05  # share of the weighted squared residuals that a step of a hopeless start must remove
@@ -141,10 +141,10 @@ def solve_linearized(
         for field in fields(Solution):
             getattr(point, field.name)[good] = getattr(trial, field.name)[better]
         shrink = np.maximum(0.1, 1 - (2 * np.clip(ratio[better], 0, 1) - 1) ** 3)
-        damping[good], growth[good] = np.maximum(damping[good] * shrink, _LEAST_DAMPING), 2.0
+        damping[good], growth[good] = np.maximum(damping[good] * shrink, _MIN_DAMPING), 2.0
         bad = live[~better]
         damping[bad], growth[bad] = damping[bad] * growth[bad], 2 * growth[bad]
-        live = live[damping[live] < _MOST_DAMPING]
+        live = live[damping[live] < _MAX_DAMPING]
     return point
 
 

@@ -7,13 +7,13 @@ import numpy as np
 from . import point_dynamics, rotations
 
 State = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # points, rotations, v, w
-MOST_STEPS = 20000  # maximum number of cached steps; motion stops after the last
+MAX_STEPS = 20000  # maximum number of cached steps; motion stops after the last
 
 
 class SteppedPath:
     """`point_dynamics.rk2` of the same points at many times, with bit-identical results.
 
-    A point whose position is no longer finite stays at its last finite position. All points stop after `MOST_STEPS`.
+    A point whose position is no longer finite stays at its last finite position. All points stop after `MAX_STEPS`.
 
     Args:
         points: Start positions. [..., 3]
@@ -34,7 +34,7 @@ class SteppedPath:
             raise ValueError(f"duration: expected a time >= 0, got {duration}")
         if duration == 0:
             return self._states[0][0], self._states[0][1]
-        steps = point_dynamics.step_sizes(min(duration, MOST_STEPS * self._step), self._step)
+        steps = point_dynamics.step_sizes(min(duration, MAX_STEPS * self._step), self._step)
         while len(self._states) < len(steps):
             self._states.append(self._next(self._states[-1], self._step))
         points, quats, _, _ = self._next(self._states[len(steps) - 1], steps[-1])

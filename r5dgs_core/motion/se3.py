@@ -18,7 +18,7 @@ from . import rotations
 
 Array = rotations.Array
 Pose = tuple[Array, Array]
-MOST_STEPS = 1 << 31  # result of `steps_needed` if no number of steps suffices
+MAX_STEPS = 1 << 31  # result of `steps_needed` if no number of steps suffices
 
 
 def float64(*arrays: Array) -> tuple[Array, ...]:
@@ -207,7 +207,7 @@ def steps_needed(
 
     Returns:
         n >= 1 for each duration, numpy. It is 1 if twist and rate commute, because one step is then exact, and
-        `MOST_STEPS` if that many do not suffice or the rates are not finite. [...] int64
+        `MAX_STEPS` if that many do not suffice or the rates are not finite. [...] int64
 
     Source: leading omitted term D = [C1, a2]/240 + [a1, [a1, C1]]/720 with C1 = [a1, a2], a1 = m, a2 = b at h = 1:
         n = ceil((c T^5 / tol)^(1/4)), c the mean over [0, T] of radius |D_w| + |D_v|; at least |w| T / 2 steps.
@@ -224,7 +224,7 @@ def steps_needed(
     by_turn = np.ceil(np.linalg.norm(a1[0], axis=-1).max(axis=0) * span / 2)
     commutes = omitted * span**5 <= 1e-15 * _reach(a1, radius) * span
     count = np.where(commutes, 1, np.maximum(1, np.maximum(by_error, by_turn)))
-    return np.nan_to_num(np.minimum(count, MOST_STEPS), nan=MOST_STEPS).astype(np.int64)
+    return np.nan_to_num(np.minimum(count, MAX_STEPS), nan=MAX_STEPS).astype(np.int64)
 
 
 def _numbers(values: Array) -> np.ndarray:

@@ -117,7 +117,7 @@ class Propagator:
         omitted, turning = self._omitted[i], self._turning[i]
         error = (omitted[0] + omitted[1] * span + omitted[2] * span**2) * span**5
         by_turn = (turning[0] + turning[1] * span) * span / 2
-        if not (error**0.25 < se3.MOST_STEPS and by_turn < se3.MOST_STEPS):  # no number of steps suffices
+        if not (error**0.25 < se3.MAX_STEPS and by_turn < se3.MAX_STEPS):  # no number of steps suffices
             return min(MAX_STEPS, self._most_steps)
         return min(max(1, math.ceil(error**0.25), math.ceil(by_turn)), self._most_steps)
 

@@ -11,8 +11,8 @@ from . import candidates as families
 from .candidates import FittedCandidate, Noise
 
 HELD_OUT = 0.2  # share of the last poses that are predicted
-_FEWEST = 8  # minimum number of poses of a track for this test
-_MOST_SQUARE = 600.0  # maximum squared prediction error, in variances
+_MIN_POSES = 8  # minimum number of poses of a track for this test
+_MAX_SQUARE = 600.0  # maximum squared prediction error, in variances
 
 
 def relative_error(chosen: FittedCandidate, track: PoseTrack, noise: Noise, variance: float) -> float:
@@ -22,7 +22,7 @@ def relative_error(chosen: FittedCandidate, track: PoseTrack, noise: Noise, vari
     ``variance``. Returns 1 for short tracks.
     """
     count = len(track)
-    if count < _FEWEST:
+    if count < _MIN_POSES:
         return 1.0
     shares = []
     most = count - chosen.candidate.poses_with_choices  # maximum number of poses to leave out
@@ -31,10 +31,10 @@ def relative_error(chosen: FittedCandidate, track: PoseTrack, noise: Noise, vari
             continue
         earlier = families.solve(chosen.candidate, track.rows(slice(0, count - held)), noise, [chosen.theta], steps=8)
         if earlier is None:
-            return _MOST_SQUARE
+            return _MAX_SQUARE
         later = track.rows(slice(count - held, None))
         late, slopes = families.linearized(chosen.candidate, earlier.theta, later, noise)
         expected = 6 + np.einsum("phc,pq,qhc->h", slopes, earlier.inverse, slopes)
-        squares = np.minimum((late**2).sum(-1), _MOST_SQUARE * variance)
+        squares = np.minimum((late**2).sum(-1), _MAX_SQUARE * variance)
         shares.append(squares / np.maximum(expected, 6.0) / variance)
     return float(np.concatenate(shares).mean()) if shares else 1.0

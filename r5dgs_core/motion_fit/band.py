@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..motion import rotations, se3
-from ..motion.history import MOST_KNOTS, Band
+from ..motion.history import MAX_KNOTS, Band
 from . import backtest
 from .candidates import FittedCandidate, Noise
 from .fitted_motion import fade_time
@@ -28,7 +28,7 @@ _DRIFT = 5.0  # drift of a track over its span, in units of the lower bound of i
 _LINE = math.sqrt(12.0)  # drift at a constant rate over the span, in standard deviations
 _SOFT = 4.0  # difference of scores that reduces a candidate's weight by e
 _FARTHEST = 8.0  # maximum counted distance of another candidate, in radii
-_MOST_SCALE = 36.0  # maximum factor on the covariance from the errors of earlier predictions
+_MAX_SCALE = 36.0  # maximum factor on the covariance from the errors of earlier predictions
 
 
 def drift_noise(least: Noise, deviations: Noise) -> Noise:
@@ -47,13 +47,13 @@ def confidence_band(selected: Selected, variance: float, drift: Noise) -> Widths
         variance: Factor of the parameters' covariance, from `model_scores.covariance_factor`.
         drift: Drift of the track over its span.
     """
-    tau = np.linspace(0.0, 1.0, MOST_KNOTS)
+    tau = np.linspace(0.0, 1.0, MAX_KNOTS)
     chosen, noise_level, noise = selected.chosen, selected.noise_level, selected.noise
     place, turn = _variance(chosen, variance, tau)
     place2, turn2 = _spread(chosen, selected.solutions, noise_level, tau)
     fading = np.exp(-2 * tau / fade_time(chosen))  # of the bind state, which is a noisy pose
     last = noise_level.level * fading
-    scale = min(max(backtest.relative_error(chosen, selected.track, noise, variance), 1.0), _MOST_SCALE)
+    scale = min(max(backtest.relative_error(chosen, selected.track, noise, variance), 1.0), _MAX_SCALE)
     growth = 3 * (0.5 + tau) ** 2
     turn = scale * turn + turn2 + 3 * noise.turn**2 * last + growth * drift.turn**2
     place = scale * place + place2 + 3 * noise.place**2 * last + growth * drift.place**2

@@ -25,7 +25,7 @@ from . import band as bands
 from . import model_selection, noise
 
 FARTHEST = 2.5  # maximum distance of a hinge or a ball from the centres of both bodies, in their radii
-LEAST_RANGE = 4.0  # minimum range of the coordinate, in units of its noise
+MIN_RANGE = 4.0  # minimum range of the coordinate, in units of its noise
 SLACK = 0.05  # part of the range by which a prediction may exceed a limit
 _BOTH = math.sqrt(2.0)  # the pose at t_max is as noisy as the others
 _ROUNDS = 4  # reweighting rounds
@@ -241,9 +241,9 @@ def _moves(trial: _Trial, sigmas: tuple[float, float]) -> bool:
     """Return True if the joint moves by more than its noise."""
     if trial.kind == BALL:
         angles = rotations.angle_between(trial.closed[0], trial.closed[0][-1])
-        return float(angles.max()) > LEAST_RANGE * sigmas[1]
+        return float(angles.max()) > MIN_RANGE * sigmas[1]
     sigma = sigmas[0] if trial.kind == SLIDER else sigmas[1]
-    return float(np.ptp(trial.coordinates)) > LEAST_RANGE * sigma
+    return float(np.ptp(trial.coordinates)) > MIN_RANGE * sigma
 
 
 def _result(times: np.ndarray, trial: _Trial, cost: float, motion: _RelativeMotion, child: Link) -> Found:

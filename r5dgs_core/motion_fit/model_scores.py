@@ -19,8 +19,8 @@ from .candidates import FittedCandidate, Noise
 
 STRONG = 10.0  # minimum difference of scores for a break
 NEAR = 6.0  # maximum difference of scores within which the simplest law is chosen
-_LEAST_LEVEL = 0.05
-_MOST_LAG = 0.8
+_MIN_LEVEL = 0.05
+_MAX_LAG = 0.8
 _RHOS = np.linspace(0.0, 0.9, 19)  # tried correlations of neighbouring poses
 
 
@@ -43,7 +43,7 @@ class NoiseLevel:
         """Noise level, at least ``least``, from solutions of which one must be close to the truth."""
         count = len(solutions[0].weights)
         numbers = 6 * count
-        level = max(_LEAST_LEVEL, least, min(s.loss / max(numbers - s.parameters, 1) for s in solutions))
+        level = max(_MIN_LEVEL, least, min(s.loss / max(numbers - s.parameters, 1) for s in solutions))
         best = min(solutions, key=lambda s: s.loss / level + s.parameters * math.log(numbers))
         return NoiseLevel(count, level, _inflation([best], count, best.parameters))
 
@@ -52,7 +52,7 @@ class NoiseLevel:
         """Noise level, at least ``least``, from solutions of successive parts of a track."""
         count, parameters = sum(len(s.weights) for s in parts), sum(s.parameters for s in parts)
         level = sum(s.loss for s in parts) / max(6 * count - parameters, 1)
-        return NoiseLevel(count, max(_LEAST_LEVEL, least, level), _inflation(parts, count, parameters))
+        return NoiseLevel(count, max(_MIN_LEVEL, least, level), _inflation(parts, count, parameters))
 
     @property
     def variance(self) -> float:
@@ -97,7 +97,7 @@ def covariance_factor(solution: FittedCandidate, track: PoseTrack, noise: Noise,
     normal = squares[:, 1:, 1:] + np.diag(solution.candidate.precision**2)
     pull = squares[:, 1:, 0]
     explained = np.einsum("rp,rpq,rq->r", pull, np.linalg.pinv(normal, hermitian=True), pull)
-    losses = np.maximum(squares[:, 0, 0] - explained, _LEAST_LEVEL**2)
+    losses = np.maximum(squares[:, 0, 0] - explained, _MIN_LEVEL**2)
     logs = 12 * np.log(rest).sum((1, 2)) + np.linalg.slogdet(normal)[1] + free * np.log(losses)
     used = np.isfinite(logs)  # if only a weak prior determines a direction, exact poses hide it in rounding
     if not used.any():
@@ -116,5 +116,5 @@ def _inflation(parts: Sequence[FittedCandidate], count: int, parameters: int) ->
         energy += float((values**2).sum())
         product += float((values[1:] * values[:-1]).sum())
     lag = product / energy if energy > 0 else 0.0
-    rho = min(max(lag + (parameters / 6 + 1) / count, 0.0), _MOST_LAG)
+    rho = min(max(lag + (parameters / 6 + 1) / count, 0.0), _MAX_LAG)
     return (1 + rho) / (1 - rho)

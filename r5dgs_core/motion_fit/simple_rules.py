@@ -11,7 +11,7 @@ from . import candidates as families
 from .candidates import FittedCandidate, Noise
 
 _RULES = {"static": 2, "translation + spin": 5}  # law -> number of the last poses that it is fitted to
-_FEWEST = 8  # minimum number of poses to compare the rules
+_MIN_POSES = 8  # minimum number of poses to compare the rules
 
 
 def better(track: PoseTrack, noise: Noise, chosen: FittedCandidate) -> FittedCandidate | None:
@@ -20,7 +20,7 @@ def better(track: PoseTrack, noise: Noise, chosen: FittedCandidate) -> FittedCan
     Rules and law predict the last sixth and the last third of the poses from the ones before. Returns None for short
     tracks, or if the law predicts these poses better than both rules.
     """
-    if len(track) < _FEWEST:
+    if len(track) < _MIN_POSES:
         return None
     misses, of_law = dict.fromkeys(_RULES, 0.0), 0.0
     for held in (len(track) // 6, len(track) // 3):

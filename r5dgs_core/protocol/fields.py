@@ -18,10 +18,10 @@ from ..scene.cameras import Camera
 from ..scene.instance import Instance, Sky
 from ..search import prompts
 
-MOST_LINE = 512 << 20  # bytes per request; edited points and meshes are large
-MOST_ENTRIES = 100_000  # per list
-_MOST_PATH = 4096  # letters
-_MOST_TINT = 1e6
+MAX_LINE = 512 << 20  # bytes per request; edited points and meshes are large
+MAX_ENTRIES = 100_000  # per list
+_MAX_PATH = 4096  # letters
+_MAX_TINT = 1e6
 _PIXEL_BYTES, _GAUSSIAN_BYTES = 100, 600  # approximate memory per pixel and per Gaussian during rendering
 _ASSUMED_MEMORY = 4 << 30  # bytes, on systems that do not report their memory
 _FIELDS = {
@@ -42,20 +42,20 @@ def read_line(stream: BinaryIO) -> bytes:
     """Read the next line; returns b"" at the end of the stream.
 
     Raises:
-        ConfigError: The line is longer than `MOST_LINE`; it is skipped.
+        ConfigError: The line is longer than `MAX_LINE`; it is skipped.
     """
-    line = stream.readline(MOST_LINE + 1)
-    if len(line) <= MOST_LINE:
+    line = stream.readline(MAX_LINE + 1)
+    if len(line) <= MAX_LINE:
         return line
     while line and not line.endswith(b"\n"):
         line = stream.readline(1 << 20)
-    raise errors.ConfigError(f"worker: a request has more than {MOST_LINE >> 20} MiB")
+    raise errors.ConfigError(f"worker: a request has more than {MAX_LINE >> 20} MiB")
 
 
 def parse(line: bytes) -> dict[str, Any]:
     """Parse a request."""
     request = strict_json.parse(
-        line, "worker: a request", errors.ConfigError, "send one JSON object a line", size=MOST_LINE
+        line, "worker: a request", errors.ConfigError, "send one JSON object a line", size=MAX_LINE
     )
     if not isinstance(request, dict):
         raise errors.ConfigError("worker: a request has to be a JSON object")
@@ -79,12 +79,12 @@ def command_of(request: dict[str, Any]) -> str:
 
 
 def need(request: dict[str, Any], key: str, kind: type) -> Any:
-    """Return a field of the given type; lists may have at most `MOST_ENTRIES` entries."""
+    """Return a field of the given type; lists may have at most `MAX_ENTRIES` entries."""
     value = request.get(key)
     if not isinstance(value, kind):
         raise errors.ConfigError(f"worker: '{request.get('command')}' needs '{key}', found {_short(value)}")
-    if isinstance(value, list) and len(value) > MOST_ENTRIES:
-        raise errors.ConfigError(f"worker: '{key}' has {len(value)} entries; expected at most {MOST_ENTRIES}")
+    if isinstance(value, list) and len(value) > MAX_ENTRIES:
+        raise errors.ConfigError(f"worker: '{key}' has {len(value)} entries; expected at most {MAX_ENTRIES}")
     return value
 
 
@@ -96,16 +96,16 @@ def time_of(request: dict[str, Any]) -> float:
 def texts_of(request: dict[str, Any]) -> list[str]:
     """Return the phrases to embed."""
     texts = need(request, "texts", list)
-    if not all(isinstance(text, str) and len(text) <= prompts.MOST_LETTERS for text in texts):
+    if not all(isinstance(text, str) and len(text) <= prompts.MAX_LETTERS for text in texts):
         raise errors.ConfigError(
-            f"worker: 'embed' needs texts of at most {prompts.MOST_LETTERS} letters, found {_short(texts)}"
+            f"worker: 'embed' needs texts of at most {prompts.MAX_LETTERS} letters, found {_short(texts)}"
         )
     return texts
 
 
 def path_of(path: Any, command: str) -> str:
     """Return a path of a request."""
-    if not isinstance(path, str) or not 0 < len(path) <= _MOST_PATH or "\0" in path:
+    if not isinstance(path, str) or not 0 < len(path) <= _MAX_PATH or "\0" in path:
         raise errors.ConfigError(f"worker: '{command}' needs paths, found {_short(path)}")
     return path
 
@@ -255,8 +255,8 @@ def _tint_of(value: dict[str, Any]) -> tuple[float, float, float] | None:
         return None
     if not (isinstance(tint, list) and len(tint) == 3 and all(map(_is_number, tint))):
         raise errors.ConfigError(f"worker: a tint has to hold three factors, found {_short(tint)}")
-    if not all(0 <= factor <= _MOST_TINT for factor in tint):
-        raise errors.ConfigError(f"worker: a tint has to hold factors from 0 to {_MOST_TINT:g}, found {tint}")
+    if not all(0 <= factor <= _MAX_TINT for factor in tint):
+        raise errors.ConfigError(f"worker: a tint has to hold factors from 0 to {_MAX_TINT:g}, found {tint}")
     red, green, blue = map(float, tint)
     return red, green, blue
 

@@ -11,7 +11,7 @@ from ..scene import cameras
 from ..scene.cameras import Camera
 from .arrays import Array, array_namespace, device_of, is_float, is_whole, like, to_host
 
-_MOST_LABEL = (1 << 31) - 1  # ids are int32
+_MAX_LABEL = (1 << 31) - 1  # ids are int32
 # Bounds of inputs with a limited range, and the remedy.
 _RANGES: dict[str, tuple[float, float, str]] = {
     "scales": (0.0, math.inf, "pass exp(log_scales)"),
@@ -137,9 +137,9 @@ def _check_labels(labels: Any, means: Array) -> None:
     if labels.dtype.itemsize <= 4 and str(labels.dtype)[-6:] != "uint32" or not len(labels):
         return
     numbers = to_host(labels)
-    if numbers.max() > _MOST_LABEL:
+    if numbers.max() > _MAX_LABEL:
         at = int(numbers.argmax())
-        raise ValueError(f"labels: expected at most {_MOST_LABEL}, found {numbers[at]} at index {at}")
+        raise ValueError(f"labels: expected at most {_MAX_LABEL}, found {numbers[at]} at index {at}")
 
 
 def _check_device(name: str, values: Array, means: Array) -> None:

@@ -6,16 +6,16 @@ import os
 
 from ..errors import ConfigError
 
-MOST_THREADS = 1024
+MAX_THREADS = 1024
 
 
 def check_threads(value: str | None) -> None:
     """Raise `ConfigError` if a value of NUMBA_NUM_THREADS is not a number of threads; None and "" mean unset."""
     if not value:
         return
-    if not (value.isascii() and value.isdecimal() and len(value) < 9 and 1 <= int(value) <= MOST_THREADS):
+    if not (value.isascii() and value.isdecimal() and len(value) < 9 and 1 <= int(value) <= MAX_THREADS):
         raise ConfigError(
-            f"NUMBA_NUM_THREADS={value[:40]!r}: expected a whole number from 1 to {MOST_THREADS}; correct or unset it"
+            f"NUMBA_NUM_THREADS={value[:40]!r}: expected a whole number from 1 to {MAX_THREADS}; correct or unset it"
         )
 
 

@@ -19,7 +19,7 @@ from ..scene.scene import Scene
 from . import scene_renderer
 
 THUMBNAIL_SIDE = 160  # longest side of the small pictures, pixels
-MOST_CAMERAS = 16  # maximum number of cameras to try
+MAX_CAMERAS = 16  # maximum number of cameras to try
 NOTICED = 5e-4  # minimum share of the picture that counts as visible
 
 
@@ -71,7 +71,7 @@ def candidates(scene: Scene, camera: str | None = None, t: float | None = None) 
     if camera is not None:
         some = [named(scene, camera)]
     elif scene.cameras:
-        some = spread(scene.cameras, MOST_CAMERAS)
+        some = spread(scene.cameras, MAX_CAMERAS)
     else:
         some = [overview(scene)]
     first = float(scene.tracks.times[0])

@@ -28,7 +28,7 @@ from ..errors import SceneFileError
 ALLOWANCE = 32 << 20
 RATIO = 64
 _BLOCK = 1 << 20  # maximum size of a single read and of the zip directory, bytes
-_MOST_DIMENSIONS = 8
+_MAX_DIMENSIONS = 8
 _MAGIC = b"\x93NUMPY\x01\x00"
 _HEADER = re.compile(
     rb"\{'descr': '([<>|=]?[A-Za-z][0-9]*)', 'fortran_order': (True|False), 'shape': \(([0-9, ]*)\), \} *\n"
@@ -180,7 +180,7 @@ class Archive:
             )
         shape = tuple(int(n) for n in match[3].decode().split(",") if n.strip())
         size, found = math.prod(shape) * np.dtype(dtype).itemsize, self.size(member) - len(start) - len(text)
-        if size != found or len(shape) > _MOST_DIMENSIONS:
+        if size != found or len(shape) > _MAX_DIMENSIONS:
             raise ValueError(f"expected {size} bytes for shape {shape}, found {found}")
         return Header(dtype, shape)
 

@@ -19,8 +19,8 @@ WORLD_TO_BLENDER = {
     "opengl": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
 }
 FARTHEST = 1e15  # maximum coordinate; its square is within the range of float32
-MOST_PIXELS = 1 << 16  # maximum image side
-_MOST_FOCAL = 1e12  # pixels; the smallest focal length is its reciprocal
+MAX_SIDE = 1 << 16  # maximum image side
+_MAX_FOCAL = 1e12  # pixels; the smallest focal length is its reciprocal
 _RIGID_TOLERANCE = 1e-3  # maximum entry of R R^T - 1
 _ROUNDING = 1e-9  # tolerance of matrix entries that must be 0 or 1
 EXTENT = 3.0  # radius of a Gaussian in images, standard deviations
@@ -63,9 +63,9 @@ def check(camera: Camera) -> None:
     place = f"camera {camera.name!r}" if camera.name else "camera"
     if not all(isinstance(side, int | np.integer) for side in (camera.width, camera.height)):
         raise TypeError(f"{place}: expected whole numbers of pixels, got {camera.width!r} x {camera.height!r}")
-    if not (1 <= camera.width <= MOST_PIXELS and 1 <= camera.height <= MOST_PIXELS):
+    if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
         raise ValueError(
-            f"{place}: expected a width and height of 1 to {MOST_PIXELS}, got {camera.width} x {camera.height}"
+            f"{place}: expected a width and height of 1 to {MAX_SIDE}, got {camera.width} x {camera.height}"
         )
     for name, shape in (("intrinsics", (3, 3)), ("T_cam_world", (4, 4))):
         matrix = getattr(camera, name)
@@ -92,9 +92,9 @@ def check(camera: Camera) -> None:
     if abs(camera.intrinsics[1, 0]) > _ROUNDING:
         raise ValueError(f"{place}: intrinsics: expected 0 at index (1, 0), found {camera.intrinsics[1, 0]}")
     for at in ((0, 0), (1, 1)):
-        if not 1 / _MOST_FOCAL <= camera.intrinsics[at] <= _MOST_FOCAL:
+        if not 1 / _MAX_FOCAL <= camera.intrinsics[at] <= _MAX_FOCAL:
             raise ValueError(
-                f"{place}: intrinsics: expected focal lengths above 0, up to {_MOST_FOCAL:g}, found "
+                f"{place}: intrinsics: expected focal lengths above 0, up to {_MAX_FOCAL:g}, found "
                 f"{camera.intrinsics[at]} at index {at}"
             )
 

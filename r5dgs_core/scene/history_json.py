@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors
-from ..motion.history import EVENTS, MOST_KNOTS, Band, Event, History, PoseErrors, Segment
+from ..motion.history import EVENTS, MAX_KNOTS, Band, Event, History, PoseErrors, Segment
 from ..motion.models import FIELDS, KINDS, SCALARS
 from .json_row import Row
 
@@ -78,8 +78,8 @@ def _further(rates: Row) -> dict[str, Any]:
 def _band(row: Row) -> Band:
     times = row.get("times", list)
     shape = (len(times),)
-    if not 1 <= len(times) <= MOST_KNOTS:
-        raise errors.SceneFileError(f"{row.place}: times: expected 1 to {MOST_KNOTS} numbers, found {len(times)}")
+    if not 1 <= len(times) <= MAX_KNOTS:
+        raise errors.SceneFileError(f"{row.place}: times: expected 1 to {MAX_KNOTS} numbers, found {len(times)}")
     found = {name: row.numbers(name, shape) for name in ("times", "half_width", "half_angle")}
     if (np.diff(found["times"]) <= 0).any():
         raise errors.SceneFileError(f"{row.place}: times: expected increasing numbers, found {times!r:.60}")

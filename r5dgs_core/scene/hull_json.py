@@ -13,7 +13,7 @@ from .hull import Hull
 from .json_row import Row
 from .scene import Scene
 
-MOST_VERTICES = 64
+MAX_VERTICES = 64
 
 
 def dump(scene: Scene) -> list[dict[str, Any]]:
@@ -32,8 +32,8 @@ def read(row: Row) -> Hull:
     """Read an entry of ``hulls``. Raises `SceneFileError` naming place and key."""
     vertices = row.get("vertices", list)
     if vertices is not findings.UNREAD:
-        if not 4 <= len(vertices) <= MOST_VERTICES:
-            wanted = f"4 to {MOST_VERTICES} points"
+        if not 4 <= len(vertices) <= MAX_VERTICES:
+            wanted = f"4 to {MAX_VERTICES} points"
             raise errors.SceneFileError(f"{row.place}: vertices: expected {wanted}, found {len(vertices)}")
         vertices = row.numbers("vertices", (len(vertices), 3))
     return Hull(row.get("object_id", int), row.get("motion_id", int), vertices)
@@ -51,8 +51,8 @@ def check(scene: Scene, place: str, guard: findings.Guard) -> None:
             if hull is findings.UNREAD:
                 continue
             where, shape = f"hull {number}", np.shape(hull.vertices)
-            if len(shape) != 2 or shape[1] != 3 or not 4 <= shape[0] <= MOST_VERTICES:
-                fail(place, where, f"vertices of shape (4 to {MOST_VERTICES}, 3)", shape)
+            if len(shape) != 2 or shape[1] != 3 or not 4 <= shape[0] <= MAX_VERTICES:
+                fail(place, where, f"vertices of shape (4 to {MAX_VERTICES}, 3)", shape)
             if not (np.abs(hull.vertices) <= cameras.FARTHEST).all():
                 fail(place, where, f"vertices up to {cameras.FARTHEST:g}", hull.vertices)
             if hull.object_id not in {item.id for item in scene.objects if item.id > 0}:

@@ -10,20 +10,20 @@ from . import cameras
 from .array_shapes import fail
 
 SPIN = 1e6  # maximum rad per unit of time, and per its square
-MOST_TIME = 1e12  # maximum time
-LEAST_LENGTH = 1e-30  # minimum radius
-LEAST_STEP = 1e-12  # minimum time
+MAX_TIME = 1e12  # maximum time
+MIN_LENGTH = 1e-30  # minimum radius
+MIN_STEP = 1e-12  # minimum time
 
 
 def _limit(unit: models.Unit) -> float:
     """Largest number of a rate."""
     if unit.per_time < 0:
-        return MOST_TIME
+        return MAX_TIME
     return cameras.FARTHEST if unit.is_length else SPIN
 
 
 _LIMITS = {name: _limit(unit) for name, unit in {**models.VECTORS, **models.SCALARS}.items()}
-_LIMITS |= {"fade_time": MOST_TIME, "radius": cameras.FARTHEST}
+_LIMITS |= {"fade_time": MAX_TIME, "radius": cameras.FARTHEST}
 
 
 def check(model: models.MotionModel, place: str, guard: findings.Guard) -> None:
@@ -34,5 +34,5 @@ def check(model: models.MotionModel, place: str, guard: findings.Guard) -> None:
             if not value <= limit:
                 fail(place, name, f"numbers up to {limit:g}", f"{value:g}")
     with guard():
-        if model.radius < LEAST_LENGTH or model.fade_time < LEAST_STEP:
-            fail(place, "radius and fade_time", f"{LEAST_LENGTH:g} and {LEAST_STEP:g} or more", "less")
+        if model.radius < MIN_LENGTH or model.fade_time < MIN_STEP:
+            fail(place, "radius and fade_time", f"{MIN_LENGTH:g} and {MIN_STEP:g} or more", "less")

@@ -64,6 +64,6 @@ def _fault(joint: Joint) -> tuple[str, str, Any] | None:
         return "axis", "a unit vector", joint.axis
     elif joint.limits is None or not -farthest <= joint.limits[0] <= joint.limits[1] <= farthest:
         return "limits", f"two numbers up to {farthest:g}, in order", joint.limits
-    if joint.stop_time is not None and not 0 <= joint.stop_time <= model_checks.MOST_TIME:
-        return "stop_time", f"a number from 0 to {model_checks.MOST_TIME:g}, or null", joint.stop_time
+    if joint.stop_time is not None and not 0 <= joint.stop_time <= model_checks.MAX_TIME:
+        return "stop_time", f"a number from 0 to {model_checks.MAX_TIME:g}, or null", joint.stop_time
     return None

@@ -268,11 +268,11 @@ def _read_json(archive: Archive, guard: findings.Guard = findings.STRICT) -> sce
 
 
 def _parse_json(archive: Archive, where: str) -> Any:
-    if archive.size(JSON_MEMBER) > strict_json.MOST_BYTES:
+    if archive.size(JSON_MEMBER) > strict_json.MAX_BYTES:
         raise errors.SceneFileError(
-            f"{where}: expected at most {strict_json.MOST_BYTES >> 20} MiB, found {archive.size(JSON_MEMBER) >> 20} MiB"
+            f"{where}: expected at most {strict_json.MAX_BYTES >> 20} MiB, found {archive.size(JSON_MEMBER) >> 20} MiB"
         )
-    memory = min(strict_json.MOST_MEMORY, most_content(archive.compressed_size(JSON_MEMBER)))
+    memory = min(strict_json.MAX_MEMORY, most_content(archive.compressed_size(JSON_MEMBER)))
     remedy = "bake or copy the file again"
     return strict_json.parse(archive.read(JSON_MEMBER), where, errors.SceneFileError, remedy, memory=memory)
 

@@ -24,16 +24,16 @@ _UNIT_TOLERANCE = 1e-3
 
 # Maximum numbers of a scene: their squares are within the range of float32, and no motion overflows within its times.
 _LARGE = 1e9  # colours, logits, embeddings
-_LOG_SCALE, _LEAST_LOG_SCALE = 40.0, -1e4  # thinner Gaussians than float32 resolves are drawn at the minimum width
+_MAX_LOG_SCALE, _MIN_LOG_SCALE = 40.0, -1e4  # thinner Gaussians than float32 resolves are drawn at the minimum width
 _RATES = np.repeat([cameras.FARTHEST, model_checks.SPIN, cameras.FARTHEST, model_checks.SPIN], 3)
 _POSE = np.repeat([_LARGE, cameras.FARTHEST], [4, 3])
 _LIMITS: dict[str, float | np.ndarray] = {
     "means": cameras.FARTHEST,
     "quats": _LARGE,
-    "log_scales": _LOG_SCALE,
+    "log_scales": _MAX_LOG_SCALE,
     "opacity_logits": _LARGE,
     "sh": _LARGE,
-    "track_times": model_checks.MOST_TIME,
+    "track_times": model_checks.MAX_TIME,
     "track_poses": _POSE,
     "background_sh": _LARGE,
     "identities": _LARGE,
@@ -41,7 +41,7 @@ _LIMITS: dict[str, float | np.ndarray] = {
     "classifier_bias": _LARGE,
     "residual_offsets": cameras.FARTHEST,
     "residual_quats": _LARGE,
-    "residual_log_scales": _LOG_SCALE,
+    "residual_log_scales": _MAX_LOG_SCALE,
     "dynamics": _RATES,
     "canonical_means": cameras.FARTHEST,
     "shading": _LARGE,
@@ -49,7 +49,7 @@ _LIMITS: dict[str, float | np.ndarray] = {
     "light_direction": _LARGE,
     "origin": cameras.FARTHEST,
 }
-_MOST_ID = np.iinfo(np.int32).max
+_MAX_ID = np.iinfo(np.int32).max
 _CONVERTED = ("background_sh", "identities", *EMBEDDINGS)  # any float dtype in memory; converted on writing
 _DTYPES = {name: dtype for name, dtype in DTYPES.items() if name not in _CONVERTED} | {"origin": np.float64}
 
@@ -160,7 +160,7 @@ def check_embeddings(
 
 def check_range(name: str, values: np.ndarray, place: str) -> None:
     """Raise `SceneFileError` if numbers of a field of `Scene` are not finite or out of range."""
-    low = _LEAST_LOG_SCALE if "log_scales" in name else None
+    low = _MIN_LOG_SCALE if "log_scales" in name else None
     _check_range(place, name, values, _LIMITS[name], low)
 
 
@@ -220,18 +220,16 @@ def _check_units(scene: Scene, place: str, guard: findings.Guard) -> None:
 def _check_times(scene: Scene, place: str, guard: findings.Guard) -> None:
     times = scene.tracks.times
     with guard():
-        if len(times) == 0 or not (np.diff(times) >= model_checks.LEAST_STEP).all():
-            _fail(place, "track_times", f"at least one time, increasing by {model_checks.LEAST_STEP:g} or more", times)
+        if len(times) == 0 or not (np.diff(times) >= model_checks.MIN_STEP).all():
+            _fail(place, "track_times", f"at least one time, increasing by {model_checks.MIN_STEP:g} or more", times)
     with guard():
         if not np.isfinite(scene.t_max) or times[-1] != scene.t_max:
             _fail(place, "t_max", f"the last of track_times, {float(times[-1])!r}", repr(scene.t_max))
     with guard():
-        if not 1 / model_checks.MOST_TIME <= scene.frames_per_unit <= model_checks.MOST_TIME:
-            _fail(
-                place, "frames_per_unit", f"a positive number up to {model_checks.MOST_TIME:g}", scene.frames_per_unit
-            )
+        if not 1 / model_checks.MAX_TIME <= scene.frames_per_unit <= model_checks.MAX_TIME:
+            _fail(place, "frames_per_unit", f"a positive number up to {model_checks.MAX_TIME:g}", scene.frames_per_unit)
     with guard():
-        if not model_checks.LEAST_LENGTH <= scene.near_plane <= cameras.FARTHEST:
+        if not model_checks.MIN_LENGTH <= scene.near_plane <= cameras.FARTHEST:
             _fail(place, "near_plane", f"a positive depth up to {cameras.FARTHEST:g}", scene.near_plane)
     with guard(), np.errstate(invalid="ignore"):  # infinite means are reported separately
         last = scene.tracks.poses[:, -1]
@@ -245,8 +243,8 @@ def _check_times(scene: Scene, place: str, guard: findings.Guard) -> None:
 def _check_objects(scene: Scene, place: str, guard: findings.Guard) -> None:
     with guard():
         ids = [item.id for item in scene.objects]
-        if 0 not in ids or ids != sorted(set(ids)) or ids[0] < -1 or ids[-1] > _MOST_ID:
-            _fail(place, "objects", f"increasing ids from -1 or 0 to {_MOST_ID}, with 0, the background", ids[:5])
+        if 0 not in ids or ids != sorted(set(ids)) or ids[0] < -1 or ids[-1] > _MAX_ID:
+            _fail(place, "objects", f"increasing ids from -1 or 0 to {_MAX_ID}, with 0, the background", ids[:5])
     with guard():
         names = [item.name for item in scene.objects]
         if len(set(names)) != len(names):

@@ -21,7 +21,7 @@ UNCALIBRATED = 0.25  # threshold for a file without encoder metadata
 PASS = 0.5  # score at the threshold
 _BEST = 0.95  # score far above the threshold, below that of a name match
 _SPREAD = 0.25  # spread of cosines for a file without encoder metadata
-_MOST_EXPONENT = 700.0  # largest exponent with a finite exponential
+_MAX_EXPONENT = 700.0  # largest exponent with a finite exponential
 _BESIDE = 0.4  # maximum score of an object far below the best match
 
 
@@ -61,7 +61,7 @@ def ask(embeddings: StoredEmbeddings, query: np.ndarray) -> list[EmbeddingMatch]
 
 def relevancy(cosine: float, canonical: np.ndarray, scale: float) -> float:
     """LERF relevancy from the cosines of an object with a phrase and with the canonical phrases. canonical: [C]"""
-    return float(1.0 / (1.0 + np.exp(min(-scale * (cosine - float(np.max(canonical))), _MOST_EXPONENT))))
+    return float(1.0 / (1.0 + np.exp(min(-scale * (cosine - float(np.max(canonical))), _MAX_EXPONENT))))
 
 
 def _answer(embeddings: StoredEmbeddings, row: int, query: np.ndarray) -> EmbeddingMatch | None:
@@ -81,7 +81,7 @@ def _answer(embeddings: StoredEmbeddings, row: int, query: np.ndarray) -> Embedd
 
 def _score(above: float, spread: float) -> float:
     """Score of a cosine relative to the threshold: 0 far below it, `PASS` at it, `_BEST` far above."""
-    share = math.exp(-min(abs(above) / max(spread, 1e-9), _MOST_EXPONENT))
+    share = math.exp(-min(abs(above) / max(spread, 1e-9), _MAX_EXPONENT))
     return PASS + (_BEST - PASS) * (1 - share) if above >= 0 else PASS * share
 
 

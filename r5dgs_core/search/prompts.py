@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from .. import errors
 from . import english
 
-MOST_LETTERS = 1000  # per prompt, to bound the cost, which grows with its length and the number of names
+MAX_LETTERS = 1000  # per prompt, to bound the cost, which grows with its length and the number of names
 Phrase = tuple[str, list[str]]  # as written, and its words (`english.phrases`)
 
 _THINGS = r"(?:\s+(?:of\s+)?(?:the|these|those|them|it|my))?(?:\s+(?:objects?|things?|items?))?"
@@ -51,11 +51,11 @@ def parse(text: str, names: Iterable[str] = ()) -> Prompt:
         names: Names of objects; a prompt that equals one selects only that, even "Not" or "all".
 
     Raises:
-        UsageError: Nothing follows an excluding word, or the prompt is longer than `MOST_LETTERS`.
+        UsageError: Nothing follows an excluding word, or the prompt is longer than `MAX_LETTERS`.
     """
-    if len(text) > MOST_LETTERS:
+    if len(text) > MAX_LETTERS:
         raise errors.UsageError(
-            f"a prompt of {len(text)} letters: expected at most {MOST_LETTERS}; name fewer objects at a time"
+            f"a prompt of {len(text)} letters: expected at most {MAX_LETTERS}; name fewer objects at a time"
         )
     known = {_spelled(name) for name in names}
     found = None if _spelled(text) in known else _first(text)

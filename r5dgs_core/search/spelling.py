@@ -6,7 +6,7 @@ import difflib
 
 _TYPO_RATIO = 0.75
 _LETTERS_PER_SLIP = 3  # letters of the shorter word per allowed typo
-_MOST_SLIPS = 3
+_MAX_SLIPS = 3
 
 
 def similarity(word: str, present: str) -> float:
@@ -32,7 +32,7 @@ def similarity(word: str, present: str) -> float:
 def nearness(word: str, other: str) -> float:
     """Similarity of two words: 1 if equal, less for each typo, 0 for more typos than their length allows."""
     shorter, longer = sorted((len(word), len(other)))
-    excused = min(shorter // _LETTERS_PER_SLIP, _MOST_SLIPS)
+    excused = min(shorter // _LETTERS_PER_SLIP, _MAX_SLIPS)
     if longer - shorter > excused:
         return 0.0
     slips = edit_distance(word, other, excused)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..motion import rotations
-from ..scene.hull_json import MOST_VERTICES
+from ..scene.hull_json import MAX_VERTICES
 
 LEVEL = 0.15  # opacity at which the surface of a Gaussian is placed; between 0.1 and 0.25 hulls of objects fit best
 _DIRECTIONS = 1024  # directions in which the hull is tight
@@ -18,7 +18,7 @@ def vertices(
     quats: np.ndarray,
     scales: np.ndarray,
     opacities: np.ndarray,
-    most: int = MOST_VERTICES,
+    most: int = MAX_VERTICES,
 ) -> np.ndarray:
     """Return points whose convex hull encloses the visible part of an object.
 

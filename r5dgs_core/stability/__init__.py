@@ -31,7 +31,7 @@ from . import (
     rotations,
     steps,
 )
-from .cases import MOST_SECONDS, Case, logged
+from .cases import MAX_SECONDS, Case, logged
 
 CASES: tuple[Case, ...] = (
     *orders.CASES,
@@ -46,7 +46,7 @@ CASES: tuple[Case, ...] = (
     *loading.CASES,
 )
 _CAPTION = (
-    f"Less is better. A case over {MOST_SECONDS:g} s of processor time fails. "
+    f"Less is better. A case over {MAX_SECONDS:g} s of processor time fails. "
     "--json FILE adds the quantity, the function, the result of TRACE's integrator and "
     "the origin of each tolerance."
 )
@@ -65,7 +65,7 @@ class CaseResult:
         tolerance: Maximum value that passes.
         source: Origin of the tolerance.
         trace_rk2: The same value for TRACE's integrator, or None if it does not apply.
-        passed: True if the value is within the tolerance and the case took at most `MOST_SECONDS`.
+        passed: True if the value is within the tolerance and the case took at most `MAX_SECONDS`.
         seconds: Processor time of our code.
         message: Error of a case that raised one, else "".
     """
@@ -117,9 +117,9 @@ def _measured(case: Case) -> CaseResult:
                 other = float(case.trace_rk2())
             except Exception as error:
                 other, message = math.nan, message or f"trace_rk2: {type(error).__name__}: {error}"
-    if seconds > MOST_SECONDS:
-        message = message or f"took {seconds:.1f} s of processor time, expected at most {MOST_SECONDS:g}"
-    passed = bool(value <= case.tolerance) and seconds <= MOST_SECONDS  # NaN does not pass
+    if seconds > MAX_SECONDS:
+        message = message or f"took {seconds:.1f} s of processor time, expected at most {MAX_SECONDS:g}"
+    passed = bool(value <= case.tolerance) and seconds <= MAX_SECONDS  # NaN does not pass
     return CaseResult(
         case.topic,
         case.name,

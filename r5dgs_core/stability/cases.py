@@ -18,7 +18,7 @@ import numpy as np
 
 from ..motion import models, point_dynamics, rotations
 
-MOST_SECONDS = 10.0  # of processor time, for a case to pass
+MAX_SECONDS = 10.0  # of processor time, for a case to pass
 RADIUS = 0.3
 POINT_ERROR = "error of a point / radius"
 ROUNDING = "rounding of float64"

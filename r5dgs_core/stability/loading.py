@@ -1,6 +1,6 @@
 """Stability cases on code around motion: scene files, keys, cameras and the rasterizer.
 
-Each case must finish within `cases.MOST_SECONDS` of processor time.
+Each case must finish within `cases.MAX_SECONDS` of processor time.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def _keys(model: models.MotionModel, frame: float) -> float:
     values = [curves.location.values, curves.rotation.values]
     if not all(np.isfinite(part).all() for part in values):
         return float("inf")
-    return sampled[0] / (40 * min(max(10 / frame, key_reduction.FEWEST_INTERVALS), key_reduction.MOST_INTERVALS))
+    return sampled[0] / (40 * min(max(10 / frame, key_reduction.MIN_INTERVALS), key_reduction.MAX_INTERVALS))
 
 
 def _looking(distance: float = 4.0) -> Camera:

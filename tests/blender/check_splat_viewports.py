@@ -17,7 +17,7 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 sys.path.insert(0, str(Path(__file__).parent))
-from check_splats import LEAST_DB, psnr, redraw, screenshot, shown_region  # noqa: E402
+from check_splats import MIN_DB, psnr, redraw, screenshot, shown_region  # noqa: E402
 from window import area_of, inside, main_window, region_of, run, service  # noqa: E402
 
 out = Path()
@@ -33,7 +33,7 @@ def compare(what: str, found: np.ndarray, wanted: np.ndarray) -> None:
     """Print the difference of two pictures, and fail if it is too large."""
     value = psnr(found, wanted)
     print(f"{what}: {value:.1f} dB", flush=True)
-    assert value > LEAST_DB
+    assert value > MIN_DB
 
 
 def checks(path: str, folder: str = "", *chosen: str):
@@ -80,7 +80,7 @@ def check_meshes(before: np.ndarray):
     cube = bpy.context.object
     cube.select_set(False)
     yield 0.5
-    assert psnr(seen("covered"), before) < LEAST_DB
+    assert psnr(seen("covered"), before) < MIN_DB
     space.show_object_viewport_mesh = False
     yield 0.5
     compare("mesh hidden in this viewport only", seen("uncovered"), before)
@@ -196,7 +196,7 @@ def check_local_view(before: np.ndarray):
         cloud.hide_set(cloud != chosen)
     yield 0.5
     compare("local view", found, seen("others_hidden"))
-    assert psnr(found, before) < LEAST_DB
+    assert psnr(found, before) < MIN_DB
     for cloud in clouds:
         cloud.hide_set(False)
     yield 0.5

@@ -19,7 +19,7 @@ from mathutils import Euler, Matrix, Vector
 sys.path.insert(0, str(Path(__file__).parent))
 from window import area_of, inside, main_window, region_of, run, service  # noqa: E402
 
-LEAST_DB = 40.0
+MIN_DB = 40.0
 VIEWS = (Euler((1.1, 0, 0.6)), Euler((0.8, 0, -0.9)), Euler((1.3, 0, 2.4)))
 THICK = 0.1  # of an object's radius: Gaussians are not thinner, so that closer surfaces have no order
 TIMES = (0.0, 0.3, 0.6, 0.95, 1.15)  # in observed spans
@@ -222,7 +222,7 @@ def checks(path: str, folder: str = ""):
     scene.r5dgs_render.sky = True
     yield from check_meshes(out, size)
     print("message:", service("splats.viewport_splats").message(bpy.context), flush=True)
-    assert worst > LEAST_DB
+    assert worst > MIN_DB
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ def few_views():
 def short_playback():
     """Limit the measurement of playback speed to a dozen frames."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(playback_speed, "LEAST_FRAMES", 12)
+        patch.setattr(playback_speed, "MIN_FRAMES", 12)
         yield
 
 

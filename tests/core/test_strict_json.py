@@ -65,7 +65,7 @@ def test_a_duplicate_key_is_found_in_linear_time():
 
 
 def test_nesting_up_to_the_limit_is_accepted():
-    parse("[" * strict_json.MOST_DEPTH + "]" * strict_json.MOST_DEPTH)
+    parse("[" * strict_json.MAX_DEPTH + "]" * strict_json.MAX_DEPTH)
 
 
 @pytest.mark.parametrize("unit", [b"[],", b"{},", b'{"a":0},', b"0,", b"[[]],", b'"ab",'])
@@ -93,7 +93,7 @@ def test_the_estimate_of_memory_is_an_upper_bound(unit):
 
 
 def test_a_file_is_not_read_past_the_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(strict_json, "MOST_BYTES", 100)
+    monkeypatch.setattr(strict_json, "MAX_BYTES", 100)
     path = tmp_path / "large.json"
     path.write_bytes(b" " * 1000 + b"1")
     with pytest.raises(errors.ConfigError, match="large.json: expected JSON of at most"):

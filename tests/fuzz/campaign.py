@@ -25,8 +25,8 @@ from random import Random
 
 from r5dgs_core.errors import R5dgsError
 
-MOST_SECONDS = 10  # of processor time, for one input
-MOST_MEMORY = 1 << 30  # bytes beyond those at the beginning
+MAX_SECONDS = 10  # of processor time, for one input
+MAX_MEMORY = 1 << 30  # bytes beyond those at the beginning
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 Files = dict[str, bytes]
@@ -64,7 +64,7 @@ class Tally:
     @property
     def good(self) -> bool:
         """True if no input failed."""
-        return not self.uncaught and not self.hangs and self.peak <= MOST_MEMORY
+        return not self.uncaught and not self.hangs and self.peak <= MAX_MEMORY
 
     def row(self) -> str:
         """A line of the table below `HEAD`."""
@@ -110,7 +110,7 @@ def run(reader: Reader, indices: range, seed: int, save: Path | None = None) -> 
             tally.inputs += 1
             peak = max(_memory(peak=True) - floor, 0)
             tally.peak = max(tally.peak, peak)
-            if fault is None and peak > MOST_MEMORY:
+            if fault is None and peak > MAX_MEMORY:
                 fault = f"memory: {peak >> 20} MiB"
             if fault is not None:
                 tally.faults[_summary(fault)] += 1
@@ -142,7 +142,7 @@ def _read(reader: Reader, target: Path, tally: Tally) -> str | None:
 
 @contextlib.contextmanager
 def _limited() -> Iterator[None]:
-    """Raise `Hang` in the block after `MOST_SECONDS` of processor time, as soon as Python runs again."""
+    """Raise `Hang` in the block after `MAX_SECONDS` of processor time, as soon as Python runs again."""
 
     def stop(*_: object) -> None:
         raise Hang
@@ -151,7 +151,7 @@ def _limited() -> Iterator[None]:
         yield
         return
     before = signal.signal(signal.SIGPROF, stop)
-    signal.setitimer(signal.ITIMER_PROF, MOST_SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, MAX_SECONDS)
     try:
         yield
     finally:

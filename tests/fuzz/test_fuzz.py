@@ -44,7 +44,7 @@ def test_a_refusal_is_no_defect(tmp_path):
 
 
 def test_a_hang_is_ended_and_counted_whatever_the_reader_catches(tmp_path, monkeypatch):
-    monkeypatch.setattr(campaign, "MOST_SECONDS", 0.1)
+    monkeypatch.setattr(campaign, "MAX_SECONDS", 0.1)
 
     def hang(folder):
         while True:
@@ -58,7 +58,7 @@ def test_a_hang_is_ended_and_counted_whatever_the_reader_catches(tmp_path, monke
 
 
 def test_memory_is_measured(tmp_path, monkeypatch):
-    monkeypatch.setattr(campaign, "MOST_MEMORY", 20 << 20)
+    monkeypatch.setattr(campaign, "MAX_MEMORY", 20 << 20)
     # New pages: the heap of a long test session may have room for the rest.
     tally = campaign_of(lambda folder: mmap.mmap(-1, 100 << 20).write(bytes(100 << 20)), tmp_path)
     assert not tally.good and tally.peak > 40 << 20

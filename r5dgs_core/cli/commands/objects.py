@@ -77,7 +77,7 @@ def run_objects(
     if dataset is None:
         views: list[Any] = object_table.own_views(scene)
     else:
-        views = sampling.spread((*dataset.val, *dataset.test) or dataset.train, object_table.MOST_VIEWS)
+        views = sampling.spread((*dataset.val, *dataset.test) or dataset.train, object_table.MAX_VIEWS)
     rows = object_table.measure(scene, views, mode)
     result = object_table.to_json(scene, rows, len(views))
     if as_json:

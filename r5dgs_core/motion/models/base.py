@@ -31,7 +31,7 @@ from .motion_model import FIELDS, RATES, VECTORS, MotionModel
 
 Curve = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Quaternions [..., 4], displacements [..., 3], angular velocities in the world frame [..., 3], velocities [..., 3]."""
-_MOST_EXPONENT = 600.0  # maximum exponent of a decay backwards in time
+_MAX_EXPONENT = 600.0  # maximum exponent of a decay backwards in time
 _AT_REST = [np.zeros(unit.size) for unit in FIELDS.values()]
 
 
@@ -283,7 +283,7 @@ def _decaying(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """exp(-c tau) cos(W tau), exp(-c tau) sin(W tau) / W, and W^2 + c^2."""
     phase2 = (frequency * span) ** 2
-    decay = np.exp(np.minimum(-c * span, _MOST_EXPONENT))
+    decay = np.exp(np.minimum(-c * span, _MAX_EXPONENT))
     return (
         decay * np.cos(frequency * span),
         decay * span * rotations.sine_ratio(phase2),

@@ -17,7 +17,7 @@ from ..pose_track import PoseTrack, Window
 from . import first_guesses
 from .base import Block, Curve, MotionKind, MotionModel, Rates
 
-_LEAST = 1e-300
+_TINY = 1e-300
 _NEAR = 9  # poses about a bounce that give its first guess
 _PLACES = (0.2, 0.5, 0.8)  # tried times of a bounce between two poses
 _RESTING = 1000.0  # flight number that stands for a body that stays on the floor
@@ -42,7 +42,7 @@ class Bounce(MotionKind):
         down = -(hit * up).sum(-1)[..., None]
         speed = rates.restitution * np.maximum(down, 0.0)
         flies = (since < 0) | (down < 0) | (g == 0)  # up to the bounce; or a body that moves away from the floor
-        high, rise = _heights(np.where(flies, 0.0, since), speed, np.maximum(g, _LEAST), rates.restitution)
+        high, rise = _heights(np.where(flies, 0.0, since), speed, np.maximum(g, _TINY), rates.restitution)
         free = rates.v * span + rates.a * (0.5 * span**2)
         at = rates.v * rates.bounce_time + rates.a * (0.5 * rates.bounce_time**2)
         along = hit + down * up
@@ -55,11 +55,11 @@ class Bounce(MotionKind):
         g, up = _gravity(parts["a"])
         rho = _restitution(parts)
         speed, along = _split(parts["v"], up)
-        number, start = _flight(-parts["bounce"], speed, np.maximum(g, _LEAST), rho)
+        number, start = _flight(-parts["bounce"], speed, np.maximum(g, _TINY), rho)
         at = parts["bounce"] + start
         rising = np.where(number >= _RESTING, 0.0, speed * rho ** np.minimum(number, _RESTING))
         v = along + (rising + g * at) * up  # at t_max, -at after the bounce
-        ahead = np.maximum(at + 2 * rising / np.maximum(g, _LEAST), 0.0)
+        ahead = np.maximum(at + 2 * rising / np.maximum(g, _TINY), 0.0)
         resting = number >= _RESTING
         return Rates(
             v=np.where(resting, along, v),
@@ -77,7 +77,7 @@ class Bounce(MotionKind):
         rho = _restitution(parts)
 
         def place(at: np.ndarray) -> np.ndarray:
-            high, _ = _heights(at - parts["bounce"], speed, np.maximum(g, _LEAST), rho)
+            high, _ = _heights(at - parts["bounce"], speed, np.maximum(g, _TINY), rho)
             return along * at + high * up
 
         quats = rotations.multiply(
@@ -120,7 +120,7 @@ class Bounce(MotionKind):
     def events(self, parts: Mapping[str, np.ndarray], window: Window) -> list[tuple[str, np.ndarray]]:
         g, up = _gravity(parts["a"])
         speed, _ = _split(parts["v"], up)
-        rho, gravity = _restitution(parts), np.maximum(g, _LEAST)
+        rho, gravity = _restitution(parts), np.maximum(g, _TINY)
         first = float(_flight(window.first - parts["bounce"], speed, gravity, rho)[0].reshape(-1)[0])
         last = float(_flight(-parts["bounce"], speed, gravity, rho)[0].reshape(-1)[0])
         numbers = range(int(first) + 1, int(min(last, first + 50)) + 1)
@@ -154,7 +154,7 @@ class Bounce(MotionKind):
 def _gravity(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Strength of an acceleration [..., 1] and the direction against it [..., 3]."""
     g = np.sqrt((a * a).sum(-1))[..., None]
-    return g, -a / np.maximum(g, _LEAST)
+    return g, -a / np.maximum(g, _TINY)
 
 
 def _restitution(parts: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -181,14 +181,14 @@ def _flight(since: np.ndarray, speed: np.ndarray, g: np.ndarray, rho: np.ndarray
         Number of the flight, negative before bounce 0 and `_RESTING` if the body stays on the floor, and its start.
     """
     first = 2 * speed / g
-    flights = since / np.maximum(first, _LEAST)
+    flights = since / np.maximum(first, _TINY)
     steady = np.abs(1 - rho) < 1e-9
     rest = 1 - flights * (1 - rho)  # rho^number, for whole numbers
     with np.errstate(divide="ignore", invalid="ignore"):
         number = np.where(
-            steady, np.floor(flights), np.floor(np.log(np.maximum(rest, _LEAST)) / np.log(np.maximum(rho, _LEAST)))
+            steady, np.floor(flights), np.floor(np.log(np.maximum(rest, _TINY)) / np.log(np.maximum(rho, _TINY)))
         )
-    number = np.where((rest <= _LOW * (1 - rho)) | (first <= _LEAST) & (since >= 0), _RESTING, number)
+    number = np.where((rest <= _LOW * (1 - rho)) | (first <= _TINY) & (since >= 0), _RESTING, number)
     number = np.clip(number, -60.0, _RESTING)
     return number, np.where(number < _RESTING, _start(number, speed, g, rho), 0.0)
 

@@ -13,7 +13,7 @@ from .base import LOGARITHMS, Block, Curve, MotionKind, Rates
 
 _DECAYS = (0.5, 1.0, 2.0, 4.0, 8.0)  # tried decay rates, per span
 _SERIES = 1e-2  # |c tau| below which the second integral is a series
-_MOST_EXPONENT = 600.0
+_MAX_EXPONENT = 600.0
 
 
 class Drag(MotionKind):
@@ -28,7 +28,7 @@ class Drag(MotionKind):
     blocks = {"log_c": Block(1, 2.0), "terminal": Block(3, 100.0)}
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
-        exponent = np.minimum(-rates.damping * span, _MOST_EXPONENT)
+        exponent = np.minimum(-rates.damping * span, _MAX_EXPONENT)
         once, twice = span * _first(exponent), span**2 * _second(exponent)
         decay = np.exp(exponent)
         quats = rotations.rotvecs_to_quats(rates.w * once)
@@ -37,7 +37,7 @@ class Drag(MotionKind):
     def rates(self, parts: Mapping[str, np.ndarray], window: Window) -> Rates:
         """Rates at t_max; "v", the velocity minus "terminal", and the spin "w" are values at mid-window."""
         c = np.exp(np.clip(parts["log_c"], *LOGARITHMS))
-        decay = np.exp(np.minimum(c * window.middle, _MOST_EXPONENT))
+        decay = np.exp(np.minimum(c * window.middle, _MAX_EXPONENT))
         terminal = parts.get("terminal", np.zeros(1))
         return Rates(v=parts["v"] * decay + terminal, a=c * terminal, w=parts["w"] * decay, damping=c)
 

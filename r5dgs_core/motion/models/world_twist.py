@@ -11,7 +11,7 @@ from .base import Curve, MotionModel, Rates
 from .twist import Twist
 
 _STEP_TOLERANCE = 1e-9  # allowed Magnus-4 error, in radii
-_MOST_STEPS = 1 << 20  # maximum number of Magnus steps to one time
+_MAX_STEPS = 1 << 20  # maximum number of Magnus steps to one time
 _FIT_STEPS = 16  # number of Magnus steps per time when candidates are compared
 
 
@@ -39,7 +39,7 @@ class WorldTwist(Twist):
         rates = Rates.of(models)
         radii = np.array([model.radius for model in models])
         return twist_propagation.Propagator(
-            np.concatenate([rates.v, rates.w, rates.a, rates.eps], -1), _STEP_TOLERANCE * radii, radii, _MOST_STEPS
+            np.concatenate([rates.v, rates.w, rates.a, rates.eps], -1), _STEP_TOLERANCE * radii, radii, _MAX_STEPS
         ).rows_of
 
     def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:
@@ -66,9 +66,9 @@ def _poses(model: MotionModel, tau: np.ndarray, most_steps: int | None) -> se3.P
     v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
     flat = tau.reshape(-1)
     needed = KIND.steps_needed(model, flat)
-    steps = np.minimum(1 << np.ceil(np.log2(needed)).astype(np.int64), _MOST_STEPS)
+    steps = np.minimum(1 << np.ceil(np.log2(needed)).astype(np.int64), _MAX_STEPS)
     quats, displacements = rotations.identity(len(flat)), np.zeros((len(flat), 3))
-    hopeless = needed >= se3.MOST_STEPS
+    hopeless = needed >= se3.MAX_STEPS
     quats[hopeless] = np.nan
     if most_steps is not None and steps[~hopeless].sum() > most_steps:
         quats[~hopeless], displacements[~hopeless] = _shared_steps(

@@ -21,7 +21,7 @@ from . import tiles as cpu_tiles
 
 WORTH_A_THREAD = 2000  # Gaussians per thread; fewer are projected before a second thread wakes up
 _FEW_LABELS = 16  # labels below this are used without removing gaps
-_MOST_LABEL = 1 << 24  # labels below this are exact in float32
+_MAX_LABEL = 1 << 24  # labels below this are exact in float32
 # Distance of log2(alpha) from a threshold below which float64 decides: several times the largest rounding error of thin
 # Gaussians at the usual dilation. The error grows with the whitening.
 _CLOSE_LOG2, _USUAL_DILATION = 2e-4, 0.3
@@ -126,9 +126,9 @@ def pack_labels(labels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
 def to_numbers(labels: np.ndarray) -> np.ndarray:
     """Convert labels of any integer type to int64. Raises ValueError if one is 2^24 or more."""
     numbers = labels.astype(np.int64)
-    if len(numbers) and numbers.max() >= _MOST_LABEL:
+    if len(numbers) and numbers.max() >= _MAX_LABEL:
         at = numbers.argmax()
-        raise ValueError(f"labels: expected at most {_MOST_LABEL - 1}, found {numbers[at]} at index {at}")
+        raise ValueError(f"labels: expected at most {_MAX_LABEL - 1}, found {numbers[at]} at index {at}")
     return numbers
 
 

@@ -41,8 +41,8 @@ ROTATION, TRANSLATION = 14, 23
 
 # Tiles of the image: side in px, and maximum number per side, so that four tile indices fit into one float64.
 TILE = 32  # larger tiles make fewer pairs; smaller ones finish earlier in opaque scenes
-MOST_TILES = 8191
-BOX_DIGIT = MOST_TILES + 1
+MAX_TILES = 8191
+BOX_DIGIT = MAX_TILES + 1
 BOX_MARGIN = 0.01  # px added to the extents, far above rounding; exact decisions come later
 
 # A slot begins with sums over pixels of A, A u, A v, A u u, A u v, A v v with A = dL/d(ln alpha) and (u, v) = L d

@@ -21,9 +21,9 @@ from .projection import (
     L11,
     L12,
     L22,
+    MAX_TILES,
     MEAN_X,
     MEAN_Y,
-    MOST_TILES,
     TILE,
 )
 from .simd.vectors import prefetch
@@ -32,8 +32,8 @@ _BOX_BITS = np.uint64(BOX_DIGIT.bit_length() - 1)
 AHEAD = 16  # prefetch distance, Gaussians
 _DIGIT = 11  # bits per pass of the radix sort
 _WORTH_A_THREAD = 4000  # Gaussians per thread
-_MOST_PAIRS = (1 << 31) - 1  # slots are numbered in int32
-_MOST_PAIRS_OF_A_TILE = 1 << 24  # pairs of a tile are numbered in float32
+_MAX_PAIRS = (1 << 31) - 1  # slots are numbered in int32
+_MAX_PAIRS_OF_A_TILE = 1 << 24  # pairs of a tile are numbered in float32
 
 
 def sort_by_depth(depths, radii):
@@ -139,7 +139,7 @@ def _tile_range(low, high, tiles):
 @helper
 def _box(boxes, i):
     """Tiles of the bounding box of Gaussian i: first and one past the last column, then the same of rows."""
-    packed, mask = np.uint64(boxes[i]), np.uint64(MOST_TILES)
+    packed, mask = np.uint64(boxes[i]), np.uint64(MAX_TILES)
     left, packed = packed & mask, packed >> _BOX_BITS
     right, packed = packed & mask, packed >> _BOX_BITS
     return np.int64(left), np.int64(right), np.int64(packed & mask), np.int64(packed >> _BOX_BITS)
@@ -245,7 +245,7 @@ def assign_tiles(order, boxes, geometry, width, height, with_slots):
     np.cumsum(slot_starts, out=slot_starts)
     tile_starts = np.zeros(columns * rows + 1, np.int64)
     np.cumsum(counts.sum(0), out=tile_starts[1:])
-    if tile_starts[-1] > _MOST_PAIRS or np.diff(tile_starts).max(initial=0) > _MOST_PAIRS_OF_A_TILE:
+    if tile_starts[-1] > _MAX_PAIRS or np.diff(tile_starts).max(initial=0) > _MAX_PAIRS_OF_A_TILE:
         raise ValueError(
             f"means: {len(order)} Gaussians touch {tile_starts[-1]} tiles in all, more than can be counted; remedy: "
             "draw smaller images, or fewer Gaussians that cover all of it"

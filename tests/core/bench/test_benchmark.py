@@ -83,7 +83,7 @@ def test_a_record_holds_the_results_of_evaluation_and_playback(made, tiny):
     )
     assert set(found["splits"]["test"]) == set(evaluate.METRICS)
     assert found["splits"]["test"]["images"] == 4 and found["splits"]["val"]["images"] == 2
-    assert found["playback"]["frames"] >= playback_speed.LEAST_FRAMES
+    assert found["playback"]["frames"] >= playback_speed.MIN_FRAMES
     assert found["playback"]["fps"] == pytest.approx(1e3 / found["playback"]["ms_frame"])
     assert found["gaussians"] == len(scene_file.read(case.beside(".r5dgs")).gaussians.means)
     assert main.main(["evaluate", str(case.run), "--progress", "none"]) == 0
@@ -358,4 +358,4 @@ def test_modes_alternate_in_each_round(baked, tiny, monkeypatch):
     found = playback_speed.measure(still, views, ["rigid", "standard"])
     turn = ["rigid"] * len(views) + ["standard"] * len(views)
     assert drawn == turn * (len(drawn) // len(turn))
-    assert found["rigid"]["frames"] == found["standard"]["frames"] >= playback_speed.LEAST_FRAMES
+    assert found["rigid"]["frames"] == found["standard"]["frames"] >= playback_speed.MIN_FRAMES

@@ -298,7 +298,7 @@ def _(root):
 
 @case("D53")
 def _(root, monkeypatch):
-    monkeypatch.setattr(data, "LEAST_SPACE", 1 << 62)
+    monkeypatch.setattr(data, "MIN_SPACE", 1 << 62)
     write_flat(root)
     return root
 

@@ -221,7 +221,7 @@ def test_a_rule_about_two_keys_is_not_applied_to_a_key_without_a_value(tmp_path)
 
 
 def test_the_list_of_a_hostile_file_is_bounded(sound, tmp_path, monkeypatch):
-    monkeypatch.setattr(findings, "MOST_FINDINGS", 50)
+    monkeypatch.setattr(findings, "MAX_FINDINGS", 50)
 
     def change(tree):
         tree["objects"] = [{} for _ in range(5000)]

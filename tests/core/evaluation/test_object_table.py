@@ -38,7 +38,7 @@ def test_own_views_use_every_camera_and_times_from_the_whole_range(scene):
     views = object_table.own_views(scene)
     assert [view.camera for view in views] == list(scene.cameras)
     many = object_table.own_views(dataclasses.replace(scene, cameras=scene.cameras * 50))
-    assert len(many) == object_table.MOST_VIEWS
+    assert len(many) == object_table.MAX_VIEWS
     times = np.sort([view.t for view in many])
     assert times[0] >= 0 and times[-1] <= scene.t_max and np.diff(times).max() < 0.1 * scene.t_max
     assert {view.camera.name for view in object_table.own_views(dataclasses.replace(scene, cameras=()))} == {"overview"}

@@ -11,7 +11,7 @@ from tests.support.problems import MOTIONS, RADIUS, SIZE
 TOLERANCE = 1e-3 * SIZE
 # Scalar keys over [0, 2] at 0.1 % of the size. One cubic holds an arc of radius u for about (384 tol / (2 u))^(1/4)
 # rad, so the hinge, which turns by 4 rad and by 7 when it accelerates, needs 6 and 11 intervals in location.
-MOST_KEYS = {
+MAX_KEYS = {
     "static": 7,
     "uniform": 10,
     "ballistic": 10,
@@ -54,10 +54,10 @@ def test_no_point_leaves_the_tolerance_between_keys(name, tolerance):
     assert largest_error(curves, CASES[name], np.linspace(0, 2, 1931)) <= 1.001 * tolerance
 
 
-@pytest.mark.parametrize("name", MOST_KEYS)
+@pytest.mark.parametrize("name", MAX_KEYS)
 def test_few_keys_suffice(name):
     curves = reduced(CASES[name])
-    assert 3 * len(curves.location.times) + 4 * len(curves.rotation.times) <= MOST_KEYS[name]
+    assert 3 * len(curves.location.times) + 4 * len(curves.rotation.times) <= MAX_KEYS[name]
 
 
 def test_constant_curves_have_one_key():
@@ -178,12 +178,12 @@ def test_more_kinks_than_can_be_keyed_give_keys_at_frames():
     )
     kinks = models.kinks(model, 2.0).tolist()
     frames = key_reduction.FrameTimes(0.0, 1 / 60)
-    few = key_reduction.FEWEST_INTERVALS
+    few = key_reduction.MIN_INTERVALS
     options = {"nearest": 0.011 / 60, "frames": frames, "most": few}
-    assert len(kinks) > key_reduction.FEWEST_KINKS
+    assert len(kinks) > key_reduction.MIN_KINKS
     curves = reduced(model, 1e-5 * SIZE, kinks=kinks, **options)
     assert not curves.followed
-    for kink in kinks[: key_reduction.FEWEST_KINKS]:
+    for kink in kinks[: key_reduction.MIN_KINKS]:
         assert kink in curves.location.times
 
 
@@ -299,7 +299,7 @@ WILD = {
 }
 
 
-def work(monkeypatch, model, span, frame, most=key_reduction.MOST_INTERVALS):
+def work(monkeypatch, model, span, frame, most=key_reduction.MAX_INTERVALS):
     """Keys of a motion over a span, the times that were sampled for them, and the steps of integration."""
     counts = {"times": 0, "steps": 0}
     sampler, exp = key_reduction.model_sampler(model, 0.0, most), se3.exp

@@ -143,7 +143,7 @@ def test_the_last_step_is_shortened_to_reach_the_time():
 
 
 def test_a_diverging_path_keeps_its_last_finite_position(monkeypatch):
-    monkeypatch.setattr(rk2_cache, "MOST_STEPS", 2000)
+    monkeypatch.setattr(rk2_cache, "MAX_STEPS", 2000)
     start = np.zeros((2, 3))
     v, w = np.array([[0.1, 0, 0], [0.1, 0, 0]]), np.array([[0, 0, 400.0], [0, 0, 0.5]])
     path = rk2_cache.SteppedPath(start, v, w, 0 * v, np.array([[300.0, 0, 0], [0, 0, 0]]), 1 / 60)
@@ -151,4 +151,4 @@ def test_a_diverging_path_keeps_its_last_finite_position(monkeypatch):
     assert np.isfinite(points).all() and np.isfinite(quats).all()
     alone, _ = rk2_cache.SteppedPath(start[1:], v[1:], w[1:], 0 * v[1:], 0 * v[1:], 1 / 60).at(1000.0)
     np.testing.assert_array_equal(alone[0], points[1])
-    np.testing.assert_array_equal(path.at(1e6)[0], path.at(rk2_cache.MOST_STEPS / 60)[0])
+    np.testing.assert_array_equal(path.at(1e6)[0], path.at(rk2_cache.MAX_STEPS / 60)[0])

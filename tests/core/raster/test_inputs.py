@@ -106,7 +106,7 @@ def test_pixels_without_alpha_have_no_id_at_threshold_zero(backend):
 
 
 def test_boxes_can_count_the_tiles_of_the_largest_image():
-    assert projection.MOST_TILES * projection.TILE >= cameras.MOST_PIXELS
+    assert projection.MAX_TILES * projection.TILE >= cameras.MAX_SIDE
 
 
 # Gaussians

@@ -108,7 +108,7 @@ def test_candidates_are_cameras_at_times(scene):
     (one,) = viewpoints.candidates(scene, "0", LATER)
     assert one.t == LATER and one.camera is scene.cameras[0]
     many = dataclasses.replace(scene, cameras=scene.cameras * 100)
-    assert len(viewpoints.candidates(many, t=0.0)) == viewpoints.MOST_CAMERAS
+    assert len(viewpoints.candidates(many, t=0.0)) == viewpoints.MAX_CAMERAS
     with pytest.raises(ConfigError, match="--time nan"):
         viewpoints.candidates(scene, t=float("nan"))
 

@@ -132,7 +132,7 @@ def changed(matrix, at, value):
     [
         (lambda c: {"width": 32.0}, TypeError, "whole numbers of pixels"),
         (lambda c: {"height": 0}, ValueError, "width and height of 1 to"),
-        (lambda c: {"width": cameras.MOST_PIXELS + 1}, ValueError, "width and height of 1 to"),
+        (lambda c: {"width": cameras.MAX_SIDE + 1}, ValueError, "width and height of 1 to"),
         (lambda c: {"intrinsics": c.intrinsics.tolist()}, TypeError, "intrinsics: expected an array"),
         (lambda c: {"T_cam_world": c.T_cam_world[:3]}, ValueError, r"T_cam_world: expected shape \(4, 4\)"),
         (lambda c: {"T_cam_world": changed(c.T_cam_world, (1, 3), np.nan)}, ValueError, r"nan at index \(1, 3\)"),

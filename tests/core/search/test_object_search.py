@@ -215,7 +215,7 @@ def test_a_prompt_that_is_too_long_is_refused_before_names_are_compared(scene, t
 
 
 def test_a_prompt_as_long_as_allowed_finds_what_it_names(scene):
-    text = ("mug" + " " * 400 + ", lemon").ljust(prompts.MOST_LETTERS)
+    text = ("mug" + " " * 400 + ", lemon").ljust(prompts.MAX_LETTERS)
     assert [match.object_id for match in object_search.search(scene, text)] == [MUG, LEMON]
 
 

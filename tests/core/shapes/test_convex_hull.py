@@ -23,7 +23,7 @@ def test_the_hull_of_one_gaussian_is_its_ellipsoid():
     turn = rotations.normalize(np.array([[0.9, 0.1, -0.3, 0.2]]))
     scales, opacity = np.array([[0.3, 0.2, 0.1]]), 0.7
     found = convex_hull.vertices(np.array([[1.0, 2, 3]]), turn, scales, np.array([opacity]))
-    assert len(found) == convex_hull.MOST_VERTICES
+    assert len(found) == convex_hull.MAX_VERTICES
     local = (found - [1, 2, 3]) @ rotations.quats_to_rotmats(turn)[0] / scales[0]
     exponent = (local**2).sum(1) / 2
     np.testing.assert_allclose(opacity * np.exp(-exponent), convex_hull.LEVEL, rtol=1e-9)
@@ -72,5 +72,5 @@ def test_the_hull_scales_and_moves_with_the_object(scale):
 def test_few_gaussians_give_a_hull_or_nothing(count):
     means = np.eye(4, 3)[:count]
     found = convex_hull.vertices(means, np.tile([1.0, 0, 0, 0], (count, 1)), np.full((count, 3), 0.1), np.ones(count))
-    assert len(found) <= convex_hull.MOST_VERTICES and np.isfinite(found).all() and (len(found) > 0) == (count > 0)
+    assert len(found) <= convex_hull.MAX_VERTICES and np.isfinite(found).all() and (len(found) > 0) == (count > 0)
     assert len(convex_hull.vertices(means, np.ones((count, 4)), np.ones((count, 3)), np.zeros(count))) == 0

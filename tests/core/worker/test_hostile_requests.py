@@ -168,7 +168,7 @@ def test_there_are_more_than_the_trials_had():
 
 
 def test_a_giant_line_is_skipped_without_being_stored(path, monkeypatch):
-    monkeypatch.setattr(fields, "MOST_LINE", 4 << 20)
+    monkeypatch.setattr(fields, "MAX_LINE", 4 << 20)
     most = []
 
     class Stream(io.BytesIO):
