@@ -16,7 +16,7 @@ from scipy import sparse
 
 from . import segment_stack
 
-LEAST = 1e-3  # minimum weight of a voting Gaussian in other images, pixels
+MIN_WEIGHT = 1e-3  # minimum weight of a voting Gaussian in other images, pixels
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def left_out(
         others = sparse.csr_matrix(votes[seen] - own[voting][:, seen].T @ member)
         others.data = np.maximum(others.data, 0.0)
         total = np.asarray(others.sum(axis=1)).ravel()
-        others.data[np.repeat(total <= LEAST, np.diff(others.indptr))] = 0.0
+        others.data[np.repeat(total <= MIN_WEIGHT, np.diff(others.indptr))] = 0.0
         others.eliminate_zeros()
         others.data /= np.repeat(total, np.diff(others.indptr))
         yield seen, others

@@ -17,7 +17,7 @@ from . import associate, leave_one_out, segment_stack
 
 TRUSTED = 0.3  # minimum usual IoU of segments and votes; below it, outlines of votes are too inaccurate
 WITHIN = 0.5  # minimum share of an object's voted pixels inside the segment that loses pixels to it
-LEAST = 0.1  # minimum number of voted pixels, relative to the object's usual segment size
+MIN_RELATIVE_SIZE = 0.1  # minimum number of voted pixels, relative to the object's usual segment size
 
 
 def shares(
@@ -56,7 +56,7 @@ def mend(mask: np.ndarray, ids: np.ndarray, drawn: np.ndarray, found: associate.
     result = out.copy()
     for name in lacks(found, image):
         where = shown == name
-        if where.sum() < LEAST * found.sizes.get(int(name), np.inf):
+        if where.sum() < MIN_RELATIVE_SIZE * found.sizes.get(int(name), np.inf):
             continue
         segments, counts = np.unique(mask[where], return_counts=True)
         best = int(counts.argmax())

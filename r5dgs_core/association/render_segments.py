@@ -15,7 +15,7 @@ from ..render import posed_scene, scene_renderer, segment_weights
 from ..scene.scene import Scene
 from . import segment_stack
 
-LEAST = 0.02  # minimum weight of a Gaussian in a segment's bag, pixels
+MIN_WEIGHT = 0.02  # minimum weight of a Gaussian in a segment's bag, pixels
 
 
 def draw(
@@ -56,7 +56,7 @@ def draw(
             settings=RasterSettings(near_plane=scene.near_plane),
             backend=backend,
         )[known]
-        weights.data[weights.data < LEAST] = 0
+        weights.data[weights.data < MIN_WEIGHT] = 0
         weights.eliminate_zeros()
         drawn.append(
             segment_stack.ImageBags(

@@ -32,7 +32,7 @@ from ..train import train_views
 log = logging.getLogger(__name__)
 
 PIXELS = 700_000  # total of the sampled views
-FEWEST, MOST = 20, 40  # limits of the number of sampled views
+MIN_VIEWS, MAX_VIEWS = 20, 40  # limits of the number of sampled views
 CLUSTERS = 8  # smallest number of clusters; with fewer cameras, their views are split in time
 PATCHES = 8  # patches per body: its octants
 STEP = 0.02  # change of the poses for finite differences of the images, rad or radii
@@ -215,7 +215,7 @@ def make_renderer(scene: Scene) -> Callable[[datasets.View], np.ndarray]:
 def sample(views: Sequence[datasets.View]) -> list[datasets.View]:
     """Return views spread evenly over the times of each camera, as many as `PIXELS` allows."""
     size = float(np.median([view.camera.width * view.camera.height for view in views]))
-    limit = int(np.clip(PIXELS / size, FEWEST, MOST))
+    limit = int(np.clip(PIXELS / size, MIN_VIEWS, MAX_VIEWS))
     cameras = _by_camera(views)
     if 2 * len(cameras) > limit:
         return spread(sorted(views, key=lambda view: (view.t, view.name)), limit)

@@ -37,7 +37,7 @@ from .unseen_rotations import Surface, Unseen
 VIEWS = 4  # maximum number of views of a knot, spread evenly
 STEP = 0.03  # change of the pose for finite differences, rad or radii
 MARGIN = 2  # dilation of the pixels that show a body, px
-FEWEST_PIXELS = 8  # minimum number of pixels of a body in a view
+MIN_PIXELS = 8  # minimum number of pixels of a body in a view
 FACTORS = (2.0, 4.5)  # ratios of measured errors to deviations, for displacements and rotations
 UNEXPLAINED = 0.5  # misfit above which the rotations are unknown, as a share of the contrast of the texture
 LARGE = 2.0  # misfit that may count as unexplained, relative to the root mean square misfit of all pixels
@@ -126,7 +126,7 @@ def measure(scene: Scene, dataset: datasets.Dataset, config: Config, groups: Col
                 ids = picture.ids if ids is None else ids
             for group in groups:
                 mine = ids == scene.groups[group].object_id
-                if mine.sum() >= FEWEST_PIXELS:
+                if mine.sum() >= MIN_PIXELS:
                     look = _look(scene, group, posed[view.t], view, truth, mine)
                     looks.setdefault((group, knot), []).append(look)
     usual, count = float(np.mean(misfits)) if misfits else 0.0, len(scene.tracks.times)

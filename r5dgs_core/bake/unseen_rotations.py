@@ -25,7 +25,7 @@ ROUND = 0.92  # smallest ratio of two axes of the ellipsoid that count as equal
 ROUNDS = 15  # number of fits with new weights
 HEIGHTS = 10  # number of heights along an axis between which colours are interpolated
 DARKEST = 0.02  # smallest colour, because shade is fitted to logarithms
-FEWEST = 3  # minimum number of pixels per coefficient of a fit
+MIN_PIXELS_PER_COEFFICIENT = 3  # minimum number of pixels per coefficient of a fit
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def _texture(surfaces: Sequence[Surface], axis: np.ndarray | None) -> float:
         if axis is not None:
             heights = surface.directions @ rotations.rotate(surface.turn, axis)
             columns = np.concatenate([columns, _interpolation(heights)], axis=1)
-        if len(columns) < FEWEST * columns.shape[1]:
+        if len(columns) < MIN_PIXELS_PER_COEFFICIENT * columns.shape[1]:
             continue
         colors = np.maximum(surface.colors, DARKEST)
         logs = np.log(colors)

@@ -20,7 +20,7 @@ from .sections.motion import DiscoverySection, FieldSection, ResidualSection
 from .sections.needs import NeedsSection
 from .sections.training import CurriculumSection, DataSection, InitSection, LossSection, RatesSection, TrainSection
 
-_MOST_BYTES = 1 << 20  # maximum size of a configuration file
+_MAX_BYTES = 1 << 20  # maximum size of a configuration file
 
 
 @dataclass(frozen=True)
@@ -134,13 +134,13 @@ def load(
     if path is not None:
         try:
             with open(path, "rb") as stream:
-                data = stream.read(_MOST_BYTES + 1)
+                data = stream.read(_MAX_BYTES + 1)
         except FileNotFoundError:
             raise ConfigError(f"{path}: no such configuration file") from None
         except OSError as error:
             raise ConfigError(f"{path}: cannot be read: {error}") from error
-        if len(data) > _MOST_BYTES:
-            raise ConfigError(f"{path}: expected at most {_MOST_BYTES >> 10} KiB, found more")
+        if len(data) > _MAX_BYTES:
+            raise ConfigError(f"{path}: expected at most {_MAX_BYTES >> 10} KiB, found more")
         try:
             values = tomllib.loads(data.decode("utf-8"))
         except (ValueError, RecursionError) as error:  # ValueError: not TOML or UTF-8, or a number with too many digits

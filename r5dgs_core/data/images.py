@@ -17,7 +17,7 @@ from ..color import srgb
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".tif", ".tiff")
 COMPRESSION_LEVEL = 6
 # Limits for sizes declared in headers, checked before decoding; a PNG of one colour has about 1000 pixels per byte.
-_MOST_PIXELS, _MOST_CHANNELS = 1 << 28, 64
+_MAX_PIXELS, _MAX_CHANNELS = 1 << 28, 64
 _PIXELS, _PIXELS_PER_BYTE = 1 << 24, 4096
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
 UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".gif", ".bmp", ".psd")
@@ -196,9 +196,9 @@ def _open(path: Path):
 def check_size(path: Path, width: int, height: int, channels: int) -> None:
     """Raise `DatasetError` if an image declares no pixels, or more than a file of its size can hold."""
     size = Path(path).stat().st_size
-    most = min(_MOST_PIXELS, _PIXELS + _PIXELS_PER_BYTE * size)
-    if min(width, height, channels) < 1 or width * height > most or channels > _MOST_CHANNELS:
+    most = min(_MAX_PIXELS, _PIXELS + _PIXELS_PER_BYTE * size)
+    if min(width, height, channels) < 1 or width * height > most or channels > _MAX_CHANNELS:
         raise errors.DatasetError(
-            f"{path}: expected 1 to {most} pixels of up to {_MOST_CHANNELS} channels in a file of {size} bytes, found "
+            f"{path}: expected 1 to {most} pixels of up to {_MAX_CHANNELS} channels in a file of {size} bytes, found "
             f"{width} x {height} of {channels}; is it damaged?"
         )

@@ -22,7 +22,7 @@ _LOOK = 256  # longer side of the small pictures, pixels
 _CAMERAS = 8  # maximum number of cameras to try
 _TIMES = 4  # number of times to try
 _TRIED = 10  # maximum number of views per object that are also rendered without occluders
-_LEAST_PIXELS = 12  # minimum visible area in a small picture
+_MIN_PIXELS = 12  # minimum visible area in a small picture
 _WANTED_SIDE = 32  # object size in the camera's picture, pixels; smaller objects get a lower score
 _CUT = 0.3  # factor on the score of an object cut by the border
 _AGAIN = 0.4  # factor on the score for each chosen view of the same camera
@@ -70,7 +70,7 @@ def find(
         ids = scene_renderer.render(player, small, at.t, backend=backend).ids
         for object_id in object_ids:
             mask = ids == object_id
-            if mask.sum() >= _LEAST_PIXELS:
+            if mask.sum() >= _MIN_PIXELS:
                 seen[object_id].append((_sighting(at, small, mask), mask))
         if progress:
             progress(done + 1, len(places))

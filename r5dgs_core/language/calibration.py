@@ -19,7 +19,7 @@ import numpy as np
 from . import common_nouns
 
 FALSE_ALARMS = 0.1  # accepted share of prompts for missing objects that still match an object
-_MOST_EACH = 0.02  # the same for a single object
+_MAX_FALSE_ALARMS_PER_OBJECT = 0.02  # the same for one object
 _LIKELY_TRUE = 0.03  # assumed share of nouns that describe an object whose name is not a noun of the list
 _MARGIN = 2.0  # distance of further matches below the best cosine, in standard deviations; 1.5 to 2.5 work as well
 
@@ -80,7 +80,7 @@ def standardize(rows: np.ndarray, nouns: np.ndarray) -> np.ndarray:
 
 
 def _limit(false: np.ndarray, objects: int) -> float:
-    each = min(FALSE_ALARMS / max(objects, 1), _MOST_EACH)
+    each = min(FALSE_ALARMS / max(objects, 1), _MAX_FALSE_ALARMS_PER_OBJECT)
     return float(np.quantile(false, 1 - each)) if false.size else 0.0
 
 

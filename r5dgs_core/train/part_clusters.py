@@ -18,8 +18,8 @@ from ..motion import rotations
 from . import motion_clusters
 
 TOLERANCE = 0.02  # residual allowed in the search for parts, relative to the size of the body
-LEAST_SHARE = 0.08  # minimum share of a part in the members
-FEWEST = 8  # minimum number of members of a part
+MIN_SHARE = 0.08  # minimum share of a part in the members
+MIN_MEMBERS = 8  # minimum number of members of a part
 NEIGHBOURS = 8  # members over which residuals are averaged before a member joins a part
 ROUNDS = 12  # rounds of joining and refitting
 EXPLAINED = 0.8  # maximum distance from the motions of the parts, relative to that from one motion
@@ -38,7 +38,7 @@ def find(paths: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> np
         Part of each member, 0 for the heaviest; None if several parts do not explain the paths clearly better than one.
         [R]
     """
-    fewest = max(FEWEST, int(LEAST_SHARE * len(paths)))
+    fewest = max(MIN_MEMBERS, int(MIN_SHARE * len(paths)))
     if len(paths) < 2 * fewest:
         return None
     middle = np.median(paths[:, 0], axis=0)

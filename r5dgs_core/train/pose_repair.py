@@ -32,11 +32,11 @@ CLEARLY = 0.93  # largest image error of a new pose that is accepted, relative t
 SIMILAR = 1.03  # image error below which the pose nearest to the prediction is taken, relative to the smallest error
 APART = np.radians(3.0)  # smallest angle between different poses
 TURNS = np.radians((25.0, 50.0))  # rotations of the prediction about each axis that are tried as starts
-FEWEST_VIEWS = 2  # minimum number of views of a knot; a single view does not determine a position
+MIN_VIEWS = 2  # minimum number of views of a knot; a single view does not determine a position
 VIEWS = 3  # maximum number of views of a knot
 REFINED = 2  # number of starts that are refined
 STEPS = 4  # steps of a refinement
-MOST = 2  # maximum registrations of a body in a round, as a multiple of its knots
+MAX_REGISTRATIONS_PER_KNOT = 2  # maximum registrations of a body in a round, relative to the number of its knots
 
 
 def applies(trainer: Trainer) -> bool:
@@ -84,7 +84,7 @@ def repair(trainer: Trainer) -> int:
         queue = suspicious(own, _quats(trainer, body), trainer.times).tolist()
         limit = UNUSUAL * float(np.median(own[seen])) if queue else 0.0
         found: set[int] = set()
-        for _ in range(MOST * count):
+        for _ in range(MAX_REGISTRATIONS_PER_KNOT * count):
             if not queue:
                 break
             s = queue.pop(0)
@@ -131,7 +131,7 @@ def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit
     """
     look = BodyRegistration(trainer, _tracks(trainer), body, knot, VIEWS)
     predicted = _predictions(trainer, body, knot, seen)
-    if len(look) < FEWEST_VIEWS or not predicted:
+    if len(look) < MIN_VIEWS or not predicted:
         return False
     own = look.pose
     found = [look.refined(pose, STEPS) for pose in [own, *predicted[:1]][: 1 + _apart(own, predicted[0])]]

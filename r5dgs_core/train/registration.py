@@ -26,7 +26,7 @@ from .representations.tracks import TracksRepresentation
 from .trainer import Trainer
 
 MARGIN = 2  # dilation of masks, px
-FEWEST_PIXELS = 8  # minimum number of pixels of a mask
+MIN_PIXELS = 8  # minimum number of pixels of a mask
 STEP = 0.02  # change of the pose for finite differences, rad or radii
 _LARGEST = 0.35  # step of the refinement, rad or radii
 _ENOUGH = 1e-2  # relative gain of a step below which the refinement ends
@@ -63,9 +63,7 @@ class BodyRegistration:
         names = ("means", "quats", "log_scales", "opacity_logits", "shading")
         self._shape = {name: params[name].detach()[rows] for name in names}
         self._shape["colors"] = spherical_harmonics.dc_to_rgb(params["sh"].detach()[rows, 0])
-        shown = sampling.spread(
-            [v for v in views_at(trainer, knot) if (v.mask == object_id).sum() >= FEWEST_PIXELS], most
-        )
+        shown = sampling.spread([v for v in views_at(trainer, knot) if (v.mask == object_id).sum() >= MIN_PIXELS], most)
         self._looks = [self._look(view, view.mask == object_id) for view in shown]
 
     def __len__(self) -> int:
@@ -178,7 +176,7 @@ def errors(trainer: Trainer, knot: int, most: int) -> np.ndarray:
         squares = (trainer.render(view.camera, view.t).numpy() - view.image / 255.0) ** 2
         for row, object_id in enumerate(ids):
             mine = view.mask == object_id
-            if mine.sum() >= FEWEST_PIXELS:
+            if mine.sum() >= MIN_PIXELS:
                 sums[row] += squares[grown(mine)].sum()
                 pixels[row] += 3 * grown(mine).sum()
     return np.where(pixels > 0, sums / np.maximum(pixels, 1), np.nan)

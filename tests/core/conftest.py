@@ -28,8 +28,8 @@ def no_plots():
 def few_views():
     """Limit the image evidence of baking to a dozen images."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(image_evidence, "FEWEST", 8)
-        patch.setattr(image_evidence, "MOST", 12)
+        patch.setattr(image_evidence, "MIN_VIEWS", 8)
+        patch.setattr(image_evidence, "MAX_VIEWS", 12)
         yield
 
 

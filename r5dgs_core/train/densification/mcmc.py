@@ -18,7 +18,7 @@ from ...scene.cameras import Camera
 from . import densifier
 from .densifier import Conditions
 
-MOST = 51  # maximum number of Gaussians that replace one
+MAX_REPLACEMENTS = 51  # maximum number of Gaussians that replace one
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005  # sigmoid gate of the noise over opacity
 
 
@@ -33,7 +33,7 @@ def divided(
 
     Args:
         opacities: Opacity o of the one, in (0, 1). [R]
-        counts: Number N of replacements, 1 to `MOST`. [R] integers
+        counts: Number N of replacements, 1 to `MAX_REPLACEMENTS`. [R] integers
 
     Returns:
         Opacity o' of each of the N, and the factor on its standard deviations. [R], [R]
@@ -155,7 +155,7 @@ class MCMC:
         """Set opacity and size of each drawn Gaussian so that it and its copies together look like the original."""
         opacities = torch.sigmoid(gaussians.params["opacity_logits"])
         rows, times = source.unique(return_counts=True)
-        each, factor = divided(opacities[rows].clamp(max=1 - 1e-6), (times + 1).clamp(max=MOST))
+        each, factor = divided(opacities[rows].clamp(max=1 - 1e-6), (times + 1).clamp(max=MAX_REPLACEMENTS))
         each = each.clamp(min=self.section.dead_opacity, max=1 - 1e-6)
         gaussians.params["opacity_logits"][rows] = torch.logit(each)
         gaussians.params["log_scales"][rows] += factor.log()[:, None]

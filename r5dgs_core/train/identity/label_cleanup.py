@@ -41,7 +41,7 @@ UNDECIDED_BACKGROUND = 0.45  # the same for Gaussians of the background
 APART = 5.0  # maximum link between members of an object / their typical spacing
 SMALL = 0.05  # share of an object's total opacity above which a part is never an outlier
 SUPPORTED = 0.65  # trusted share of a part's votes above which it is no outlier
-FEWEST = 9  # minimum number of members for statistics of an object
+MIN_MEMBERS = 9  # minimum number of members for statistics of an object
 MOVES = 0.1  # displacement in radii above which an object counts as moving
 AGREED = 0.5  # median certainty of the objects below which the masks contradict each other
 AT_ONCE = 1 << 16  # Gaussians per block; bounds memory
@@ -141,7 +141,7 @@ def certainty(
     result = np.full(shares.shape[1], np.nan)
     for k in np.unique(labels[inner]):
         own = shares[inner & (labels == k), k]
-        if len(own) >= FEWEST:
+        if len(own) >= MIN_MEMBERS:
             result[k] = np.median(own)
     return result
 
@@ -270,7 +270,7 @@ def _without_outliers(
     result = labels.copy()
     for k in range(1, votes.shape[1]):
         rows = np.flatnonzero(labels == k)
-        if len(rows) < FEWEST:
+        if len(rows) < MIN_MEMBERS:
             continue
         parts, count = _parts(points[rows], opacities[rows])
         if count == 1:

@@ -26,7 +26,7 @@ STIFFEST = 100.0  # factor on the smoothness of a track if nothing is visible
 CLEARER = 0.03  # maximum mean colour difference due to noise
 DISC = 0.6  # radius of the compared disc / radius of the body
 HIDDEN = 0.1  # share of the disc covered by other objects above which a view is ignored
-FEWEST_FRAMES, MOST_FRAMES = 2, 15  # frames of a camera for the colours without the object
+MIN_FRAMES, MAX_FRAMES = 2, 15  # frames of a camera for the colours without the object
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,8 @@ def absent(views: Sequence[TrainView], places: ObjectPositions, times: np.ndarra
                 columns, rows = _disc(view, places.centers[row, s], float(places.radii[row]))
                 if len(rows) == 0 or (_ids(view, rows, columns) > 0).mean() > HIDDEN:
                     continue
-                marked = spread([v for k, v in frames if places.evidence[row, k] > 0], MOST_FRAMES)
-                if len(marked) < FEWEST_FRAMES:
+                marked = spread([v for k, v in frames if places.evidence[row, k] > 0], MAX_FRAMES)
+                if len(marked) < MIN_FRAMES:
                     continue
                 empty, known = _without(marked, rows, columns)
                 if known.mean() < 0.5:

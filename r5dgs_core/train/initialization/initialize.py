@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 MASKS = "Remedy: object_mask/train/IMAGE.png files"
 SAME_TIME = 0.1  # share of the cameras' median time step within which times are equal
-FEWEST_EYES = 3  # minimum number of cameras to place a scene from the images of one time
+MIN_CAMERAS = 3  # minimum number of cameras to place a scene from the images of one time
 SEEN_AT_ALL = 1e-3  # score of a time at which the object has a position, but no view shows all of it
 
 
@@ -267,7 +267,7 @@ def supporting_plane(
 def _at_once(views: Sequence[TrainView], times: np.ndarray, knot: int) -> Sequence[TrainView]:
     """Return the views of one observed time, in which moving objects have one place; all views if these are too few."""
     then = [v for v in views if nearest_knot(times, v.t) == knot]
-    return then if len(by_camera(then)) >= FEWEST_EYES else views
+    return then if len(by_camera(then)) >= MIN_CAMERAS else views
 
 
 def _first_time(places: triangulation.ObjectPositions, count: int) -> int:

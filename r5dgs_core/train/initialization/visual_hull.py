@@ -20,9 +20,9 @@ log = logging.getLogger(__name__)
 LIMITS = (0.0, 0.1, 0.2, 0.35, 0.5)  # shares of votes against a point that are tried in turn
 CELLS = 60  # cells of a mask, which the object's points should fill
 FILLED = 0.8  # smallest share of a mask's cells that points of the whole object fill
-FEWEST_CELLS = 20  # smaller masks are not compared
+MIN_CELLS = 20  # smaller masks are not compared
 HELPS = 0.1  # gain of this share by which a view is left out
-FEWEST_VIEWS = 2  # minimum number of views that vote against points
+MIN_VIEWS = 2  # minimum number of views that vote against points
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def _chosen(
 
     def filled(good: np.ndarray) -> float:
         shares = [
-            np.isin(x.filled, x.cells[good]).mean() for x in outlines if x is not None and len(x.filled) >= FEWEST_CELLS
+            np.isin(x.filled, x.cells[good]).mean() for x in outlines if x is not None and len(x.filled) >= MIN_CELLS
         ]
         return float(min(shares, default=1.0))
 
@@ -146,7 +146,7 @@ def _chosen(
     best = select(hiding)
     share = filled(best)
     showing = [number for number, x in enumerate(outlines) if x is not None]
-    while share < FILLED and len(showing) - len(hiding) > FEWEST_VIEWS:
+    while share < FILLED and len(showing) - len(hiding) > MIN_VIEWS:
         trials = {number: select([*hiding, number]) for number in showing if number not in hiding}
         shares = {number: filled(good) for number, good in trials.items()}
         number = max(shares, key=shares.__getitem__)

@@ -33,7 +33,7 @@ FLOATING = 2.0  # distance above which a member is a floater / 90 % quantile of 
 ROUNDS = 8  # maximum number of rounds of regrouping and refitting
 REACH = 4.0  # maximum distance of a shadow from its caster along the plane, radii
 STEEPEST = 4.0  # maximum shift of a shadow / rise of its caster: light from 14 degrees above the plane
-FEWEST = 5  # minimum number of Gaussians in a shadow
+MIN_SHADOW_SIZE = 5  # minimum number of Gaussians in a shadow
 AT_ONCE = 8192  # Gaussians per block; bounds memory
 
 
@@ -192,14 +192,14 @@ def imitators(
         slopes, found = _alone(path, rows[asked], group.displacements, plane, normal)
         alike = (found < BETTER * own[asked]) & (found < EXPLAINED * size)
         alike &= np.linalg.norm(slopes, axis=1) < STEEPEST
-        if alike.sum() < FEWEST:
+        if alike.sum() < MIN_SHADOW_SIZE:
             continue
         slope = np.median(slopes[alike], axis=0)  # one light
         shift = group.displacements @ plane + np.outer(group.displacements @ normal, slope)
         shadow = dataclasses.replace(group, quats=rotations.identity(len(shift)), displacements=shift)
         found = errors(path, rows[asked], shadow)
         take = (found < BETTER * own[asked]) & (found < EXPLAINED * size) & (found < best[asked])
-        if take.sum() >= FEWEST:
+        if take.sum() >= MIN_SHADOW_SIZE:
             best[asked[take]], casters[rows[asked[take]]] = found[take], g
     return casters
 
