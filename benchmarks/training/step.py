@@ -46,7 +46,7 @@ def measure(dataset: datasets.Dataset, overrides: list[str], gaussians: int, ste
     run = trainer.Trainer(dataset, settings(overrides, gaussians))
     while len(run.gaussians) < 0.98 * gaussians and run.iteration < 1000:
         run.step()
-    run.growth.observe = lambda *_: None  # type: ignore[method-assign]
+    run.densifier.observe = lambda *_: None  # type: ignore[method-assign]
     times = []
     for _ in range(steps):
         began = time.process_time()

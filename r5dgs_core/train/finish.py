@@ -11,7 +11,7 @@ import torch
 
 from ..config import training_needs
 from ..scene.splats import to_opacities
-from . import checkpoint_content, probe
+from . import checkpoint_content, held_out_psnr
 from .identity import identity_training, label_cleanup, label_votes
 from .representations.fused_posing import PosedSplats
 from .train_views import TrainView
@@ -75,12 +75,12 @@ def final_tensors(trainer: Trainer, progress: Progress) -> dict[str, torch.Tenso
         from . import object_discovery
 
         progress({"event": "prepare", "text": "no masks: sorting moving Gaussians into parts"})
-        labels = torch.from_numpy(object_discovery.sort(trainer) + 1)
+        labels = torch.from_numpy(object_discovery.sort_into_parts(trainer) + 1)
         count = int(labels.max())
         progress({"event": "prepare", "text": f"no masks: {count} moving part{'s' * (count != 1)} found"})
         extra |= {"labels": labels, "object_ids": torch.arange(count + 1), checkpoint_content.DISCOVERED_LABELS: labels}
     with torch.no_grad():
-        shown = probe.training_psnr(
+        shown = held_out_psnr.training_psnr(
             trainer.dataset,
             trainer.behind,
             lambda view: trainer.render(trainer.normalization.camera(view.camera), view.t).numpy(),
@@ -103,10 +103,10 @@ def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dic
     )
     gaussians = {name: tensor.numpy() for name, tensor in params.items()} | (motion.gaussians or {})
     group_ids = ids.numpy() if motion.motion_ids is None else motion.motion_ids
-    points = label_cleanup.bound(motion.groups, group_ids, gaussians["means"])
-    going, moving = label_cleanup.companions(motion.groups, group_ids, points, trainer.object_ids)
+    points = label_cleanup.bind_positions(motion.groups, group_ids, gaussians["means"])
+    companions, moving_classes = label_cleanup.find_companions(motion.groups, group_ids, points, trainer.object_ids)
     opacities = to_opacities(gaussians["opacity_logits"])
-    found, changes = label_cleanup.clean(votes.numpy(), given, points, opacities, going, moving)
+    found, changes = label_cleanup.clean(votes.numpy(), given, points, opacities, companions, moving_classes)
     counts = dataclasses.astuple(changes)
     log.info("labels: %d by neighbours, %d by motion, %d outliers changed of %d", *counts)
     return {"labels": torch.from_numpy(found), label_cleanup.CHANGES: torch.tensor(counts)}

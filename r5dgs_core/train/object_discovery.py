@@ -33,14 +33,14 @@ from .trainer import Trainer
 
 log = logging.getLogger(__name__)
 
-JUDGES = 20  # number of views that decide if a part is needed
-GAIN = 2.0  # minimum gain in PSNR by the motion of a part, dB
-TOLERANCE = 0.02  # residual allowed for points that hardly move, normalised units
-SPECK = 0.1  # minimum size of a piece of a mask / size of its largest piece
-CAP = 12000  # maximum number of Gaussians in the short run
+MAX_VIEWS = 20  # maximum number of views in which the need for a part is measured
+MIN_GAIN_DB = 2.0  # minimum gain in PSNR by the motion of a part, dB
+MAX_MISFIT = 0.02  # maximum residual of points that hardly move, normalised units
+MIN_PIECE_SIZE = 0.1  # minimum size of a piece of a mask, relative to its largest piece
+MAX_GAUSSIANS = 12000  # maximum number of Gaussians in the short run
 
 
-def find(
+def find_masks(
     dataset: Dataset, config: Config, progress: Callable[[dict[str, Any]], None] | None = None
 ) -> list[np.ndarray] | None:
     """Find masks of the moving objects in the training views.
@@ -69,10 +69,10 @@ def find(
         if trainer.iteration % config.train.log_every == 0 or trainer.done:
             total = trainer.config.train.iterations
             progress({"event": packed_masks.PHASE, "done": trainer.iteration, "total": total, "unit": "steps"})
-    labels = parts(trainer, config)
+    labels = find_parts(trainer, config)
     count = int(labels.max(initial=-1)) + 1
     progress({"event": "prepare", "text": f"no masks: {count} moving part{'s' * (count != 1)} found"})
-    return masks(trainer, labels) if count > 0 else None
+    return draw_masks(trainer, labels) if count > 0 else None
 
 
 def _short(config: Config, last: float) -> Config:
@@ -92,7 +92,7 @@ def _short(config: Config, last: float) -> Config:
             "train.shadows": False,
             "init.placement": "scene",
             "densify.strategy": "share",
-            "densify.max_gaussians": min(cap, CAP) if cap else 0,
+            "densify.max_gaussians": min(cap, MAX_GAUSSIANS) if cap else 0,
             "field.size": "small",
             "field.width": 0,
             "field.horizon": max(round(last, 9), 0.0),
@@ -109,17 +109,17 @@ def _short(config: Config, last: float) -> Config:
     )
 
 
-def parts(trainer: Trainer, config: Config) -> np.ndarray:
+def find_parts(trainer: Trainer, config: Config) -> np.ndarray:
     """Return the rigidly moving part of each opaque Gaussian of a field, -1 for none. [N]"""
     rows, opacities = _movers(trainer)
     rows, opacities = rows[opacities > visibility.SEEN_OPACITY], opacities[opacities > visibility.SEEN_OPACITY]
     return _labelled(trainer, config, rows, opacities, _paths(trainer, rows))
 
 
-def sort(trainer: Trainer) -> np.ndarray:
+def sort_into_parts(trainer: Trainer) -> np.ndarray:
     """Return the rigidly moving part of each Gaussian of a trained field, -1 for none. [N]
 
-    Faint Gaussians, which `parts` excludes, join the part that they move with.
+    Faint Gaussians, which `find_parts` excludes, join the part that they move with.
 
     Args:
         trainer: A finished run of a field.
@@ -127,7 +127,7 @@ def sort(trainer: Trainer) -> np.ndarray:
     rows, opacities = _movers(trainer)
     paths, opaque = _paths(trainer, rows), opacities > visibility.SEEN_OPACITY
     labels = _labelled(trainer, trainer.config, rows[opaque], opacities[opaque], paths[opaque])
-    labels[rows] = motion_clusters.attach(paths, opacities, TOLERANCE, labels[rows])
+    labels[rows] = motion_clusters.attach(paths, opacities, MAX_MISFIT, labels[rows])
     return labels
 
 
@@ -137,8 +137,8 @@ def _labelled(
     """Return the part of each Gaussian from the paths of ``rows``; -1 for other Gaussians and for none. [N]"""
     rng = np.random.default_rng(config.train.seed)
     labels = np.full(len(trainer.gaussians), -1)
-    labels[rows] = motion_clusters.find(paths, opacities, TOLERANCE, config.discovery.fewest, rng)
-    return needed(trainer, labels)
+    labels[rows] = motion_clusters.find(paths, opacities, MAX_MISFIT, config.discovery.fewest, rng)
+    return without_unneeded_parts(trainer, labels)
 
 
 @torch.no_grad()
@@ -162,20 +162,20 @@ def _paths(trainer: Trainer, rows: np.ndarray) -> np.ndarray:
 
 
 @torch.no_grad()
-def needed(trainer: Trainer, labels: np.ndarray) -> np.ndarray:
+def without_unneeded_parts(trainer: Trainer, labels: np.ndarray) -> np.ndarray:
     """Remove parts whose motion the images do not need: fields also move uniform regions. [N]
 
     Each part is rendered in motion and in its mean state. A part is kept if its motion lowers the error by more than
-    `GAIN` dB over the pixels that show it in at least one of the two renderings.
+    `MIN_GAIN_DB` dB over the pixels that show it in at least one of the two renderings.
     """
     count = int(labels.max(initial=-1)) + 1
     errors, parts_of = np.zeros((2, count)), torch.from_numpy(labels)
     motion, gaussians = trainer.motion, trainer.gaussians
     assert isinstance(motion, FieldRepresentation)
-    mean = gating.rest(motion.motion, gaussians.means, gaussians.log_scales, trainer.times)
+    mean = gating.mean_state(motion.motion, gaussians.means, gaussians.log_scales, trainer.times)
     means, scales = gaussians.means + mean.offsets, (gaussians.log_scales + mean.log_scales).exp()
     quats = rotations.multiply(mean.quats, gaussians.quats)
-    for view in spread(trainer.views, JUDGES):
+    for view in spread(trainer.views, MAX_VIEWS):
         moving = trainer.splats(view.camera, view.t)
         error, ids = _drawn(trainer, view, moving, parts_of)
         for k in range(count):
@@ -191,7 +191,7 @@ def needed(trainer: Trainer, labels: np.ndarray) -> np.ndarray:
             errors[:, k] += float(error[region].sum()), float(error_at_rest[region].sum())
     gains = 10 * np.log10(np.maximum(errors[1], 1e-12) / np.maximum(errors[0], 1e-12))
     log.info("parts: %s dB by moving", np.round(gains, 1))
-    kept = gains > GAIN
+    kept = gains > MIN_GAIN_DB
     ranks = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
     return ranks[labels]
 
@@ -214,7 +214,7 @@ def _drawn(trainer: Trainer, view: TrainView, splats: PosedSplats, parts_of: Ten
 
 
 @torch.no_grad()
-def masks(trainer: Trainer, labels: np.ndarray) -> list[np.ndarray]:
+def draw_masks(trainer: Trainer, labels: np.ndarray) -> list[np.ndarray]:
     """Render the masks of the training views: k + 1 for part k, 0 for the background. [H, W]"""
     kind = np.uint8 if labels.max() < 255 else np.uint16
     result = []
@@ -231,7 +231,7 @@ def _without_specks(mask: np.ndarray) -> np.ndarray:
         pieces = np.zeros(mask.shape, np.int32)
         ndimage.label(mask == k, output=pieces)
         sizes = np.bincount(pieces.ravel())
-        good = sizes >= SPECK * sizes[1:].max(initial=0)
+        good = sizes >= MIN_PIECE_SIZE * sizes[1:].max(initial=0)
         good[0] = False
         kept[good[pieces]] = k
     return kept

@@ -22,7 +22,7 @@ from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted, TrainingError
 from ..render import warm_up
 from ..time_left import Phase, TimedProgress
-from . import checkpoint, checkpoint_content, finish, interrupt, learning_curves, probe, step_log
+from . import checkpoint, checkpoint_content, finish, held_out_psnr, interrupt, learning_curves, step_log
 from .identity import packed_masks
 from .representations.representation import TRACKS
 from .trainer import Trainer
@@ -101,7 +101,7 @@ class _Session:
         began_cpu: The same for the processor clock; None if the log of an older version has no processor time.
         resume_command: Command that resumes the run, for messages.
         progress: Called with a dictionary per event.
-        probe: Probe of the held-out views, or None.
+        held_out: Measurement of the PSNR on held-out views, or None.
         curves: Plot of the log.
     """
 
@@ -111,7 +111,7 @@ class _Session:
     began_cpu: float | None
     resume_command: str
     progress: TimedProgress
-    probe: probe.Probe | None
+    held_out: held_out_psnr.HeldOutPsnr | None
     curves: learning_curves.LearningCurves
 
 
@@ -140,7 +140,7 @@ def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]
         found = _found_masks(dataset, run.config, state, progress)
         progress({"event": "prepare", "text": "images, objects, background"})
         trainer = Trainer(dataset, run.config, found)
-        probe = _probe(trainer)
+        held_out = _held_out_psnr(trainer)
     if replaces:
         run = checkpoint.create_run(folder, dataset, request.config)
     if state is not None:
@@ -150,7 +150,7 @@ def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]
     began_cpu = step_log.processor_start(folder / checkpoint.LOG_FILE, began_cpu)
     curves = learning_curves.LearningCurves(run.folder)
     _plan(trainer, progress)
-    _complete(_Session(run, trainer, began, began_cpu, resume_command, progress, probe, curves))
+    _complete(_Session(run, trainer, began, began_cpu, resume_command, progress, held_out, curves))
     return run
 
 
@@ -209,7 +209,7 @@ def _found_masks(
 
         progress.estimate.add(Phase(packed_masks.PHASE, config.discovery.iterations, DISCOVERY_COST))
         progress.estimate.add(Phase("step", config.train.iterations))
-        return object_discovery.find(dataset, config, progress)
+        return object_discovery.find_masks(dataset, config, progress)
     packed = state.tensors.get(checkpoint_content.DISCOVERED_MASKS)
     sizes = [(view.camera.height, view.camera.width) for view in dataset.train]
     return None if packed is None else packed_masks.unpack(packed, sizes)
@@ -253,12 +253,12 @@ def take_step(trainer: Trainer, decision: int | None, progress: Progress) -> Non
         residual_trial.decide(trainer, progress)
 
 
-def _probe(trainer: Trainer) -> probe.Probe | None:
-    """Return the probe of the held-out views; None if there are none or ``train.probe_every`` is 0."""
+def _held_out_psnr(trainer: Trainer) -> held_out_psnr.HeldOutPsnr | None:
+    """Return the measurement on held-out views; None if there are none or ``train.probe_every`` is 0."""
     section = trainer.config.train
     if section.probe_every == 0 or not trainer.dataset.val:
         return None
-    return probe.Probe(trainer, section.probe_views)
+    return held_out_psnr.HeldOutPsnr(trainer, section.probe_views)
 
 
 def _complete(session: _Session) -> None:
@@ -274,14 +274,14 @@ def _complete(session: _Session) -> None:
 
 def _optimise(session: _Session) -> None:
     """Take the remaining steps, and write the log and checkpoints."""
-    trainer, probe = session.trainer, session.probe
+    trainer, held_out = session.trainer, session.held_out
     section = trainer.config.train
     decision = decision_step(trainer)
     with interrupt.collected() as asked, step_log.StepLog(session.run.folder / checkpoint.LOG_FILE) as steps:
         while not trainer.done:
             take_step(trainer, decision, session.progress)
-            look = probe is not None and (trainer.done or trainer.iteration % section.probe_every == 0)
-            if trainer.iteration % section.log_every == 0 or trainer.done or look:
+            due = held_out is not None and (trainer.done or trainer.iteration % section.probe_every == 0)
+            if trainer.iteration % section.log_every == 0 or trainer.done or due:
                 event = {
                     "event": "step",
                     "iteration": trainer.iteration,
@@ -292,8 +292,8 @@ def _optimise(session: _Session) -> None:
                 if session.began_cpu is not None:
                     event["cpu_seconds"] = time.process_time() - session.began_cpu
                 event = session.progress.timed(event)
-                if look and probe is not None:
-                    event["val_psnr"] = probe.psnr()
+                if due and held_out is not None:
+                    event["val_psnr"] = held_out.measure()
                 steps.append(event)
                 session.progress(event)
             stop = bool(asked)

@@ -29,7 +29,7 @@ from .densification import densifier
 from .densification import registry as densification
 from .identity import joint_identity, packed_masks
 from .initialization import run_start
-from .representations import fused_posing, registry, static
+from .representations import fused_posing, registry, still
 
 TARGET_BYTES = 1 << 30  # maximum size of the cache of training images as floats
 MAX_CAMERAS = 256  # maximum number of cameras in tests of visibility
@@ -42,7 +42,7 @@ class Trainer:
     Args:
         dataset: The data set.
         config: The run's configuration.
-        found: Discovered masks of the training views, if the data set has none; used for the initialisation only.
+        discovered_masks: Masks of the training views for the initialisation, if the data set has none.
 
     Raises:
         DatasetError: The training split is empty or cannot be read, or no Gaussian can be placed.
@@ -52,7 +52,7 @@ class Trainer:
         self,
         dataset: Dataset,
         config: Config,
-        found: Sequence[np.ndarray] | None = None,
+        discovered_masks: Sequence[np.ndarray] | None = None,
     ):
         torch.set_num_threads(config.train.threads)
         self.dataset = dataset
@@ -60,12 +60,14 @@ class Trainer:
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         self.behind = train_views.behind(dataset, config)
         self.views = train_views.load(dataset, self.normalization, self.behind)
-        self.found = None if found is None else packed_masks.pack(found)
-        shown = self.views if found is None else train_views.with_masks(self.views, found)
-        motion = registry.configured(config, still=static.applies(self.views, config))
+        self.discovered_masks = None if discovered_masks is None else packed_masks.pack(discovered_masks)
+        shown = self.views if discovered_masks is None else train_views.with_masks(self.views, discovered_masks)
+        motion = registry.configured(config, at_rest=still.applies(self.views, config))
         if not motion.moves:
             self.config = config = config.replace(**{"train.shading": False, "train.shadows": False})
-        start = run_start.initial_state(shown, self.normalization, dataset, config, motion, found is not None)
+        start = run_start.initial_state(
+            shown, self.normalization, dataset, config, motion, discovered_masks is not None
+        )
         self.gaussians: Gaussians = start.gaussians
         self.motion = registry.make(motion, start, config)
         self.times = start.tracks.times
@@ -86,7 +88,7 @@ class Trainer:
         self.distinct_cameras = [group[0].camera for group in train_views.by_camera(self.views, MAX_CAMERAS)]
         self.frozen = torch.zeros(0, dtype=torch.bool)
         self.optimizer = self.make_optimizer()
-        self.growth = densification.make(config, self._conditions(), len(self.gaussians))
+        self.densifier = densification.make(config, self._conditions(), len(self.gaussians))
         self._targets: dict[int, Tensor] = {}
 
     def _conditions(self) -> densifier.Conditions:
@@ -144,7 +146,7 @@ class Trainer:
             ) from error
         loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
         penalties = [self.motion.penalty(self.gaussians, self.iteration, self._labels)]
-        penalties.append(self.growth.penalty(self.gaussians))
+        penalties.append(self.densifier.penalty(self.gaussians))
         if self.identity is not None:
             penalties.append(self.identity.loss(self.gaussians, splats, view, self.iteration, features))
         total = loss
@@ -158,7 +160,7 @@ class Trainer:
         self._hide_harmonics()
         self._freeze_single_view_centres()
         self.optimizer.step()
-        self.growth.observe(stats, view.camera)
+        self.densifier.observe(stats, view.camera)
         self.iteration += 1
         self.running_loss = value if math.isnan(self.running_loss) else 0.98 * self.running_loss + 0.02 * value
         self._maintain()
@@ -233,7 +235,9 @@ class Trainer:
 
     def _maintain(self) -> None:
         self.motion.after_step(self.gaussians, self.iteration, self.generator)
-        self.growth.after_step(self.gaussians, self.optimizer, self.iteration, self.rates.at("means", self.iteration))
+        self.densifier.after_step(
+            self.gaussians, self.optimizer, self.iteration, self.rates.at("means", self.iteration)
+        )
         if len(self.gaussians) == 0:
             raise TrainingError(
                 f"step {self.iteration}: every Gaussian has become too faint or too wide and was removed; the last "
@@ -247,14 +251,14 @@ class Trainer:
         tensors |= self.motion.tensors()
         if self.identity is not None:
             tensors |= self.identity.tensors(self.gaussians)
-        if self.found is not None:
-            tensors[checkpoint_content.DISCOVERED_MASKS] = self.found
+        if self.discovered_masks is not None:
+            tensors[checkpoint_content.DISCOVERED_MASKS] = self.discovered_masks
         tensors["background"] = self.background.params["background"].detach()
         tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
         tensors["generator"] = self.generator.get_state()
         if len(self.frozen) == len(self.gaussians):
             tensors[checkpoint_content.FROZEN] = self.frozen
-        tensors |= self.growth.tensors()
+        tensors |= self.densifier.tensors()
         tensors |= optimizers.tensors(self.optimizer)
         x, y, z = (float(v) for v in self.dataset.origin + self.normalization.origin)
         return Checkpoint(
@@ -288,7 +292,7 @@ class Trainer:
             ) from error
         if any(len(t) != len(self.gaussians) for n, t in tensors.items() if n.startswith("gradients.")):
             raise CheckpointError(f"the checkpoint's 'gradients.*': expected {len(self.gaussians)} rows each")
-        self.growth.restore(tensors)
+        self.densifier.restore(tensors)
         self.frozen = tensors.get(checkpoint_content.FROZEN, torch.zeros(0, dtype=torch.bool))
         self.optimizer = self.make_optimizer()
         optimizers.restore(self.optimizer, tensors)

@@ -31,20 +31,20 @@ log = logging.getLogger(__name__)
 CHANGES = "label_changes"  # name of the counts in a checkpoint, in the order of `LabelChanges`
 
 NEIGHBOURS = 8
-OWN = 4.0  # weight of a Gaussian's own votes relative to its neighbourhood
-MOTION = 0.5  # weight of the group that it moves with relative to its neighbourhood
-DOUBT = 1.0  # votes with a trust of one half, pixels
+OWN_WEIGHT = 4.0  # weight of a Gaussian's own votes relative to its neighbourhood
+MOTION_WEIGHT = 0.5  # weight of the group that it moves with relative to its neighbourhood
+HALF_TRUST_VOTES = 1.0  # votes with a trust of one half, pixels
 # a Gaussian of an object keeps its label if more than this (trusted) share of the votes for its old and new label is
 # for the old one
 UNDECIDED = 0.55
 UNDECIDED_BACKGROUND = 0.45  # the same for Gaussians of the background
-APART = 5.0  # maximum link between members of an object / their typical spacing
-SMALL = 0.05  # share of an object's total opacity above which a part is never an outlier
-SUPPORTED = 0.65  # trusted share of a part's votes above which it is no outlier
+MAX_LINK = 5.0  # maximum link between members of an object / their typical spacing
+MAX_OUTLIER_SHARE = 0.05  # maximum share of an outlier part in the total opacity of its object
+MAX_OUTLIER_SUPPORT = 0.65  # maximum trusted share of the votes of an outlier part
 MIN_MEMBERS = 9  # minimum number of members for statistics of an object
-MOVES = 0.1  # displacement in radii above which an object counts as moving
-AGREED = 0.5  # median certainty of the objects below which the masks contradict each other
-AT_ONCE = 1 << 16  # Gaussians per block; bounds memory
+MIN_DISPLACEMENT = 0.1  # minimum displacement of moving objects, relative to their radius
+MIN_CERTAINTY = 0.5  # minimum median certainty of the objects; below it, the masks contradict each other
+BLOCK_SIZE = 1 << 16  # Gaussians per block; bounds memory
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ def clean(
     labels: np.ndarray,
     points: np.ndarray,
     opacities: np.ndarray,
-    going: np.ndarray | None = None,
-    moving: np.ndarray | None = None,
+    companion_classes: np.ndarray | None = None,
+    moving_classes: np.ndarray | None = None,
 ) -> tuple[np.ndarray, LabelChanges]:
     """Clean labels by neighbours, motion and outlier removal.
 
@@ -82,8 +82,8 @@ def clean(
         labels: Class of each Gaussian by the votes, or by its motion group if it has none. [N]
         points: Centres in the bind state. [N, 3]
         opacities: [N]
-        going: Class of the body that a Gaussian moves with, 0 for none; None if unknown. [N]
-        moving: Classes that differ from the background by their motion. [C] bool
+        companion_classes: Class of the body that a Gaussian moves with, 0 for none; None if unknown. [N]
+        moving_classes: Classes that differ from the background by their motion. [C] bool
 
     Returns:
         Classes [N] int64, and the counts of changes.
@@ -98,16 +98,16 @@ def clean(
     shares = votes / np.maximum(total, 1e-9)[:, None]
     sure = certainty(shares, start, total, opacities, nearest)
     measured = sure[1:][np.isfinite(sure[1:])]
-    if len(measured) and np.median(measured) < AGREED:
+    if len(measured) and np.median(measured) < MIN_CERTAINTY:
         log.warning("masks contradict each other about the objects: labels are not cleaned")
         return start, LabelChanges(gaussians=len(votes))
-    shares /= np.where(np.isnan(sure), 1.0, np.maximum(sure, AGREED)).astype(np.float32)
+    shares /= np.where(np.isnan(sure), 1.0, np.maximum(sure, MIN_CERTAINTY)).astype(np.float32)
     shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1e-9)
-    trust = total / (total + DOUBT)
-    pull = _pull(start, going, moving, count)
+    trust = total / (total + HALF_TRUST_VOTES)
+    pull = _pull(start, companion_classes, moving_classes, count)
     found, motion = start.copy(), np.zeros(len(votes), bool)
-    for first in range(0, len(votes), AT_ONCE):
-        rows = np.arange(first, min(first + AT_ONCE, len(votes)))
+    for first in range(0, len(votes), BLOCK_SIZE):
+        rows = np.arange(first, min(first + BLOCK_SIZE, len(votes)))
         near = distances[rows], nearest[rows]
         found[rows], motion[rows] = _decide(rows, shares, trust, start, opacities, *near, pull)
     found = _keep_objects(start, found, count)
@@ -136,7 +136,7 @@ def certainty(
     Returns:
         Median share per class; nan for classes with fewer than nine interior Gaussians. [C]
     """
-    inner = (labels[nearest] == labels[:, None]).all(axis=1) & (total > DOUBT)
+    inner = (labels[nearest] == labels[:, None]).all(axis=1) & (total > HALF_TRUST_VOTES)
     inner &= opacities > visibility.SEEN_OPACITY
     result = np.full(shares.shape[1], np.nan)
     for k in np.unique(labels[inner]):
@@ -154,7 +154,7 @@ def changes_of(tensors: Mapping[str, Any]) -> dict[str, int] | None:
     return dict(zip(names, map(int, tensors[CHANGES]), strict=True))
 
 
-def bound(groups: Sequence[GroupTrack], motion_ids: np.ndarray, means: np.ndarray) -> np.ndarray:
+def bind_positions(groups: Sequence[GroupTrack], motion_ids: np.ndarray, means: np.ndarray) -> np.ndarray:
     """Return the centres in the bind state, at the last knot of their groups' tracks. [N, 3]
 
     Args:
@@ -170,7 +170,7 @@ def bound(groups: Sequence[GroupTrack], motion_ids: np.ndarray, means: np.ndarra
     return points
 
 
-def companions(
+def find_companions(
     groups: Sequence[GroupTrack], motion_ids: np.ndarray, points: np.ndarray, object_ids: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the body that each Gaussian moves with, for `clean`.
@@ -186,7 +186,7 @@ def companions(
         tenth of their radius [C] bool.
     """
     rows = {int(object_id): row for row, object_id in enumerate(object_ids)}
-    owners, moving = np.zeros(len(groups), np.int64), np.zeros(len(object_ids), bool)
+    owners, moving_classes = np.zeros(len(groups), np.int64), np.zeros(len(object_ids), bool)
     for g, group in enumerate(groups):
         if group.role != "body":
             continue
@@ -198,25 +198,24 @@ def companions(
         turned = rotations.multiply(group.quats, rotations.conjugate(group.quats[-1]))
         chords = 2 * np.linalg.norm(turned[:, 1:], axis=1)  # 2 sin(angle / 2)
         went = np.linalg.norm(group.displacements - group.displacements[-1], axis=1) + chords * radius
-        moving[owners[g]] |= bool(went.max() > MOVES * radius)
-    return owners[motion_ids], moving
+        moving_classes[owners[g]] |= bool(went.max() > MIN_DISPLACEMENT * radius)
+    return owners[motion_ids], moving_classes
 
 
 def _pull(
-    labels: np.ndarray, going: np.ndarray | None, moving: np.ndarray | None, count: int
+    labels: np.ndarray, companion_classes: np.ndarray | None, moving_classes: np.ndarray | None, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the class that the motion of each Gaussian votes for, and the weight of this vote.
 
     The weight is 0 if that class is at rest. A vote for class 0 (background) has weight 0 if the Gaussian's own class
     is at rest.
     """
-    if going is None or moving is None:
+    if companion_classes is None or moving_classes is None:
         return np.zeros(len(labels), np.int64), np.zeros(len(labels), np.float32)
-    known_moving = np.append(moving, np.zeros(count - len(moving), bool))
+    known_moving = np.append(moving_classes, np.zeros(count - len(moving_classes), bool))
     known_moving[0] = False
-    return going.astype(np.int64), (MOTION * np.where(going > 0, known_moving[going], known_moving[labels])).astype(
-        np.float32
-    )
+    counts = np.where(companion_classes > 0, known_moving[companion_classes], known_moving[labels])
+    return companion_classes.astype(np.int64), (MOTION_WEIGHT * counts).astype(np.float32)
 
 
 def _decide(
@@ -242,10 +241,10 @@ def _decide(
     for column, weight in zip(nearest.T, weights.T, strict=True):
         around += weight[:, None] * shares[column]
     whole = weights.sum(axis=1)
-    tally = OWN * trust[rows, None] * shares[rows] + around / np.maximum(whole, 1e-9)[:, None]
+    tally = OWN_WEIGHT * trust[rows, None] * shares[rows] + around / np.maximum(whole, 1e-9)[:, None]
     alone = tally.argmax(axis=1)
-    companion, weight = (values[rows] for values in pull)
-    tally[np.arange(len(rows)), companion] += weight
+    preferred, weight = (values[rows] for values in pull)
+    tally[np.arange(len(rows)), preferred] += weight
     new = tally.argmax(axis=1)
     said, other = shares[rows, own], shares[rows, new]
     sure = trust[rows] * said / np.maximum(said + other, 1e-9)
@@ -278,8 +277,8 @@ def _without_outliers(
         mass = np.bincount(parts, opacities[rows], count)
         seen = np.bincount(parts, total[rows], count)
         own = np.bincount(parts, total[rows] * shares[rows, k], count) / np.maximum(seen, 1e-9)
-        weak = own * seen / (seen + DOUBT) < SUPPORTED
-        for part in np.flatnonzero(weak & (mass < SMALL * mass.sum())):
+        weak = own * seen / (seen + HALF_TRUST_VOTES) < MAX_OUTLIER_SUPPORT
+        for part in np.flatnonzero(weak & (mass < MAX_OUTLIER_SHARE * mass.sum())):
             members = rows[parts == part]
             rest = votes[members].sum(axis=0)
             rest[k] = 0.0
@@ -288,12 +287,12 @@ def _without_outliers(
 
 
 def _parts(points: np.ndarray, opacities: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the connected component of each point and their number; links reach `APART` times the typical spacing."""
+    """Return the connected component of each point and their number; links reach `MAX_LINK` typical spacings."""
     width = min(NEIGHBOURS + 1, len(points))
     distances, nearest = map(np.asarray, spatial.KDTree(points).query(points, width))
     shown = visibility.seen(opacities)
     spacing = np.median(distances[shown if shown.any() else slice(None), width // 2])
-    near = distances <= APART * spacing
+    near = distances <= MAX_LINK * spacing
     rows = np.repeat(np.arange(len(points)), width)[near.ravel()]
     links = sparse.coo_matrix((np.ones(len(rows)), (rows, nearest.ravel()[near.ravel()])), (len(points),) * 2)
     count, parts = csgraph.connected_components(links, directed=False)

@@ -1,1 +1,1 @@
-"""Motion representations of training: tracks, field and static, with residuals and regrouping."""
+"""Motion representations of training: tracks, field and still, with residuals and regrouping."""

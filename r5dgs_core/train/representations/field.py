@@ -90,7 +90,7 @@ class FieldRepresentation(Representation):
 
     @property
     def _measured(self) -> bool:
-        return gating.kind(self._tracks.bodies, self._config) == "measured"
+        return gating.mover_rule(self._tracks.bodies, self._config) == "measured"
 
     def movers(self, gaussians: Gaussians) -> Tensor:
         """Return the rows that the networks move; none during the warm-up. [R] int64"""
@@ -132,7 +132,7 @@ class FieldRepresentation(Representation):
         """Fit field and TRD to the positions of the objects before the first image."""
         section = self._config.field
         self._iteration = 0
-        gating.release(gaussians, self._tracks, self._config)
+        gating.release_background(gaussians, self._tracks, self._config)
         if self._tracks.bodies < 2 or section.place_steps == 0:
             return
         self.fit(gaussians, self._tracks, section.place_steps, section.trd_steps, draw)
@@ -143,9 +143,9 @@ class FieldRepresentation(Representation):
         """Fit field and TRD to the motion of tracks, without images; Gaussians of no body are fitted to rest."""
         rows = self.movers(gaussians)
         means, ids = gaussians.means.detach()[rows], gaussians.motion_ids[rows]
-        groups = gating.bodies_of(ids, tracks, 0)
+        groups = gating.rigid_groups(ids, tracks, 0)
         field_fitting.fit_field(self.motion, means, groups, tracks, self._first, field_steps, draw)
-        groups = gating.bodies_of(ids, tracks, field_fitting.ALONE)
+        groups = gating.rigid_groups(ids, tracks, field_fitting.ALONE)
         field_fitting.fit_trd(self.motion, means, groups, trd_steps, self._config.field.twist, draw)
 
     def move(self, gaussians: Gaussians, t: float, draw: torch.Generator | None = None) -> MovedGaussians:
@@ -176,10 +176,10 @@ class FieldRepresentation(Representation):
         terms: list[Tensor] = []
         calm = self._config.field.calm
         if calm > 0 and self._measured and iteration < gating.gate_step(self._config):
-            terms.append(calm * gating.restlessness(moved.offsets, moved.quats, moved.log_scales))
+            terms.append(calm * gating.distance_from_rest(moved.offsets, moved.quats, moved.log_scales))
         if self._tracks.bodies < 2:
             return terms[0] if terms else None
-        groups = gating.bodies_of(gaussians.motion_ids[moved.rows], self._tracks, 0)
+        groups = gating.rigid_groups(gaussians.motion_ids[moved.rows], self._tracks, 0)
         if self._config.field.stiffness > 0:
             after = moved.before + moved.offsets
             bent = rigidity.stiffness(moved.before, after, moved.quats, moved.log_scales, groups)
@@ -199,13 +199,13 @@ class FieldRepresentation(Representation):
         self._iteration = iteration
         if self._measured and iteration == gating.gate_step(self._config):
             rows = self.movers(gaussians)
-            still = gating.settle(gaussians, rows, self.motion, self.times, section.still)
-            log.info("step %d: %d of %d Gaussians rest", iteration, len(still), len(gaussians))
+            resting = gating.freeze_resting(gaussians, rows, self.motion, self.times, section.still)
+            log.info("step %d: %d of %d Gaussians rest", iteration, len(resting), len(gaussians))
         every = round(section.trd_every * self._config.train.iterations)
         if section.trd_steps > 0 and every > 0 and iteration % every == 0:
             rows = self.movers(gaussians)
             means = gaussians.means.detach()[rows]
-            groups = gating.bodies_of(gaussians.motion_ids[rows], self._tracks, field_fitting.ALONE)
+            groups = gating.rigid_groups(gaussians.motion_ids[rows], self._tracks, field_fitting.ALONE)
             field_fitting.fit_trd(self.motion, means, groups, section.trd_steps, section.twist, draw)
 
     def tensors(self) -> dict[str, Tensor]:

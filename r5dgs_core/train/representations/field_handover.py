@@ -31,7 +31,7 @@ def from_tracks(
     with torch.no_grad():
         made.light.copy_(light)
     pose_at_knot(gaussians, tracks, first, light.detach())
-    gating.release(gaussians, tracks, config)
+    gating.release_background(gaussians, tracks, config)
     made.fit(gaussians, tracks, config.field.distill_steps, config.field.distill_steps, draw)
     return made
 

@@ -175,8 +175,8 @@ def _groups(
         shadows: Caster (a class) of each group from B on.
         normal: Normal of the plane that carries shadows. [3]
     """
-    still = rotations.identity(path.shape[1]), np.zeros((path.shape[1], 3))
-    groups = [GroupTrack(0, "pinned", np.zeros(3), *still, observed[0])]
+    unturned, nowhere = rotations.identity(path.shape[1]), np.zeros((path.shape[1], 3))
+    groups = [GroupTrack(0, "pinned", np.zeros(3), unturned, nowhere, observed[0])]
     for row in range(1, len(object_ids)):
         members = ids == row
         center, quat, shift = _track(path[members], regroup.fit_weights(path[members, -1], opacities[members]))
@@ -189,7 +189,7 @@ def _groups(
             matrix = np.zeros((3, 3))
         center = np.average(path[members, -1], axis=0, weights=weights) if members.any() else leader.center
         shift = leader.displacements @ matrix.T
-        groups.append(GroupTrack(leader.object_id, "shadow", center, still[0], shift, leader.observed, caster, matrix))
+        groups.append(GroupTrack(leader.object_id, "shadow", center, unturned, shift, leader.observed, caster, matrix))
     return groups
 
 

@@ -20,6 +20,7 @@ from ...config.config import Config
 from ...model.gaussians import Gaussians
 from ...model.tracks import Tracks
 from ...motion import rotations
+from ...scene.sampling import spread
 from .field_motion import FieldMotion
 
 TURN = 0.1  # weight of differences of quaternions and log scales relative to distances in normalised units
@@ -32,7 +33,7 @@ def free_id(tracks: Tracks) -> int:
     return tracks.groups
 
 
-def kind(bodies: int, config: Config) -> str:
+def mover_rule(bodies: int, config: Config) -> str:
     """Return ``field.movers``, with ``measured`` in place of ``labelled`` if there are no masks."""
     return "measured" if config.field.movers == "labelled" and bodies < 2 else config.field.movers
 
@@ -48,18 +49,18 @@ def movers(motion_ids: Tensor, bodies: int, times: np.ndarray, config: Config) -
     """
     if config.needs.tracks == "off" or len(times) < 2:
         return torch.zeros(0, dtype=torch.int64)
-    if kind(bodies, config) == "all":
+    if mover_rule(bodies, config) == "all":
         return torch.arange(len(motion_ids))
     return (motion_ids > 0).nonzero()[:, 0]
 
 
-def release(gaussians: Gaussians, tracks: Tracks, config: Config) -> None:
+def release_background(gaussians: Gaussians, tracks: Tracks, config: Config) -> None:
     """Let the networks also move Gaussians of the background, in place, if movers are measured."""
-    if kind(tracks.bodies, config) == "measured":
+    if mover_rule(tracks.bodies, config) == "measured":
         gaussians.motion_ids[gaussians.motion_ids == 0] = free_id(tracks)
 
 
-def bodies_of(motion_ids: Tensor, tracks: Tracks, outside: int) -> Tensor:
+def rigid_groups(motion_ids: Tensor, tracks: Tracks, outside: int) -> Tensor:
     """Return motion groups, with ``outside`` for Gaussians that belong to no rigid group. [N]"""
     one = (motion_ids < free_id(tracks)) & ((motion_ids > 0) | (tracks.bodies > 1))
     return torch.where(one, motion_ids, outside)
@@ -72,7 +73,7 @@ def gate_step(config: Config) -> int:
     return max(round(begun + section.gate * (steps - begun)), config.curriculum.steps(steps)[1])
 
 
-def restlessness(offsets: Tensor, quats: Tensor, log_scales: Tensor) -> Tensor:
+def distance_from_rest(offsets: Tensor, quats: Tensor, log_scales: Tensor) -> Tensor:
     """Return the mean distance of Gaussians from their canonical state.
 
     The distance is not squared, so that Gaussians that no image moves come to rest exactly.
@@ -88,24 +89,24 @@ def restlessness(offsets: Tensor, quats: Tensor, log_scales: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Rest:
+class MeanState:
     """Mean state of Gaussians over some times.
 
     Attributes:
         offsets: Offset of the mean centre from the canonical one. [R, 3]
         quats: Rotation from the canonical to the mean orientation, unit wxyz. [R, 4]
         log_scales: Change from the canonical to the mean log scales. [R, 3]
-        unrest: Upper bound of the displacement of any point of the one-sigma ellipsoid from the mean state. [R]
+        deviation: Upper bound of the displacement of any point of the one-sigma ellipsoid from the mean state. [R]
     """
 
     offsets: Tensor
     quats: Tensor
     log_scales: Tensor
-    unrest: Tensor
+    deviation: Tensor
 
 
 @torch.no_grad()
-def rest(motion: FieldMotion, means: Tensor, log_scales: Tensor, times: np.ndarray) -> Rest:
+def mean_state(motion: FieldMotion, means: Tensor, log_scales: Tensor, times: np.ndarray) -> MeanState:
     """Return the mean state of Gaussians over some times, and their deviation from it.
 
     Args:
@@ -123,12 +124,12 @@ def rest(motion: FieldMotion, means: Tensor, log_scales: Tensor, times: np.ndarr
     largest = (log_scales + size).max(-1).values.exp()
     angles = 2 * torch.acos((turns * turn).sum(-1).abs().clamp(max=1))
     growth = torch.expm1((sizes - size).abs().max(-1).values)
-    unrest = (offsets - offset).norm(dim=-1) + largest * (angles + growth)
-    return Rest(offset, turn, size, unrest.max(0).values)
+    deviations = (offsets - offset).norm(dim=-1) + largest * (angles + growth)
+    return MeanState(offset, turn, size, deviations.max(0).values)
 
 
 @torch.no_grad()
-def settle(gaussians: Gaussians, rows: Tensor, motion: FieldMotion, times: np.ndarray, limit: float) -> Tensor:
+def freeze_resting(gaussians: Gaussians, rows: Tensor, motion: FieldMotion, times: np.ndarray, limit: float) -> Tensor:
     """Freeze Gaussians at rest in their mean state, in place.
 
     Args:
@@ -141,12 +142,12 @@ def settle(gaussians: Gaussians, rows: Tensor, motion: FieldMotion, times: np.nd
     Returns:
         Rows that were frozen. [<= R] int64
     """
-    sampled = times[np.unique(np.linspace(0, len(times) - 1, SAMPLES).round().astype(int))]
-    found = rest(motion, gaussians.means[rows], gaussians.log_scales[rows], sampled)
-    still = found.unrest < limit
-    chosen = rows[still]
-    gaussians.means[chosen] += found.offsets[still]
-    gaussians.quats[chosen] = rotations.multiply(found.quats[still], gaussians.quats[chosen])
-    gaussians.log_scales[chosen] += found.log_scales[still]
+    sampled = np.array(spread(times.tolist(), SAMPLES))
+    found = mean_state(motion, gaussians.means[rows], gaussians.log_scales[rows], sampled)
+    resting = found.deviation < limit
+    chosen = rows[resting]
+    gaussians.means[chosen] += found.offsets[resting]
+    gaussians.quats[chosen] = rotations.multiply(found.quats[resting], gaussians.quats[chosen])
+    gaussians.log_scales[chosen] += found.log_scales[resting]
     gaussians.motion_ids[chosen] = 0
     return chosen

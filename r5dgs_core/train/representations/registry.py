@@ -8,14 +8,14 @@ from __future__ import annotations
 from ...config.config import Config
 from ...errors import CheckpointError
 from ..initialization import initialize
-from . import static
+from . import still
 from .representation import FIELD, STILL, TRACKS, Representation
 
 
 def by_name(name: str) -> type[Representation]:
     """Return the representation of a name in checkpoints. Raises CheckpointError if this version does not have it."""
     if name == STILL:
-        return static.StillRepresentation
+        return still.StillRepresentation
     if name == TRACKS:
         from .tracks import TracksRepresentation
 
@@ -28,9 +28,9 @@ def by_name(name: str) -> type[Representation]:
     raise CheckpointError(f"the checkpoint was trained with representation '{name}'; this version supports {known}")
 
 
-def configured(config: Config, still: bool = False) -> type[Representation]:
-    """Return the final representation of a run: the configured one, or that of a static scene if ``still``."""
-    return by_name(STILL if still else config.train.representation)
+def configured(config: Config, at_rest: bool = False) -> type[Representation]:
+    """Return the final representation of a run: the configured one, or that of a static scene if ``at_rest``."""
+    return by_name(STILL if at_rest else config.train.representation)
 
 
 def make(motion: type[Representation], start: initialize.InitialState, config: Config) -> Representation:
@@ -42,7 +42,7 @@ def make(motion: type[Representation], start: initialize.InitialState, config: C
         config: The run's configuration.
     """
     if not motion.moves:
-        return static.StillRepresentation(start)
+        return still.StillRepresentation(start)
     from . import tracks as tracks_representation
 
     if motion.name == TRACKS or config.field.tracks_share > 0:

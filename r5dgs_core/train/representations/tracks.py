@@ -204,8 +204,8 @@ class TracksRepresentation(Representation):
         displacements = tracks.params["translations"].detach().numpy().astype(np.float64)
         centers = tracks.centers.numpy().astype(np.float64)
         follow = tracks.follow_matrix().detach().numpy().astype(np.float64)
-        still, nowhere = rotations.identity(len(tracks.times)), np.zeros((len(tracks.times), 3))
-        groups = [GroupTrack(0, "pinned", centers[0], still, nowhere, np.ones(len(tracks.times), bool))]
+        unturned, nowhere = rotations.identity(len(tracks.times)), np.zeros((len(tracks.times), 3))
+        groups = [GroupTrack(0, "pinned", centers[0], unturned, nowhere, np.ones(len(tracks.times), bool))]
         for body in range(1, tracks.bodies):
             groups.append(
                 GroupTrack(
@@ -223,7 +223,7 @@ class TracksRepresentation(Representation):
                     int(object_ids[owners[caster]]),
                     "shadow",
                     centers[caster],
-                    still,
+                    unturned,
                     displacements[caster] @ follow.T,
                     observed[owners[caster] - 1],
                     caster,

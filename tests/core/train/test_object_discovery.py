@@ -41,7 +41,7 @@ def overlap(found, truth, a, b):
 def test_moving_objects_are_found_and_separated(unmasked, tiny):
     config = tiny_datasets.settings("discovery.iterations=1000", "densify.stop=0.6")
     events = []
-    found = object_discovery.find(datasets.read(unmasked.root), config, events.append)
+    found = object_discovery.find_masks(datasets.read(unmasked.root), config, events.append)
     assert found is not None and [event["event"] for event in events] == ["prepare", "prepare"]
     truth = true_masks(tiny)
     ids = range(1, max(int(mask.max()) for mask in found) + 1)
@@ -56,15 +56,15 @@ def test_a_run_searches_only_if_necessary(unmasked, tiny):
     assert not training_needs.discovery(datasets.read(tiny.root), config)
     for off in ("discovery.iterations=0", "needs.tracks='off'", "train.representation='field'"):
         assert not training_needs.discovery(datasets.read(unmasked.root), tiny_datasets.settings(off))
-        assert object_discovery.find(datasets.read(unmasked.root), tiny_datasets.settings(off)) is None
+        assert object_discovery.find_masks(datasets.read(unmasked.root), tiny_datasets.settings(off)) is None
     field = tiny_datasets.settings("train.representation='field'", "field.tracks_share=0.2")
     assert training_needs.discovery(datasets.read(unmasked.root), field)
 
 
 def test_static_scenes_get_no_masks(unmasked, monkeypatch):
-    monkeypatch.setattr(object_discovery, "parts", lambda trainer, config: np.full(len(trainer.gaussians), -1))
+    monkeypatch.setattr(object_discovery, "find_parts", lambda trainer, config: np.full(len(trainer.gaussians), -1))
     config = tiny_datasets.settings("discovery.iterations=2")
-    assert object_discovery.find(datasets.read(unmasked.root), config) is None
+    assert object_discovery.find_masks(datasets.read(unmasked.root), config) is None
 
 
 def test_found_masks_start_a_run_like_given_ones(unmasked, tiny):
@@ -84,7 +84,7 @@ def test_a_resumed_run_keeps_the_masks_that_it_began_with(unmasked, tiny, tmp_pa
         calls.append(config)
         return true_masks(tiny)
 
-    monkeypatch.setattr(object_discovery, "find", find)
+    monkeypatch.setattr(object_discovery, "find_masks", find)
     config = tiny_datasets.settings(*BRIEF, "train.checkpoint_every=20")
     whole = run.train(unmasked.root, tmp_path / "whole", config)
     expected = checkpoint.load(whole.folder).tensors
@@ -138,7 +138,7 @@ def test_a_field_without_masks_groups_moving_gaussians_at_the_end(unmasked, tmp_
         sorted_ones.append(labels)
         return labels
 
-    monkeypatch.setattr(object_discovery, "sort", sort)
+    monkeypatch.setattr(object_discovery, "sort_into_parts", sort)
     events = []
     made = run.train(unmasked.root, tmp_path / "run", config, progress=events.append)
     assert "2 moving parts found" in [event["text"] for event in events if event["event"] == "prepare"][-1]

@@ -68,8 +68,8 @@ def test_strong_votes_are_never_overruled():
     points, truth, opacities = scene()
     inner = np.flatnonzero(truth == LEFT)[:30]
     weights, said = plant(votes_for(truth), truth, inner, RIGHT, 0.8)
-    going, moving = truth, np.ones(4, bool)
-    found, changes = label_cleanup.clean(weights, said, points, opacities, going, moving)
+    companions, moving = truth, np.ones(4, bool)
+    found, changes = label_cleanup.clean(weights, said, points, opacities, companions, moving)
     np.testing.assert_array_equal(found, said)
     assert changes == label_cleanup.LabelChanges(gaussians=len(truth))
 
@@ -180,8 +180,8 @@ def test_the_numbers_of_the_objects_and_the_order_of_the_gaussians_do_not_matter
     weights = votes_for(truth, 0.9) + PIXELS * draw.random((len(truth), 1)) * draw.dirichlet(
         np.full(4, 0.3), len(truth)
     )
-    said, going, moving = weights.argmax(1), truth, np.array([False, True, False, True])
-    found, changes = label_cleanup.clean(weights, said, points, opacities, going, moving)
+    said, companions, moving = weights.argmax(1), truth, np.array([False, True, False, True])
+    found, changes = label_cleanup.clean(weights, said, points, opacities, companions, moving)
     assert (found != said).sum() > 0
     name = np.array([0, 3, 1, 2])  # of each class; the background stays what it is
     renamed = np.empty_like(weights)
@@ -190,7 +190,7 @@ def test_the_numbers_of_the_objects_and_the_order_of_the_gaussians_do_not_matter
     told[name] = moving
     order = draw.permutation(len(truth))
     again, same = label_cleanup.clean(
-        renamed[order], name[said][order], points[order], opacities[order], name[going][order], told
+        renamed[order], name[said][order], points[order], opacities[order], name[companions][order], told
     )
     np.testing.assert_array_equal(again, name[found][order])
     assert same == changes
@@ -227,12 +227,12 @@ def test_companions_are_bodies_that_move_and_the_bind_state_is_at_the_last_knot(
     ]
     ids = np.repeat(np.arange(5), 20)
     means = np.random.default_rng(0).normal(scale=0.3, size=(100, 3))
-    points = label_cleanup.bound(made, ids, means)
+    points = label_cleanup.bind_positions(made, ids, means)
     np.testing.assert_allclose(points[ids == 0], means[ids == 0])
     np.testing.assert_allclose(points[ids == 1], [2, 0, 0] + means[ids == 1] * [-1, -1, 1], atol=1e-12)
     np.testing.assert_allclose(points[ids == 4], means[ids == 4] + [0.4, 0, 0])
-    going, moving = label_cleanup.companions(made, ids, points, np.array([0, 4, 7, 9]))
-    assert going.tolist() == np.repeat([0, 2, 3, 1, 0], 20).tolist()
+    companions, moving = label_cleanup.find_companions(made, ids, points, np.array([0, 4, 7, 9]))
+    assert companions.tolist() == np.repeat([0, 2, 3, 1, 0], 20).tolist()
     assert moving.tolist() == [False, False, True, True]
 
 

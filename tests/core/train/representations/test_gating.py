@@ -63,11 +63,11 @@ def test_only_gaussians_that_move_stay_in_the_networks():
     motion = Moving(shift, turn, stretch)
     before = motion.at(gaussians.means.detach(), 0.375)
     means, quats = gaussians.means.detach() + before.offsets, rotations.multiply(before.quats, gaussians.quats.detach())
-    still = gating.settle(gaussians, torch.arange(7), motion, TIMES, 0.01)
-    assert still.tolist() == [0, 1, 3, 5] == (gaussians.motion_ids == 0).nonzero()[:, 0].tolist()
-    torch.testing.assert_close(gaussians.means.detach()[still], means[still], atol=1e-5, rtol=0)
+    resting = gating.freeze_resting(gaussians, torch.arange(7), motion, TIMES, 0.01)
+    assert resting.tolist() == [0, 1, 3, 5] == (gaussians.motion_ids == 0).nonzero()[:, 0].tolist()
+    torch.testing.assert_close(gaussians.means.detach()[resting], means[resting], atol=1e-5, rtol=0)
     turned = (gaussians.quats.detach() * quats).sum(-1).abs() / quats.square().sum(-1)
-    torch.testing.assert_close(turned[still], torch.ones(4), atol=1e-5, rtol=0)
+    torch.testing.assert_close(turned[resting], torch.ones(4), atol=1e-5, rtol=0)
     moving = torch.tensor([2, 4, 6])
     untouched = some_gaussians(7)
     for name, value in gaussians.params.items():
@@ -90,21 +90,25 @@ def test_the_picture_does_not_jump_and_resting_gaussians_are_never_evaluated_aga
         trainer.step()
     rows = trainer.motion.movers(trainer.gaussians)
     assert len(rows) == len(trainer.gaussians) and trainer.first_time == 2
-    found = gating.rest(trainer.motion.motion, trainer.gaussians.means, trainer.gaussians.log_scales, trainer.times)
-    limit = min(float(found.unrest.median()), 0.02)
+    found = gating.mean_state(
+        trainer.motion.motion, trainer.gaussians.means, trainer.gaussians.log_scales, trainer.times
+    )
+    limit = min(float(found.deviation.median()), 0.02)
     camera = trainer.views[0].camera
     with torch.no_grad():
         before = [trainer.splats(camera, float(t)).means for t in trainer.times]
-    still = gating.settle(trainer.gaussians, rows, trainer.motion.motion, trainer.times, limit)
-    assert 0 < len(still) < len(rows)
+    resting = gating.freeze_resting(trainer.gaussians, rows, trainer.motion.motion, trainer.times, limit)
+    assert 0 < len(resting) < len(rows)
     moving = trainer.motion.movers(trainer.gaussians)
-    assert sorted([*moving.tolist(), *still.tolist()]) == rows.tolist()
+    assert sorted([*moving.tolist(), *resting.tolist()]) == rows.tolist()
     with torch.no_grad():
         after = [trainer.splats(camera, float(t)).means for t in trainer.times]
-    assert all(torch.equal(a[still], after[0][still]) for a in after)
+    assert all(torch.equal(a[resting], after[0][resting]) for a in after)
     assert all(torch.equal(a[moving], b[moving]) for a, b in zip(after, before, strict=True))
-    assert max(float((a - b)[still].norm(dim=1).max()) for a, b in zip(after, before, strict=True)) < 1.1 * limit
-    densifier.grow(trainer.gaussians, trainer.optimizer, still[:3], torch.zeros(3, dtype=torch.bool), trainer.generator)
+    assert max(float((a - b)[resting].norm(dim=1).max()) for a, b in zip(after, before, strict=True)) < 1.1 * limit
+    densifier.grow(
+        trainer.gaussians, trainer.optimizer, resting[:3], torch.zeros(3, dtype=torch.bool), trainer.generator
+    )
     assert (trainer.gaussians.motion_ids[-3:] == 0).all()
 
 
@@ -136,7 +140,7 @@ def test_the_gate_closes_once_every_time_takes_part_and_a_resumed_run_does_the_s
 def test_labelled_gating_falls_back_to_measured_without_masks(unmasked, tiny):
     for data, expected in ((unmasked, "measured"), (tiny, "labelled")):
         trainer = make(data)
-        assert gating.kind(len(trainer.object_ids), trainer.config) == expected
+        assert gating.mover_rule(len(trainer.object_ids), trainer.config) == expected
     trainer = make(tiny, "field.movers='measured'")
     trainer.step()
     assert len(trainer.motion.movers(trainer.gaussians)) == len(trainer.gaussians)

@@ -1,6 +1,6 @@
 """PSNR on held-out views during training, and on the training views after it.
 
-Probing does not affect the results of the run.
+Measuring does not affect the results of the run.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 TRAINING_VIEWS = 150  # maximum number of compared training views
 
 
-class Probe:
+class HeldOutPsnr:
     """Views of the split ``val``, spread evenly, in the trainer's coordinates.
 
     Args:
@@ -43,11 +43,11 @@ class Probe:
         return len(self._views)
 
     @torch.no_grad()
-    def psnr(self) -> float:
+    def measure(self) -> float:
         """Return the current mean PSNR on the views, dB, for colours of 8 bits. The run's random state is preserved."""
         state = self._trainer.generator.get_state()
         with torch.random.fork_rng(devices=[]):
-            found = [psnr(self._trainer.render(camera, t).numpy(), image) for _, camera, t, image in self._views]
+            found = [psnr_8_bit(self._trainer.render(camera, t).numpy(), image) for _, camera, t, image in self._views]
         self._trainer.generator.set_state(state)
         return float(np.mean(found))
 
@@ -66,7 +66,7 @@ def training_psnr(
         DatasetError: An image is missing or cannot be read.
     """
     chosen = spread(dataset.train, TRAINING_VIEWS)
-    return float(np.mean([psnr(draw(view), _load(view, behind)) for view in chosen]))
+    return float(np.mean([psnr_8_bit(draw(view), _load(view, behind)) for view in chosen]))
 
 
 def _load(view: datasets.View, behind: np.ndarray | None) -> np.ndarray:
@@ -74,7 +74,7 @@ def _load(view: datasets.View, behind: np.ndarray | None) -> np.ndarray:
     return np.round(datasets.load_image(view, behind) * 255).astype(np.uint8)
 
 
-def psnr(image: np.ndarray, target: np.ndarray) -> float:
+def psnr_8_bit(image: np.ndarray, target: np.ndarray) -> float:
     """Return the PSNR of colours in [0, 1] against 8-bit colours, dB; 99 for equal images. [H, W, 3]"""
     rounded = np.round(np.clip(image, 0, 1) * 255)
     error = float(np.mean(((rounded - target) / 255) ** 2))

@@ -14,7 +14,7 @@ from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
 from r5dgs_core.train import normalization
 from r5dgs_core.train import train_views as training_views
-from r5dgs_core.train.representations import static
+from r5dgs_core.train.representations import still as representation
 from tests.support import processes, tiny_datasets
 
 MOVING_PARTS = (
@@ -82,17 +82,17 @@ def test_the_file_of_a_scene_at_rest_has_nothing_that_moves(baked_at_rest, repre
 
 def test_small_motion_is_detected(still, tiny):
     at_rest, moving = train_views(still), train_views(tiny)
-    assert static.nothing_moves(at_rest) and not static.nothing_moves(moving)
+    assert representation.nothing_moves(at_rest) and not representation.nothing_moves(moving)
     draw = np.random.default_rng(0)
 
     def noisy(view, sigma):
         grain = draw.normal(0, sigma, view.image.shape)
         return dataclasses.replace(view, image=np.clip(view.image + grain, 0, 255).astype(np.uint8))
 
-    assert static.nothing_moves([noisy(view, 4.0) for view in at_rest])
+    assert representation.nothing_moves([noisy(view, 4.0) for view in at_rest])
     changed = at_rest[-1].image.copy()
     changed[8:16, 8:16] = 255 - changed[8:16, 8:16]
-    assert not static.nothing_moves([*at_rest[:-1], dataclasses.replace(at_rest[-1], image=changed)])
+    assert not representation.nothing_moves([*at_rest[:-1], dataclasses.replace(at_rest[-1], image=changed)])
 
 
 def test_cameras_that_show_one_time_each_leave_motion_undecided(still):
@@ -102,14 +102,14 @@ def test_cameras_that_show_one_time_each_leave_motion_undecided(still):
         dataclasses.replace(v, camera=dataclasses.replace(v.camera, T_cam_world=v.camera.T_cam_world + 1e-3 * k))
         for k, v in enumerate(one_each)
     ]
-    assert not static.nothing_moves(turned)
-    assert static.nothing_moves([v for v in seen if v.t == seen[0].t])
+    assert not representation.nothing_moves(turned)
+    assert representation.nothing_moves([v for v in seen if v.t == seen[0].t])
 
 
 def test_overrides_of_the_user_win_over_the_images(still, tiny):
     at_rest, moving = train_views(still), train_views(tiny)
-    assert not static.applies(at_rest, config.Config().replace(**{"needs.tracks": "on"}))
-    assert static.applies(moving, config.Config().replace(**{"needs.tracks": "off"}))
+    assert not representation.applies(at_rest, config.Config().replace(**{"needs.tracks": "on"}))
+    assert representation.applies(moving, config.Config().replace(**{"needs.tracks": "off"}))
 
 
 def test_a_file_with_half_of_the_tracks_is_refused(still, tmp_path):
