@@ -27,6 +27,7 @@ import scipy.stats  # noqa: F401
 import torch  # noqa: F401
 
 ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = "r5dgs_core", "r5dgs_addon", "operators"
 HANG = 60  # seconds, beside five times the time of all tests, after which the tests of a mutant count as failed
 SWAPS = {
     **{ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Mod: ast.Mult},
@@ -163,7 +164,7 @@ def main() -> None:
     tests = options.tests or Path("tests/core") / options.room
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
-        for part in ("r5dgs_core", "tests", "benchmarks", "examples", "docs", "pyproject.toml"):
+        for part in (*PACKAGES, "tests", "benchmarks", "examples", "docs", "pyproject.toml"):
             source = ROOT / part
             (shutil.copytree if source.is_dir() else shutil.copy)(source, folder / part)
         room = folder / "r5dgs_core" / options.room
