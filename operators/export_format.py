@@ -13,7 +13,7 @@ _items = []  # referenced here, because Blender keeps no reference to the string
 
 def _formats(operator, context):
     found = [registry.get(name) for name in registry.MODULES]
-    _items[:] = [(format.name, format.label, format.obstacle() or format.summary) for format in found]
+    _items[:] = [(format.name, format.label, format.why_unavailable() or format.summary) for format in found]
     return _items
 
 
@@ -37,7 +37,7 @@ class R5DGS_OT_export_format(polls.NeedsScene, stepwise_operator.Stepwise, bpy.t
     @classmethod
     def description(cls, context, properties):
         format = registry.get(properties.format)
-        return format.obstacle() or f"{cls.__doc__}. {format.summary}"
+        return format.why_unavailable() or f"{cls.__doc__}. {format.summary}"
 
     def suggest(self, context):
         suffix = registry.get(self.format).suffix

@@ -21,7 +21,7 @@ def draw_formats(layout: bpy.types.UILayout, in_menu: bool = False) -> None:
     for name in registry.MODULES:
         found = registry.get(name)
         row = layout.row()
-        row.enabled = found.obstacle() is None
+        row.enabled = found.why_unavailable() is None
         operator, icon = FORMATS.get(name, ("r5dgs.export_format", "EXPORT"))
         label = f"{found.label} ({found.suffix})"
         button = row.operator(operator, text=f"R5DGS {label}" if in_menu else label, icon="NONE" if in_menu else icon)

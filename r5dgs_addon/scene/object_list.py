@@ -80,5 +80,5 @@ def active_row(state: bpy.types.PropertyGroup) -> int:
 def set_active_row(state: bpy.types.PropertyGroup, row: int) -> None:
     """Select only the object of a row."""
     context = bpy.context
-    if 0 <= row < len(state.table) and not selection.obstacle(context):
+    if 0 <= row < len(state.table) and not selection.why_unavailable(context):
         selection.select(context, [(state.id_data, state.table[row].object_id)], "SET")

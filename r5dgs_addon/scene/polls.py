@@ -47,10 +47,10 @@ class Selects:
 
     @classmethod
     def poll(cls, context):
-        obstacle = selection.obstacle(context)
-        if obstacle:
-            cls.poll_message_set(obstacle)
-        return not obstacle
+        reason = selection.why_unavailable(context)
+        if reason:
+            cls.poll_message_set(reason)
+        return not reason
 
 
 class OfObject(NeedsScene):

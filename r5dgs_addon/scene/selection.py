@@ -8,7 +8,7 @@ Wanted = tuple[bpy.types.Collection, int]  # loaded scene, and id of one of its 
 NO_SCENE = "Load an R5DGS scene first"
 
 
-def obstacle(context: bpy.types.Context) -> str:
+def why_unavailable(context: bpy.types.Context) -> str:
     """Reason why objects of scenes cannot be selected now, as a message for the user, or ""."""
     if context.mode != "OBJECT":
         return "Switch to Object Mode first"

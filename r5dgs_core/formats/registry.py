@@ -68,7 +68,7 @@ class Format:
         """Text of a tooltip: the kept and the lost parts of a scene."""
         return f"Keeps: {self.keeps}. Not kept: {self.loses}"
 
-    def obstacle(self) -> str | None:
+    def why_unavailable(self) -> str | None:
         """Return the reason and the remedy if this Python cannot write the format, else None."""
         missing = [name for name in self.packages if importlib.util.find_spec(name) is None]
         if not missing:
@@ -93,8 +93,8 @@ def get(name: str) -> Format:
 def usable(name: str) -> Format:
     """Return a format that this Python can write. Raises KeyError for an unknown name, BackendError if it cannot."""
     found = get(name)
-    if (obstacle := found.obstacle()) is not None:
-        raise errors.BackendError(obstacle)
+    if (reason := found.why_unavailable()) is not None:
+        raise errors.BackendError(reason)
     return found
 
 

@@ -37,7 +37,7 @@ def is_float(values: Array) -> bool:
     return values.is_floating_point() if is_tensor(values) else values.dtype.kind == "f"
 
 
-def is_whole(values: Array) -> bool:
+def is_integer(values: Array) -> bool:
     """Return True for signed or unsigned integers."""
     return str(values.dtype).removeprefix("torch.").lstrip("u").startswith("int")
 

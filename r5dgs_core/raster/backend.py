@@ -60,7 +60,7 @@ class Backend:
     name: ClassVar[str]
     has_static_layer: ClassVar[bool] = False
 
-    def accepting(self, like: Array) -> Backend:
+    def for_inputs(self, like: Array) -> Backend:
         """Return the backend that takes inputs of this kind, array or tensor."""
         return self
 
@@ -72,7 +72,7 @@ class Backend:
         """Return True if the backend is made for the device and dtype of an input. "auto" skips all others."""
         return True
 
-    def obstacle(self, like: Array) -> str | None:
+    def why_unavailable(self, like: Array) -> str | None:
         """Return the reason why inputs like this one cannot be rasterized here, and the remedy; None if they can."""
         return None
 

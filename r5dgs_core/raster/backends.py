@@ -15,7 +15,7 @@ from .backend import Backend
 log = logging.getLogger(__name__)
 
 # Module of this room that defines `BACKEND`, by the backend's name. Fastest first: "auto" takes the first that suits
-# the inputs and has no obstacle.
+# the inputs and is available.
 MODULES = {
     "cpu": "cpu.backend",
     "cuda": "cuda",
@@ -35,7 +35,7 @@ def choose(name: str, like: Array) -> Backend:
     if name not in MODULES:
         raise ValueError(f"backend: expected one of {', '.join(['auto', *MODULES])}, got {name!r}")
     found = _load(name, like)
-    reason = found.obstacle(like)
+    reason = found.why_unavailable(like)
     if reason is not None:
         raise errors.BackendError(f"rasterizer '{name}': {reason}")
     return found
@@ -52,7 +52,7 @@ class _Missing(Backend):
     def __init__(self, package: str):
         self._package = package
 
-    def obstacle(self, like: Array) -> str:
+    def why_unavailable(self, like: Array) -> str:
         return f"{self._package} is not installed; remedy: pip install {self._package}"
 
 
@@ -62,7 +62,7 @@ def _load(name: str, like: Array) -> Backend:
         module = importlib.import_module(f".{MODULES[name]}", __package__)
     except ModuleNotFoundError as error:
         return _Missing((error.name or name).partition(".")[0])
-    return module.BACKEND.accepting(like)
+    return module.BACKEND.for_inputs(like)
 
 
 def _fastest(like: Array) -> Backend:
@@ -71,7 +71,7 @@ def _fastest(like: Array) -> Backend:
         backend = _load(name, like)
         if not backend.suits(like):
             continue
-        reason = backend.obstacle(like)
+        reason = backend.why_unavailable(like)
         if reason is None:
             for other, why in missing:
                 _warn_once(f"rasterizer: using the slower '{name}', as '{other}' is not available: {why}")

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..scene import cameras
 from ..scene.cameras import Camera
-from .arrays import Array, array_namespace, device_of, is_float, is_whole, like, to_host
+from .arrays import Array, array_namespace, device_of, is_float, is_integer, like, to_host
 
 _MAX_LABEL = (1 << 31) - 1  # ids are int32
 # Bounds of inputs with a limited range, and the remedy.
@@ -131,7 +131,7 @@ def check_background(background: Any, means: Array, camera: Camera, depth: int) 
 def _check_labels(labels: Any, means: Array) -> None:
     """Raise unless the labels are integers in range, one per Gaussian."""
     check_kind("labels", labels, array_namespace(means))
-    if tuple(labels.shape) != (len(means),) or not is_whole(labels):
+    if tuple(labels.shape) != (len(means),) or not is_integer(labels):
         raise ValueError(f"labels: expected {len(means)} integers, got {labels.dtype} of shape {tuple(labels.shape)}")
     _check_device("labels", labels, means)
     if labels.dtype.itemsize <= 4 and str(labels.dtype)[-6:] != "uint32" or not len(labels):

@@ -71,7 +71,7 @@ class _Projected:
     height: int
 
 
-def obstacle(device: torch.device, dtype: torch.dtype) -> str | None:
+def why_unavailable(device: torch.device, dtype: torch.dtype) -> str | None:
     """Return the reason why tensors of this device and dtype cannot be rasterized here, and the remedy, or None.
 
     The first call may take minutes, as gsplat compiles its kernels when they are first loaded on a machine.
@@ -290,9 +290,9 @@ class CudaBackend(TorchBackend):
         """See `Backend.suits`."""
         return like.device.type == "cuda" and like.dtype == torch.float32
 
-    def obstacle(self, like: torch.Tensor) -> str | None:
-        """See `obstacle`."""
-        return obstacle(like.device, like.dtype)
+    def why_unavailable(self, like: torch.Tensor) -> str | None:
+        """See `why_unavailable`."""
+        return why_unavailable(like.device, like.dtype)
 
     def rasterize_splats(
         self,

@@ -46,14 +46,14 @@ def folder_of(chosen: str) -> str | None:
         is_new = not folder.exists()
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            danger = _danger(folder)
-            if danger is None:
+            reason = _why_unsafe(folder)
+            if reason is None:
                 tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             tried.append(f"{base} ({error.strerror})")
             continue
-        if danger is not None:  # never load machine code that other users can replace
-            log.warning("rasterizer: compiled code is not cached in %s, as %s; remedy: remove it", folder, danger)
+        if reason is not None:  # never load machine code that other users can replace
+            log.warning("rasterizer: compiled code is not cached in %s, as %s; remedy: remove it", folder, reason)
             tried.append(f"{base} (others can write there)")
             continue
         with contextlib.suppress(OSError):
@@ -69,7 +69,7 @@ def folder_of(chosen: str) -> str | None:
     return None
 
 
-def _danger(folder: Path) -> str | None:
+def _why_unsafe(folder: Path) -> str | None:
     """Return the reason why other users can put code into a folder, or None if they cannot."""
     if not hasattr(os, "getuid"):  # Windows: folders inherit the permissions of the user's profile
         return None
@@ -143,6 +143,6 @@ def _own_temporary() -> Path | None:
             return Path(tempfile.gettempdir()) / "r5dgs"
         folder = Path(tempfile.gettempdir()) / f"r5dgs-{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)
-        return None if _danger(folder) else folder
+        return None if _why_unsafe(folder) else folder
     except OSError:
         return None

@@ -14,15 +14,15 @@ from .arrays import Array, to_array
 from .backend import Backend, ViewPoses
 from .settings import RasterSettings, RasterStats, SplatImage
 
-TOGETHER = 32  # segments per backward pass of `TorchBackend.segment_weights`; bounds the memory
+SEGMENTS_PER_PASS = 32  # segments per backward pass of `TorchBackend.segment_weights`; bounds the memory
 
 
 class TorchBackend(Backend):
     """Backend whose methods take and return tensors. Subclasses implement `rasterize_splats` at least."""
 
-    def accepting(self, like: Array) -> Backend:
-        """See `Backend.accepting`."""
-        return _OnArrays(self) if isinstance(like, np.ndarray) else self
+    def for_inputs(self, like: Array) -> Backend:
+        """See `Backend.for_inputs`."""
+        return _ArrayAdapter(self) if isinstance(like, np.ndarray) else self
 
     def seen_colors(
         self, means: Tensor, sh: Tensor, rest: Tensor | None, factor: Tensor | None, poses: ViewPoses
@@ -43,8 +43,8 @@ class TorchBackend(Backend):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Implement `Backend.segment_weights` by the gradient of each segment's blended sum by the Gaussian's value."""
         parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32))]
-        for first in range(0, count, TOGETHER):
-            some = torch.arange(first, min(first + TOGETHER, count), device=segments.device)
+        for first in range(0, count, SEGMENTS_PER_PASS):
+            some = torch.arange(first, min(first + SEGMENTS_PER_PASS, count), device=segments.device)
             members = (segments[..., None] == some).to(means)
             channels = means.new_zeros(len(means), len(some)).requires_grad_(True)
             with torch.enable_grad():
@@ -73,7 +73,7 @@ def seen_colors(means: Tensor, sh: Tensor, rest: Tensor | None, factor: Tensor |
     return colors if factor is None else colors * factor[:, None]
 
 
-class _OnArrays(Backend):
+class _ArrayAdapter(Backend):
     """Backend of tensors that takes and returns arrays, without gradients."""
 
     def __init__(self, inner: TorchBackend):
@@ -86,8 +86,8 @@ class _OnArrays(Backend):
     def suits(self, like: Array) -> bool:
         return self._inner.suits(_tensor(like))
 
-    def obstacle(self, like: Array) -> str | None:
-        return self._inner.obstacle(_tensor(like))
+    def why_unavailable(self, like: Array) -> str | None:
+        return self._inner.why_unavailable(_tensor(like))
 
     @torch.no_grad()
     def rasterize_splats(
@@ -97,7 +97,7 @@ class _OnArrays(Backend):
             _tensor(means), _tensor(quats), _tensor(scales), _tensor(opacities), _tensor(channels),
             camera, _tensor(background), _tensor(labels), settings, stats,
         )  # fmt: skip
-        _convert(stats)
+        _stats_to_arrays(stats)
         return SplatImage(*(to_array(values) for values in (found.image, found.alpha, found.depth, found.ids)))
 
     @torch.no_grad()
@@ -115,7 +115,7 @@ def _tensor(values: np.ndarray | None) -> Any:
     return None if values is None else torch.from_numpy(to_array(values))
 
 
-def _convert(stats: RasterStats | None) -> None:
+def _stats_to_arrays(stats: RasterStats | None) -> None:
     """Turn the tensors of statistics into arrays."""
     if stats is not None:
         stats.visible, stats.radii, stats.grad_norm = map(to_array, (stats.visible, stats.radii, stats.grad_norm))

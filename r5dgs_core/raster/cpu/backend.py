@@ -31,8 +31,8 @@ class CpuBackend(Backend):
         """See `Backend.suits`."""
         return device_of(like) == "cpu" and is_float32(like)
 
-    def obstacle(self, like: Array) -> str | None:
-        """See `Backend.obstacle`."""
+    def why_unavailable(self, like: Array) -> str | None:
+        """See `Backend.why_unavailable`."""
         if importlib.util.find_spec("numba") is None:
             return "numba is not installed; remedy: pip install numba"
         if self.suits(like):

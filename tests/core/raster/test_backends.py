@@ -62,7 +62,7 @@ def test_a_backend_that_cannot_draw_is_skipped_with_its_reason(monkeypatch, capl
     class Broken(Backend):
         name = "broken"
 
-        def obstacle(self, like):
+        def why_unavailable(self, like):
             return "no licence; remedy: buy one"
 
     backends._warn_once.cache_clear()

@@ -38,7 +38,7 @@ LIMITS = {"stand-in": (0.0, TOLERANCE), "gsplat": (0.005, 2e-3)}
 def use(kernels, monkeypatch):
     """Let the backend find these kernels, and take tensors that are on the CPU."""
     monkeypatch.setattr(cuda, "find_kernels", lambda: kernels)
-    monkeypatch.setattr(cuda, "obstacle", lambda device, dtype: None)
+    monkeypatch.setattr(cuda, "why_unavailable", lambda device, dtype: None)
 
 
 @pytest.fixture(params=["stand-in", pytest.param("gsplat", marks=pytest.mark.gpu)])
@@ -49,7 +49,7 @@ def rasterize_cuda(request, monkeypatch):
         device = torch.device("cpu")
     else:
         device = torch.device("cuda")
-        reason = cuda.obstacle(device, torch.float32)
+        reason = cuda.why_unavailable(device, torch.float32)
         if reason is not None:
             pytest.skip(f"gsplat cannot draw here: {reason}")
 
