@@ -552,7 +552,7 @@ numpy.save("picture.npy", r5dgs_core.picture(scene, 0.9))
 warm_up.warm_up(gradients=False)
 for backend in ("reference", "cuda"):
     try:
-        scene_renderer.render_frame(scene, scene_player.frame(scene, 0.9), scene.cameras[0], backend=backend)
+        scene_renderer.render_frame(scene, scene_player.Player(scene).frame(0.9), scene.cameras[0], backend=backend)
     except errors.BackendError as error:
         print(error)
 assert not set(sys.modules) & set(blocked)

@@ -41,7 +41,9 @@ def make_views(scene: Scene, images: int, pixels: int, folder: Path) -> tuple[li
     for k in range(CAMERAS):
         camera = scenes.orbit_camera(2 * np.pi * k / CAMERAS, pixels, pixels)
         for i, t in enumerate(np.linspace(0, scene.t_max, images // CAMERAS)):
-            ids = scene_renderer.render_frame(scene, scene_player.frame(scene, float(t)), camera, background=None).ids
+            ids = scene_renderer.render_frame(
+                scene, scene_player.Player(scene).frame(float(t)), camera, background=None
+            ).ids
             assert ids is not None
             truth.append(Image(k, i, np.maximum(ids, 0).astype(np.int32).reshape(-1), nothing, nothing))
             path = folder / f"camera{k}_{i:03d}.png"

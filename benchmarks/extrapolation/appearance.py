@@ -113,12 +113,14 @@ def frozen(scene: Scene, shading: bool, shadows: bool) -> tuple[Scene, Move]:
     if shading and scene.shading is not None:
         still = scene.with_arrays(shading=np.zeros_like(scene.shading.vectors))
 
+    player = scene_player.Player(still)
+
     def move(t: float) -> scene_player.Frame:
-        quats, displacements = (array.copy() for array in scene_player.group_poses(still, t))
+        quats, displacements = (array.copy() for array in player.group_poses(t))
         for group in still.groups:
             if shadows and group.role == "shadow":
                 quats[group.id], displacements[group.id] = rotations.identity(), 0.0
-        return scene_player.pose(still, quats, displacements, t)
+        return player.frame_at_poses(quats, displacements, t)
 
     return still, move
 

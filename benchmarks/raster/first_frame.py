@@ -39,7 +39,7 @@ def first_frame(count: int, size: int, sh_degree: int, sky_degree: int) -> dict[
     scene = frames.make_scene(count, 6, sh_degree, sky_degree, camera)
     marks = [time.perf_counter()]
     for t in (0.1, 0.2):
-        scene_renderer.render_frame(scene, scene_player.frame(scene, t), camera)
+        scene_renderer.render_frame(scene, scene_player.Player(scene).frame(t), camera)
         marks.append(time.perf_counter())
     return dict(zip(TIMES, (imported - start, marks[1] - marks[0], marks[2] - marks[1]), strict=True))
 

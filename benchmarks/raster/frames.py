@@ -124,7 +124,7 @@ def _room(random: np.random.Generator, cuts: list[int]) -> np.ndarray:
 
 def instances_at(scene: Scene, t: float) -> list[Instance]:
     """The groups at a time in the form of the add-on's requests: ranges of Gaussians, each with a matrix."""
-    quats, displacements = scene_player.group_poses(scene, t)
+    quats, displacements = scene_player.Player(scene).group_poses(t)
     turns = rotations.quats_to_rotmats(quats)
     found = []
     for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
@@ -149,7 +149,7 @@ def measure(scene: Scene, camera: Camera, frames: int) -> dict[str, float]:
     theatre = incremental_renderer.IncrementalRenderer(scene)
     for t in [0.1 * T_MAX, *np.linspace(0, 2 * T_MAX, frames)]:  # the first one warms up and is not counted
         start = time.perf_counter()
-        frame = scene_player.frame(scene, float(t))
+        frame = scene_player.Player(scene).frame(float(t))
         moved = time.perf_counter()
         scene_renderer.render_frame(scene, frame, camera)
         drawn = time.perf_counter()

@@ -9,7 +9,7 @@ calls run in interleaved rounds and include input checks. Passes:
 
     forward           without gradients
     forward_backward  with gradients of every input
-    motion            scenes only: from the scene file's arrays to Gaussians at a time (`scene_player.frame`)
+    motion            scenes only: from the scene file's arrays to Gaussians at a time (`Player.frame`)
     frame             scenes only: motion, view-dependent colors, forward, ids
 
 Threads are those of the rasterizer. With the backend `cpu`, torch's own operations run on one thread, because its
@@ -197,7 +197,7 @@ def _contenders(
         yield contender(backend, "forward", functools.partial(draw, placed, backend))
         yield contender(backend, "forward_backward", functools.partial(step, placed, backend, gradient))
         if workload.scene is not None:
-            yield contender(backend, "motion", functools.partial(scene_player.frame, workload.scene, workload.t))
+            yield contender(backend, "motion", functools.partial(move, workload))
             yield contender(backend, "frame", functools.partial(play, workload, backend))
     for peer in peers:
         if hasattr(peer, "supports") and not peer.supports(workload.name):
@@ -233,10 +233,16 @@ def step(workload: Workload, backend: str, upstream: torch.Tensor) -> None:
         torch.cuda.synchronize()
 
 
+def move(workload: Workload) -> None:
+    """Move the Gaussians of a scene to its time, from the arrays of its file."""
+    assert workload.scene is not None
+    scene_player.Player(workload.scene).frame(workload.t)
+
+
 def play(workload: Workload, backend: str) -> None:
     """One frame of a scene, from its file's arrays to pixels."""
     assert workload.scene is not None
-    frame = scene_player.frame(workload.scene, workload.t)
+    frame = scene_player.Player(workload.scene).frame(workload.t)
     scene_renderer.render_frame(workload.scene, frame, workload.camera, backend=backend)
 
 

@@ -80,7 +80,7 @@ def check(name: str, garden: Path | None = None) -> None:
 
 def pose_scene(name: str, scene: Scene, camera: Camera, t: float) -> Workload:
     """A scene at a time, drawn as playback poses it."""
-    posed = posed_scene.pose_frame(scene, scene_player.frame(scene, t))
+    posed = posed_scene.pose_frame(scene, scene_player.Player(scene).frame(t))
     inputs = _tensors(
         posed.means,
         posed.quats,

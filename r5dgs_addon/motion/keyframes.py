@@ -205,7 +205,7 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
 
 
 def _future(scene: Scene, motion_id: int, most: int) -> tuple[reduction.Sampler, models.MotionModel]:
-    """Sampler past t_max and its model: the anchor's own, or the leader's as in `scene_player.group_poses`."""
+    """Sampler past t_max and its model: the anchor's own, or the leader's as in `GroupMotion.poses`."""
     group = scene.groups[motion_id]
     if group.follows is None or group.follow_matrix is None:
         model, stop = group.own_model, None if group.joint is None else group.joint.stop_time

@@ -39,9 +39,9 @@ def draw(
     """
     video_of = {view.name: (video.name, view.mask_video) for video in videos.of(views) for view in video.views}
     number = {which: k for k, which in enumerate(dict.fromkeys(video_of.values()))}
-    drawn = []
+    player, drawn = scene_player.Player(scene), []
     for done, (view, mask) in enumerate(zip(views, masks, strict=True)):
-        posed = posed_scene.pose_frame(scene, scene_player.frame(scene, view.t))
+        posed = posed_scene.pose_frame(scene, player.frame(view.t))
         gaussians = scene_renderer.PosedGaussians(posed)
         ids, segments, pixels = np.unique(mask, return_inverse=True, return_counts=True)
         known = ids != id_masks.UNKNOWN
@@ -70,4 +70,5 @@ def draw(
 
 def paths(scene: Scene, times: np.ndarray) -> np.ndarray:
     """Positions of each Gaussian at some times. [S] -> [N, S, 3] float32"""
-    return np.stack([scene_player.frame(scene, float(t)).means for t in times], axis=1)
+    player = scene_player.Player(scene)
+    return np.stack([player.frame(float(t)).means for t in times], axis=1)

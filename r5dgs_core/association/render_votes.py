@@ -36,12 +36,12 @@ def mend(
         for image, (mask, bag) in enumerate(zip(masks, images, strict=True)):
             yield mending.relabel(mask, bag.ids, found.ids[image])
         return
-    shares = mending.shares(images, found)
+    player, shares = scene_player.Player(scene), mending.shares(images, found)
     for image, (view, mask, (seen, part)) in enumerate(zip(views, masks, shares, strict=True)):
         if not mending.lacks(found, image):
             yield mending.relabel(mask, images[image].ids, found.ids[image])
             continue
-        posed = scene_renderer.PosedGaussians(posed_scene.pose_frame(scene, scene_player.frame(scene, view.t)))
+        posed = scene_renderer.PosedGaussians(posed_scene.pose_frame(scene, player.frame(view.t)))
         # Gaussians outside the image's bag cannot occlude.
         drawn = rasterize_splats(
             posed.means[seen],

@@ -152,7 +152,7 @@ def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[e
         for group in scene.groups:
             if group.follows is not None and group.follow_matrix is not None:
                 displacements[group.id] = group.follow_matrix @ displacements[group.follows]
-        return scene_player.pose(scene, quats, displacements, t, origin)
+        return player.frame_at_poses(quats, displacements, t, origin)
 
     return move, ""
 

@@ -115,7 +115,8 @@ def _matched(pairs: Sequence[Sequence[tuple[Body, float]]], every: bool) -> list
 
 def motion(scene: Scene, groups: Sequence[MotionGroup], times: np.ndarray) -> np.ndarray:
     """Return the motion of groups as maps from the bind state to the world. G groups, [T] -> [G, T, 4, 4]"""
-    poses = [scene_player.group_poses(scene, float(t)) for t in times]
+    player = scene_player.Player(scene)
+    poses = [player.group_poses(float(t)) for t in times]
     return np.stack([np.stack([se3.pose_to_matrix(g.pivot, q[g.id], d[g.id]) for q, d in poses]) for g in groups])
 
 

@@ -102,7 +102,7 @@ class GroupMotion:
         return models.MotionStack(own)
 
     def poses(self, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Pose of every group relative to the bind state, as from `scene_player.group_poses`."""
+        """Pose of every group relative to the bind state, as from `scene_player.Player.group_poses`."""
         if not np.isfinite(t):
             raise ValueError(f"t: expected a finite scene time, got {t}")
         if t < self._t_max:

@@ -23,10 +23,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..motion import cubic_curves, quaternion_columns, rotations
+from ..motion import quaternion_columns, rotations
 from ..scene.scene import Scene
 from . import group_dynamics, posing
-from .group_dynamics import knots
 from .modes import every, split
 from .residuals import Literal, OwnMotion, Residuals, unexplained
 
@@ -145,10 +144,7 @@ class Player:
         Returns:
             The frame. Without an origin, Gaussians that did not move equal the bind state exactly.
         """
-        scene, poser = self.scene, self._poser
-        center = np.zeros(3) if origin is None else np.array(origin, np.float64)
-        if center.shape != (3,) or not np.isfinite(center).all():
-            raise ValueError(f"origin: expected three finite numbers, got {origin!r}")
+        scene, poser, center = self.scene, self._poser, _checked(origin)
         quats, displacements = self.group_poses(t)
         past = t > scene.t_max
         if past and self._base == "rigid_paper":
@@ -160,21 +156,48 @@ class Player:
             self._bend(moved, t, quats, displacements, center)
         elif self._own is not None:
             self._part(moved, t - scene.t_max, center)
+        return self._frame(t, moved, quats, displacements, center)
+
+    def frame_at_poses(
+        self,
+        group_quats: np.ndarray,
+        group_displacements: np.ndarray,
+        t: float = float("nan"),
+        origin: np.ndarray | None = None,
+    ) -> Frame:
+        """The scene's Gaussians with each motion group in a given pose.
+
+        Args:
+            group_quats: Rotation of each group about its pivot, unit wxyz. [G, 4]
+            group_displacements: Displacement of each pivot, world. [G, 3]
+            t: Time stored in the frame.
+            origin: As for `frame`.
+        """
+        poser, center = self._poser, _checked(origin)
+        means = poser.means(group_quats, group_displacements, center)
+        log_scales = self.scene.gaussians.log_scales
+        moved = _Moved(means, poser.quats(group_quats), log_scales, poser.shading(group_quats))
+        return self._frame(t, moved, group_quats, group_displacements, center)
+
+    def _frame(
+        self, t: float, moved: _Moved, quats: np.ndarray, displacements: np.ndarray, origin: np.ndarray
+    ) -> Frame:
+        gaussians = self.scene.gaussians
         return Frame(
             t=float(t),
             means=moved.means,
             quats=moved.quats,
             log_scales=moved.log_scales,
-            opacity_logits=scene.gaussians.opacity_logits,
-            sh=scene.gaussians.sh,
+            opacity_logits=gaussians.opacity_logits,
+            sh=gaussians.sh,
             shading_factor=moved.shading,
-            object_ids=scene.gaussians.object_ids,
-            motion_ids=scene.gaussians.motion_ids,
+            object_ids=gaussians.object_ids,
+            motion_ids=gaussians.motion_ids,
             group_quats=quats,
             group_displacements=displacements,
-            origin=center,
-            turned_rows=moved.rows if scene.harmonics_turn else None,
-            turned_quats=moved.turns if scene.harmonics_turn else None,
+            origin=origin,
+            turned_rows=moved.rows if self.scene.harmonics_turn else None,
+            turned_quats=moved.turns if self.scene.harmonics_turn else None,
         )
 
     def _bend(self, moved: _Moved, t: float, quats: np.ndarray, displacements: np.ndarray, origin: np.ndarray) -> None:
@@ -224,78 +247,14 @@ class _Moved:
         self.rows, self.turns = rows, since.T
 
 
-def frame(scene: Scene, t: float, mode: str = "rigid", *, origin: np.ndarray | None = None) -> Frame:
-    """The scene's Gaussians at time t. For many times, keep a `Player`.
-
-    Args:
-        scene: The scene.
-        t: Scene time.
-        mode: Mode past t_max, one of `modes`.
-        origin: Point of the world that the centres are relative to, or None. [3]
-
-    Returns:
-        As `Player.frame`.
-
-    Raises:
-        ValueError: The mode is unknown, or the scene has no data for it.
-    """
-    return Player(scene, mode).frame(t, origin)
-
-
-def knot_slopes(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes at the knots of `knots`, per unit of scene time: quaternions [G, S, 4] and displacements [G, S, 3]."""
-    quats, displacements = knots(scene, groups)
-    times = scene.tracks.times
-    return cubic_curves.slopes(times, quats), cubic_curves.slopes(times, displacements)
-
-
-def group_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of every motion group relative to the bind state, in mode "rigid".
-
-    Args:
-        scene: The scene.
-        t: Scene time; before the first knot the first pose is held.
-
-    Returns:
-        Unit quaternions wxyz [G, 4] and displacements of the pivots, world [G, 3], float64. At t_max exactly the
-        identity; a group that `follows` another takes its displacement through `follow_matrix` past t_max.
-    """
-    return group_dynamics.GroupMotion(scene).poses(t)
+def _checked(origin: np.ndarray | None) -> np.ndarray:
+    """Copy an origin as float64, zeros if None. Raises ValueError unless it is three finite numbers. [3]"""
+    center = np.zeros(3) if origin is None else np.array(origin, np.float64)
+    if center.shape != (3,) or not np.isfinite(center).all():
+        raise ValueError(f"origin: expected three finite numbers, got {origin!r}")
+    return center
 
 
 def sh_rotations(group_quats: np.ndarray) -> np.ndarray:
     """Matrices from world directions to each group's bind frame, for evaluating SH. [G, 4] -> [G, 3, 3]"""
     return np.swapaxes(rotations.quats_to_rotmats(group_quats), -1, -2)
-
-
-def pose(
-    scene: Scene,
-    group_quats: np.ndarray,
-    group_displacements: np.ndarray,
-    t: float = float("nan"),
-    origin: np.ndarray | None = None,
-) -> Frame:
-    """The scene's Gaussians with each motion group in a given pose.
-
-    Args:
-        scene: The scene.
-        group_quats: Rotation of each group about its pivot, unit wxyz. [G, 4]
-        group_displacements: Displacement of each pivot, world. [G, 3]
-        t: Time stored in the frame.
-        origin: Point of the world that the centres are relative to, or None. [3]
-    """
-    poser, center = posing.Poser(scene), np.zeros(3) if origin is None else np.array(origin, np.float64)
-    return Frame(
-        t=float(t),
-        means=poser.means(group_quats, group_displacements, center),
-        quats=poser.quats(group_quats),
-        log_scales=scene.gaussians.log_scales,
-        opacity_logits=scene.gaussians.opacity_logits,
-        sh=scene.gaussians.sh,
-        shading_factor=poser.shading(group_quats),
-        object_ids=scene.gaussians.object_ids,
-        motion_ids=scene.gaussians.motion_ids,
-        group_quats=group_quats,
-        group_displacements=group_displacements,
-        origin=center,
-    )

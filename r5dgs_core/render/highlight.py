@@ -42,7 +42,7 @@ def isolate(
     Returns:
         Display-referred sRGB and straight alpha, in [0, 1]; black if alpha is 0. [H, W, 4] float32
     """
-    frame = scene_player.frame(scene, t, mode, origin=camera.center)
+    frame = scene_player.Player(scene, mode).frame(t, origin=camera.center)
     wanted = np.isin(frame.object_ids, list(object_ids))
     alone = dataclasses.replace(
         frame, opacity_logits=np.where(wanted, frame.opacity_logits, np.float32(_ABSENT)).astype(np.float32)

@@ -23,11 +23,11 @@ def _distances(distance: float, mode: str = "rigid") -> float:
     """
     scene, worst = every_motion(distance, singles=mode != "rigid"), 0.0
     for t in (*PAST, *FUTURES):
-        quats, displacements = scene_player.group_poses(scene, t)
+        quats, displacements = scene_player.Player(scene).group_poses(t)
         for g in range(1, len(scene.groups)):
             rows = np.flatnonzero(scene.gaussians.motion_ids == g)
             origin = scene.groups[g].pivot + displacements[g]
-            frame = scene_player.frame(scene, t, mode, origin=origin)
+            frame = scene_player.Player(scene, mode).frame(t, origin=origin)
             worst = max(worst, shape_error(frame.means[rows], scene.gaussians.means[rows]))
     return worst
 
@@ -37,7 +37,7 @@ def _absolute(distance: float) -> float:
     scene, worst = every_motion(distance), 0.0
     shortest = float(np.linalg.norm(body()[0] - body()[1]))
     for t in FUTURES:
-        frame = scene_player.frame(scene, t)
+        frame = scene_player.Player(scene).frame(t)
         for g in range(1, len(scene.groups)):
             rows = np.flatnonzero(scene.gaussians.motion_ids == g)
             grid = float(np.spacing(np.abs(frame.means[rows]).max()))
@@ -63,7 +63,7 @@ def _places(distance: float) -> float:
             pose = models.evaluate(group.model, t - T_MAX)
             origin = group.pivot + pose[1]
             expected = rotations.rotate(pose[0], scene.gaussians.means[rows].astype(np.float64) - group.pivot)
-            frame = scene_player.frame(scene, t, origin=origin)
+            frame = scene_player.Player(scene).frame(t, origin=origin)
             worst = max(worst, largest(frame.means[rows] - expected) / RADIUS)
     return worst
 
@@ -71,7 +71,7 @@ def _places(distance: float) -> float:
 def _units(mode: str) -> float:
     """Largest deviation of a quaternion's length from 1, up to 100 times the observed time."""
     scene = every_motion(singles=True)
-    quats = [scene_player.frame(scene, t, mode).quats.astype(np.float64) for t in (*PAST, *FUTURES)]
+    quats = [scene_player.Player(scene, mode).frame(t).quats.astype(np.float64) for t in (*PAST, *FUTURES)]
     return float(np.abs(np.linalg.norm(np.stack(quats), axis=-1) - 1).max())
 
 
@@ -80,7 +80,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "distances in a body",
             f"{label} from the origin, to 100 times the observed time",
-            "playback.scene_player.frame",
+            "playback.scene_player.Player.frame",
             _DISTANCE,
             1e-6,
             _FLOAT32,
@@ -93,7 +93,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "distances in a body",
             f"{label} from the origin, absolute float32",
-            "playback.scene_player.frame",
+            "playback.scene_player.Player.frame",
             "largest change / grid of float32 there",
             1.0,
             _FLOAT32,
@@ -105,7 +105,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "distances in a body",
             f"places {label} from the origin, seen from the body",
-            "playback.scene_player.frame",
+            "playback.scene_player.Player.frame",
             "distance / radius",
             5e-7,
             _FLOAT32,
@@ -117,7 +117,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "distances in a body",
             f"unit quaternions in float32, {mode}",
-            "playback.scene_player.frame",
+            "playback.scene_player.Player.frame",
             "| |q| - 1 |",
             3e-7,
             _FLOAT32,

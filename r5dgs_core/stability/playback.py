@@ -20,24 +20,24 @@ from .scenes import EVERY_MODE, HORIZON, MOTIONS, PAST, T_MAX, every_motion, sce
 def _at_t_max(mode: str) -> float:
     """Number of values of the frame at t_max that differ from the bind state."""
     scene = every_motion(singles=True)
-    frame = scene_player.frame(scene, scene.t_max, mode)
+    frame = scene_player.Player(scene, mode).frame(scene.t_max)
     return different(frame.means, scene.gaussians.means) + different(frame.quats, scene.gaussians.quats)
 
 
 def _jump(mode: str) -> float:
     """Largest displacement of points from t_max to 1e-9 units before and after it, in radii."""
     scene = every_motion(singles=True)
-    frames = [scene_player.frame(scene, scene.t_max + step, mode) for step in (-1e-9, 0.0, 1e-9)]
+    frames = [scene_player.Player(scene, mode).frame(scene.t_max + step) for step in (-1e-9, 0.0, 1e-9)]
     return max(largest(frame.means.astype(np.float64) - frames[1].means) for frame in frames) / RADIUS
 
 
 def _random_access(mode: str) -> float:
     """Number of values that differ between frames played in shuffled and in increasing order."""
     times = [*np.linspace(0, 3, 19).tolist(), 0.3, 3.0 if mode == "rigid_paper" else HORIZON]
-    forward = [scene_player.frame(every_motion(singles=True), t, mode) for t in times]
+    forward = [scene_player.Player(every_motion(singles=True), mode).frame(t) for t in times]
     scene, count = every_motion(singles=True), 0.0
     for i in np.random.default_rng(8).permutation(len(times)):
-        frame = scene_player.frame(scene, times[i], mode)
+        frame = scene_player.Player(scene, mode).frame(times[i])
         count += different(frame.means, forward[i].means) + different(frame.quats, forward[i].quats)
     return count
 
@@ -48,7 +48,7 @@ def _agreement() -> float:
     rows = np.flatnonzero(scene.gaussians.motion_ids == list(MOTIONS).index("world twist") + 1)
     for t in (1.0, 2.0, 5.0):
         rigid, single = (
-            scene_player.frame(scene, t, mode).means[rows].astype(np.float64) for mode in ("rigid", "standard")
+            scene_player.Player(scene, mode).frame(t).means[rows].astype(np.float64) for mode in ("rigid", "standard")
         )
         worst = max(worst, largest(rigid - single) / RADIUS)
     return worst
@@ -59,7 +59,7 @@ def _ten_turns() -> float:
     model = model_of("ballistic_spin", angular_velocity=[0, 0, 20 * math.pi / T_MAX])
     scene = scene_of([body()], [model], times=np.linspace(0, T_MAX, 181))
     times = np.linspace(0, 2 * T_MAX, 361)
-    quats = np.stack([scene_player.group_poses(scene, t)[0][1] for t in times])
+    quats = np.stack([scene_player.Player(scene).group_poses(t)[0][1] for t in times])
     jumps = np.linalg.norm(np.diff(rotations.make_continuous(quats), axis=0), axis=-1)
     steps = np.sqrt(np.diff(times) * 20 * math.pi / T_MAX)
     return float((jumps / (2 * np.sin(steps**2 / 4))).max())
@@ -76,7 +76,7 @@ def _wild(scene: Scene, group: int, name: str, value: float) -> Scene:
 def _isolated(value: float) -> float:
     """Number of values of other groups that change if rates and track of one group are not finite."""
     scene, count = every_motion(), 0.0
-    sound = {t: scene_player.frame(scene, t) for t in (0.4, 2.0)}
+    sound = {t: scene_player.Player(scene).frame(t) for t in (0.4, 2.0)}
     for g in range(1, len(scene.groups)):
         broken = _wild(_wild(scene, g, "velocity", value), g, "angular_velocity", value)
         poses = scene.tracks.poses.copy()
@@ -84,7 +84,7 @@ def _isolated(value: float) -> float:
         broken = broken.with_arrays(track_poses=poses)
         others = scene.gaussians.motion_ids != g
         for t, expected in sound.items():
-            frame = scene_player.frame(broken, t)
+            frame = scene_player.Player(broken).frame(t)
             count += different(frame.means[others], expected.means[others])
             count += different(frame.quats[others], expected.quats[others])
     return count
@@ -99,12 +99,12 @@ def _singles(value: float) -> tuple[float, float]:
     """
     scene, count, away = every_motion(singles=True), 0.0, 0.0
     assert scene.dynamics is not None
-    sound = scene_player.frame(scene, 2.0, "standard")
+    sound = scene_player.Player(scene, "standard").frame(2.0)
     for g in range(1, len(scene.groups)):
         mine = scene.gaussians.motion_ids == g
         bad, still = (np.where(mine[:, None], np.float32(x), scene.dynamics.rates) for x in (value, 0.0))
         frame, expected = (
-            scene_player.frame(scene.with_arrays(dynamics=states), 2.0, "standard") for states in (bad, still)
+            scene_player.Player(scene.with_arrays(dynamics=states), "standard").frame(2.0) for states in (bad, still)
         )
         count += different(frame.means, expected.means) + different(frame.quats, expected.quats)
         away = max(away, largest(frame.means[~mine].astype(np.float64) - sound.means[~mine]) / scene.extent)
@@ -136,7 +136,7 @@ def _huge(rate: float, mode: str) -> float:
     states = np.full_like(scene.dynamics.rates, rate)
     scene = dataclasses.replace(scene.with_arrays(dynamics=states), groups=(scene.groups[0], *groups))
     with np.errstate(all="ignore"):
-        frame = scene_player.frame(scene, T_MAX + 1, mode)
+        frame = scene_player.Player(scene, mode).frame(T_MAX + 1)
     return float((~np.isfinite(frame.means)).sum() + (~np.isfinite(frame.quats)).sum())
 
 
@@ -146,7 +146,7 @@ def _lacking(clouds: list[np.ndarray]) -> float:
     scene, bad = scene_of(clouds, motions, singles=True), 0
     for mode in EVERY_MODE:
         for t in (*PAST, T_MAX, T_MAX + 1e-9, 1.0, 3.0):
-            frame = scene_player.frame(scene, t, mode)
+            frame = scene_player.Player(scene, mode).frame(t)
             bad += frame.means.shape != scene.gaussians.means.shape
             bad += int((~np.isfinite(frame.means)).sum() + (~np.isfinite(frame.quats)).sum())
     return float(bad)
@@ -155,7 +155,7 @@ def _lacking(clouds: list[np.ndarray]) -> float:
 def _before_first(mode: str) -> float:
     """Number of values that differ between frames at the first knot and long before it."""
     scene = every_motion(singles=True)
-    first, long_ago = (scene_player.frame(scene, t, mode) for t in (0.0, -1e6))
+    first, long_ago = (scene_player.Player(scene, mode).frame(t) for t in (0.0, -1e6))
     return different(first.means, long_ago.means) + different(first.quats, long_ago.quats)
 
 
@@ -164,7 +164,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "t_max",
             f"the bind state to the bit, {mode}",
-            "playback.scene_player.frame",
+            "playback.scene_player.Player.frame",
             "values that differ",
             0.0,
             "to the bit",
@@ -176,7 +176,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "t_max",
             f"no jump, {mode}",
-            "playback.scene_player.frame",
+            "playback.scene_player.Player.frame",
             "distance / radius in 1e-9 units",
             1e-6,
             "rounding of float32 and speed",
@@ -187,7 +187,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "t_max",
         "ten turns before and after it",
-        "playback.scene_player.group_poses",
+        "playback.scene_player.Player.group_poses",
         "largest step of q / that of the turn",
         1 + 1e-3,
         "the track between its knots",
@@ -197,7 +197,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "random access",
             f"shuffled times give the frames in order, {mode}",
-            "playback.scene_player.frame",
+            "playback.scene_player.Player.frame",
             "values that differ",
             0.0,
             "to the bit",
@@ -208,7 +208,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "random access",
         "long before the first pose",
-        "playback.scene_player.frame",
+        "playback.scene_player.Player.frame",
         "values that differ",
         0.0,
         "to the bit",
@@ -217,7 +217,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "random access",
         "members with one twist move as their group",
-        "playback.scene_player.frame",
+        "playback.scene_player.Player.frame",
         "distance / radius",
         2e-4,
         "residuals.TOLERANCE of the scene's extent",
@@ -230,7 +230,7 @@ CASES: tuple[Case, ...] = (
             Case(
                 "bad rates",
                 f"{label} in one group changes no other, rigid",
-                "playback.scene_player.frame",
+                "playback.scene_player.Player.frame",
                 "values of others that differ",
                 0.0,
                 "to the bit",
@@ -239,7 +239,7 @@ CASES: tuple[Case, ...] = (
             Case(
                 "bad rates",
                 f"{label} in one group: it stands still, standard",
-                "playback.scene_player.frame",
+                "playback.scene_player.Player.frame",
                 "values that differ from that",
                 0.0,
                 "to the bit",
@@ -248,7 +248,7 @@ CASES: tuple[Case, ...] = (
             Case(
                 "bad rates",
                 f"{label} in one group: others move as before, standard",
-                "playback.scene_player.frame",
+                "playback.scene_player.Player.frame",
                 "distance / extent",
                 2e-5,
                 "twice residuals.TOLERANCE",
@@ -269,7 +269,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "bad rates",
             f"rates of {rate:g}, {mode}",
-            "playback.scene_player.frame",
+            "playback.scene_player.Player.frame",
             "values that are not finite",
             0.0,
             "all finite",
@@ -282,7 +282,7 @@ CASES: tuple[Case, ...] = (
         Case(
             "incomplete scenes",
             name,
-            "playback.scene_player.frame",
+            "playback.scene_player.Player.frame",
             "values not finite, shapes wrong",
             0.0,
             "finite values, correct shapes",

@@ -32,7 +32,7 @@ from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
 path, times, out = sys.argv[1], json.loads(sys.argv[2]), sys.argv[3]
 scene = scene_file.read(path)
-frames = [scene_player.frame(scene, t) for t in times]
+frames = [scene_player.Player(scene).frame(t) for t in times]
 images = [scene_renderer.render_frame(scene, frame, scene.cameras[0]).color for frame in frames]
 np.save(out, np.stack(images))
 """

@@ -60,7 +60,7 @@ def test_the_page_rasterizes_with_gradients():
 
 def test_poses_move_the_gaussians_of_their_objects(scene):
     t = scene.t_max + 0.2
-    found, means = r5dgs_core.poses(scene, t), scene_player.frame(scene, t).means
+    found, means = r5dgs_core.poses(scene, t), scene_player.Player(scene).frame(t).means
     assert list(found) == [item.name for item in scene.objects if item.id > 0]
     for item in scene.objects:
         if item.id > 0:

@@ -90,7 +90,8 @@ def offsets(bpy, collection, scene, t):
     """Distance of each Gaussian from its position in playback at a time, in sizes of the scene. [N]"""
     go_to(bpy, collection, t)
     expected = (
-        scene_player.frame(scene, t).means.astype(np.float64) @ cameras.WORLD_TO_BLENDER[scene.world_convention].T
+        scene_player.Player(scene).frame(t).means.astype(np.float64)
+        @ cameras.WORLD_TO_BLENDER[scene.world_convention].T
     )
     return np.linalg.norm(all_points(bpy, collection, len(expected)) - expected, axis=-1) / scene.extent
 

@@ -49,7 +49,7 @@ def write_dataset(root: Path, scene: Scene) -> dataset.Dataset:
         offset[:3, 3] = [0.1 * group.id, -0.2, 5.0]
         matrices = []
         for t in times:
-            quats, displacements = scene_player.group_poses(scene, t)
+            quats, displacements = scene_player.Player(scene).group_poses(t)
             motion = np.eye(4)
             motion[:3, :3] = rotations.quats_to_rotmats(quats[group.id])
             motion[:3, 3] = group.pivot + displacements[group.id] - motion[:3, :3] @ group.pivot

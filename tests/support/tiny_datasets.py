@@ -68,12 +68,12 @@ class TinyData:
 
     def center(self, object_id: int, t: float) -> np.ndarray:
         """True centre of an object in the data set's world. [3]"""
-        _, displacement = scene_player.group_poses(self.truth, t)
+        _, displacement = scene_player.Player(self.truth).group_poses(t)
         return self.scale * (CENTERS[object_id] + displacement[object_id]) + self.shift
 
     def turn(self, object_id: int, t: float) -> np.ndarray:
         """True rotation of an object since `T_MAX`, unit wxyz. [4]"""
-        return scene_player.group_poses(self.truth, t)[0][object_id]
+        return scene_player.Player(self.truth).group_poses(t)[0][object_id]
 
 
 def make_dataset(
@@ -124,7 +124,7 @@ def make_dataset(
             shown = truth if t >= ball_from else without(truth, BALL)
             output = scene_renderer.render_frame(
                 shown,
-                scene_player.frame(shown, T_MAX if still else float(t)),
+                scene_player.Player(shown).frame(T_MAX if still else float(t)),
                 camera,
                 background=None if alpha else "scene",
             )

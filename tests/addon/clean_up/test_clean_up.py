@@ -119,8 +119,8 @@ def test_deleted_gaussians_are_gone_in_the_export_and_the_others_unchanged(blend
     for t in (0.2, 0.9):
         motions.go_to(blender, loaded, t)
         np.testing.assert_allclose(
-            np.sort(scene_player.frame(found, t).means, axis=0),
-            np.sort(scene_player.frame(scene, t).means[kept], axis=0), atol=1e-5 * scene.extent,
+            np.sort(scene_player.Player(found).frame(t).means, axis=0),
+            np.sort(scene_player.Player(scene).frame(t).means[kept], axis=0), atol=1e-5 * scene.extent,
         )  # fmt: skip
     edits = motions.addon("scene.evaluated_points")
     edit = edits.of(mug, blender.context.evaluated_depsgraph_get(), loaded.r5dgs.gaussians).edit
@@ -196,7 +196,7 @@ def test_assigned_gaussians_stay_in_place_and_move_with_their_object(blender, lo
     found = exported(blender, tmp_path / "assigned.r5dgs")
     assert (found.gaussians.object_ids == 1).sum() == (scene.gaussians.object_ids == 1).sum() + len(taken)
     assert len(found.objects) == len(scene.objects)
-    world = scene_player.frame(found, 0.5).means
+    world = scene_player.Player(found).frame(0.5).means
     own = np.flatnonzero(found.gaussians.object_ids == 1)
     assert all(np.linalg.norm(world[own] - place, axis=1).min() < 1e-4 for place in to_file(loaded, expected))
 
@@ -236,7 +236,7 @@ def test_gaussians_that_bend_go_on_bending_after_others_were_deleted(blender, tm
     blender.ops.r5dgs.delete_gaussians()
     for t in (0.3, 0.61, 0.2):
         motions.go_to(blender, collection, t)
-        expected = scene_player.frame(scene, t).means
+        expected = scene_player.Player(scene).frame(t).means
         for cloud in motions.clouds(collection):
             np.testing.assert_allclose(
                 motions.points(blender, cloud), expected[rows(cloud)], atol=1e-5 * scene.extent

@@ -93,7 +93,7 @@ def metadata_of(path):
 
 def core(scene, t, background="scene", camera=None):
     """The core's own picture."""
-    pose = scene_player.frame(scene, t)
+    pose = scene_player.Player(scene).frame(t)
     return scene_renderer.render_frame(scene, pose, camera or scene.cameras[0], background=background)
 
 
@@ -149,7 +149,7 @@ def test_cryptomatte_shares_pixels_among_objects_by_name(blender, loaded, scene,
     assert {name for name in passes.names if name.startswith("Crypto")} == {"CryptoObject00", "CryptoObject01"}
     ranks = [(f"CryptoObject0{k}.{name}", f"CryptoObject0{k}.{part}") for k in (0, 1) for name, part in ("rg", "ba")]
     mug = sum(np.where(passes.found[i] == cryptomatte.value_of("mug"), passes.found[c], 0) for i, c in ranks)
-    pose = scene_player.frame(scene, 0.3)
+    pose = scene_player.Player(scene).frame(0.3)
     one_hot = ((scene.gaussians.object_ids == 1) & (scene.gaussians.motion_ids == 1)).astype(np.float32)[:, None]
     expected = scene_renderer.render_frame(scene, pose, scene.cameras[0], features=one_hot).features[..., 0]
     assert_almost_all_close(mug, expected, 1e-3)

@@ -28,7 +28,7 @@ def cloud(collection, name):
 
 def shares(scene, rows):
     """Share of each pixel that some Gaussians cover, and the depth of the others at t_max. [H, W] each"""
-    pose, camera = scene_player.frame(scene, scene.t_max), scene.cameras[0]
+    pose, camera = scene_player.Player(scene).frame(scene.t_max), scene.cameras[0]
     held = np.zeros(len(scene.gaussians.means), np.float32)
     held[rows] = 1
     z = pose.means @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]

@@ -88,7 +88,7 @@ def psnr(a, b):
 def test_the_preview_is_the_cores_picture(blender, loaded, scene_path, t):
     scene = scene_file.read(scene_path)
     go_to(blender, t)
-    assert psnr(preview(blender), core_picture(scene, scene_player.frame(scene, t))) > 45
+    assert psnr(preview(blender), core_picture(scene, scene_player.Player(scene).frame(t))) > 45
 
 
 def test_preview_statistics_show_the_error_and_the_render_time(blender, loaded, scene_path):
@@ -122,7 +122,7 @@ def test_saved_bytes_are_the_pictures_bytes(blender, loaded, scene_path, tmp_pat
     assert image.colorspace_settings.name == "sRGB" and not image.is_float
     image.filepath_raw, image.file_format = str(tmp_path / "saved.png"), "PNG"
     image.save()
-    expected = np.round(255 * core_picture(scene, scene_player.frame(scene, 0.5)))
+    expected = np.round(255 * core_picture(scene, scene_player.Player(scene).frame(0.5)))
     saved = 255 * images.read(tmp_path / "saved.png")[..., :3].astype(np.float64)
     assert np.abs(saved - expected).max() <= 1.001
 
@@ -140,7 +140,7 @@ def test_hidden_objects_are_left_out_and_moved_ones_are_moved(blender, loaded, s
             # At t_max anchor and parent inverse cancel, so only the cloud's own matrix remains.
             instances.append(Instance(obj.r5dgs.start, obj.r5dgs.count, np.array(obj.matrix_basis)))
     expected = core_picture(scene, posed_scene.pose_instances(scene, instances))
-    everything = core_picture(scene, scene_player.frame(scene, scene.t_max))
+    everything = core_picture(scene, scene_player.Player(scene).frame(scene.t_max))
     shown = preview(blender)
     assert psnr(shown, expected) > 45 and psnr(everything, expected) < 30
 

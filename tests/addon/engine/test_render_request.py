@@ -111,7 +111,7 @@ def test_exact_mode_renders_deformed_gaussians(blender, picture, load, tmp_path)
     place_camera(blender, collection, made.cameras[0], made.world_convention)
     scene, t = scene_file.read(path), 0.2
     blender.context.scene.frame_set(int(1 + scene.frames_per_unit * t))
-    expected = scene_renderer.render_frame(scene, scene_player.frame(scene, t), scene.cameras[0]).color
+    expected = scene_renderer.render_frame(scene, scene_player.Player(scene).frame(t), scene.cameras[0]).color
     stiff = drawn(blender, picture)[1]["color"]
     collection.r5dgs_exact.enabled = True
     exact = drawn(blender, picture)[1]["color"]

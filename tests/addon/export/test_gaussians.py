@@ -170,7 +170,7 @@ def test_exported_ply_read_by_trimesh_matches_the_preview(blender, scene, previe
 def test_an_unedited_scene_matches_playback(blender, scene, loaded, tmp_path):
     blender.context.scene.frame_set(13, subframe=0.5)
     splats = export(blender, tmp_path / "a.ply", axes="FILE")
-    frame = scene_player.frame(scene, 12.5 / 60)
+    frame = scene_player.Player(scene).frame(12.5 / 60)
     np.testing.assert_allclose(np.sort(splats.means, axis=0), np.sort(frame.means, axis=0), atol=1e-5 * scene.extent)
     wanted = np.clip(
         scene_renderer.render_frame(
@@ -196,7 +196,7 @@ def test_exact_mode_exports_deformed_gaussians(blender, scene, tmp_path):
     assert blender.ops.r5dgs.exact_mode() == {"FINISHED"}
     found = export(blender, tmp_path / "b.ply", axes="FILE")
     assert (np.abs(found.means - straight.means).max(-1) > 1e-3).sum() == 2
-    wanted = scene_player.frame(scene_file.read(tmp_path / "bent.r5dgs"), 12 / 60).means
+    wanted = scene_player.Player(scene_file.read(tmp_path / "bent.r5dgs")).frame(12 / 60).means
     np.testing.assert_allclose(np.sort(found.means, axis=0), np.sort(wanted, axis=0), atol=1e-5 * scene.extent)
 
 
@@ -232,7 +232,7 @@ def test_a_range_writes_a_numbered_file_per_frame_and_keeps_the_current_frame(bl
     assert blender.ops.r5dgs.export_ply(filepath=str(tmp_path / "a.ply"), frames="RANGE", frame_step=2) == {"FINISHED"}
     assert sorted(p.name for p in tmp_path.glob("*.ply")) == ["a_0005.ply", "a_0007.ply", "a_0009.ply"]
     assert (view.frame_current, view.frame_subframe) == (30, 0.25)
-    wanted = scene_player.frame(scene, 6 / 60).means @ WORLD.T
+    wanted = scene_player.Player(scene).frame(6 / 60).means @ WORLD.T
     found = ply.read(tmp_path / "a_0007.ply").means
     np.testing.assert_allclose(np.sort(found, axis=0), np.sort(wanted, axis=0), atol=1e-5 * scene.extent)
 

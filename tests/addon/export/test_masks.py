@@ -48,7 +48,7 @@ def channels(path):
 
 def truth(scene, frame):
     return scene_renderer.render_frame(
-        scene, scene_player.frame(scene, (frame - 1) / 60), scene.cameras[0], background=None
+        scene, scene_player.Player(scene).frame((frame - 1) / 60), scene.cameras[0], background=None
     )
 
 

@@ -199,7 +199,7 @@ def test_an_edited_motion_of_any_kind_plays_in_the_new_file_as_in_blender(blende
         frame = 1 + 60 * min(t, 1.0)
         blender.context.scene.frame_set(int(frame), subframe=float(frame % 1))
         shown = motions.all_points(blender, loaded, len(scene.gaussians.means))
-        played = scene_player.frame(saved, min(t, 1.0)).means.astype(np.float64)
+        played = scene_player.Player(saved).frame(min(t, 1.0)).means.astype(np.float64)
         played = played @ cameras.WORLD_TO_BLENDER[saved.world_convention].T
         for rows in (scene.gaussians.motion_ids == 1, scene.gaussians.motion_ids == 2):
             np.testing.assert_allclose(played[rows], shown[rows], atol=3e-5 * scene.extent, err_msg=str(t))
@@ -231,7 +231,7 @@ def test_a_duplicate_becomes_a_separate_object(blender, scene, loaded, tmp_path)
     copy = saved.objects[-1]
     assert copy.count == scene.object(1).count and copy.name not in {item.name for item in scene.objects}
     for t in TIMES:
-        means = scene_player.frame(saved, t).means
+        means = scene_player.Player(saved).frame(t).means
         shift = means[saved.gaussians.object_ids == copy.id] - means[saved.gaussians.object_ids == 1]
         np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=5e-5)
 

@@ -58,7 +58,7 @@ def assert_bends_like_the_core(bpy, collection, scene, times):
     motions.assert_plays_like_the_core(bpy, collection, scene, times)
     for t in times:
         motions.go_to(bpy, collection, t)
-        frame = scene_player.frame(scene, t)
+        frame = scene_player.Player(scene).frame(t)
         for cloud in (o for o in collection.all_objects if o.r5dgs.role == "CLOUD"):
             rows = slice(cloud.r5dgs.start, cloud.r5dgs.start + cloud.r5dgs.count)
             np.testing.assert_allclose(stored(cloud, "scale", "vector", 3), np.exp(frame.log_scales[rows]), rtol=1e-5)
@@ -196,7 +196,7 @@ def test_deleted_points_leave_the_others_where_they_belong(blender, scene, loade
     cloud.data = fewer
     blender.ops.r5dgs.exact_mode(action="ON")
     motions.go_to(blender, loaded, 0.3)
-    expected = scene_player.frame(scene, 0.3).means[keep]
+    expected = scene_player.Player(scene).frame(0.3).means[keep]
     np.testing.assert_allclose(motions.points(blender, cloud), expected, atol=1e-5 * scene.extent)
 
 

@@ -458,7 +458,7 @@ def test_far_from_the_origin_extrapolation_still_holds(blender, tmp_path):
     collection = motions.load(blender, path)
     blender.ops.r5dgs.extrapolate_until(t_end=1.3)
     motions.assert_plays_like_the_core(blender, collection, scene_file.read(path), (*TIMES, 1.3))
-    assert scene_player.frame(far, 1.3).means.shape == (300, 3)
+    assert scene_player.Player(far).frame(1.3).means.shape == (300, 3)
 
 
 def test_key_reduction_keeps_the_tolerance_and_the_ends(blender, scene_path, loaded):
@@ -471,7 +471,7 @@ def test_key_reduction_keeps_the_tolerance_and_the_ends(blender, scene_path, loa
     assert fewer < 0.6 * count
     for t in np.linspace(0, 1, 23):
         motions.go_to(blender, loaded, t)
-        frame = scene_player.frame(scene, t)
+        frame = scene_player.Player(scene).frame(t)
         for cloud in (o for o in loaded.all_objects if o.r5dgs.role == "CLOUD"):
             rows = slice(cloud.r5dgs.start, cloud.r5dgs.start + cloud.r5dgs.count)
             worst = np.linalg.norm(motions.points(blender, cloud) - frame.means[rows], axis=-1).max()

@@ -199,7 +199,9 @@ def test_export_writes_the_moved_pivot(blender, scene_path, tmp_path):
     arms = np.broadcast_to(PIVOT - group.pivot, displacements.shape)
     np.testing.assert_allclose(rotations.rotate(quats, arms) + displacements, arms, atol=1e-5)
     motions.assert_plays_like_the_core(blender, collection, scene, TIMES)
-    assert np.abs(scene_player.frame(scene, 1.0).means - scene_player.frame(scene, T_MAX).means).max() > 0.1
+    assert (
+        np.abs(scene_player.Player(scene).frame(1.0).means - scene_player.Player(scene).frame(T_MAX).means).max() > 0.1
+    )
 
 
 def test_motions_without_a_pivot_show_none(blender, loaded, mug):

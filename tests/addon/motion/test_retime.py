@@ -45,7 +45,7 @@ def assert_shows(bpy, collection, scene, frame, source):
     go_to(bpy, frame)
     state = collection.r5dgs
     t = (source - state.frame_zero) / state.frames_per_unit
-    expected = scene_player.frame(scene, t).means @ cameras.WORLD_TO_BLENDER[scene.world_convention].T
+    expected = scene_player.Player(scene).frame(t).means @ cameras.WORLD_TO_BLENDER[scene.world_convention].T
     found = motions.all_points(bpy, collection, len(expected))
     np.testing.assert_allclose(found, expected, atol=2e-5 * scene.extent, err_msg=f"frame {frame}")
 
@@ -147,7 +147,7 @@ def test_objects_that_bend_are_retimed_with_their_bending(blender, tmp_path):
             assert_shows(blender, collection, scene, frame, source)
             blender.ops.r5dgs.export_ply(filepath=str(tmp_path / "a.ply"), axes="FILE")
             t = (source - collection.r5dgs.frame_zero) / collection.r5dgs.frames_per_unit
-            wanted = scene_player.frame(scene, t).means
+            wanted = scene_player.Player(scene).frame(t).means
             found = ply.read(tmp_path / "a.ply").means
             np.testing.assert_allclose(np.sort(found, axis=0), np.sort(wanted, axis=0), atol=2e-5 * scene.extent)
             instances = motions.addon("engine.visible_clouds").instances(blender.context.evaluated_depsgraph_get())[1]
@@ -163,5 +163,5 @@ def test_the_edited_scene_holds_the_retimed_motion(blender, loaded, scene, tmp_p
     for t in found.tracks.times[1:-1:4].tolist():
         frame = loaded.r5dgs.frame_zero + t * loaded.r5dgs.frames_per_unit
         source = (at(frame, "REVERSE", first, last) - loaded.r5dgs.frame_zero) / loaded.r5dgs.frames_per_unit
-        wanted, own = scene_player.frame(scene, source).means, scene_player.frame(found, t).means
+        wanted, own = scene_player.Player(scene).frame(source).means, scene_player.Player(found).frame(t).means
         np.testing.assert_allclose(np.sort(own, axis=0), np.sort(wanted, axis=0), atol=1e-3 * scene.extent)

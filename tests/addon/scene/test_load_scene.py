@@ -210,7 +210,7 @@ def test_a_larger_tolerance_gives_fewer_keys_within_the_tolerance(blender, scene
         for t in TIMES:
             motions.go_to(blender, collection, t)
             points = motions.all_points(blender, collection, len(scene.gaussians.means))
-            distance = np.linalg.norm(points - scene_player.frame(scene, t).means, axis=-1)
+            distance = np.linalg.norm(points - scene_player.Player(scene).frame(t).means, axis=-1)
             assert distance.max() <= (tolerance + 2e-6) * scene.extent
     assert counts[1e-3] < 0.7 * counts[3e-6]
 

@@ -80,7 +80,7 @@ def test_the_preview_of_a_far_scene_is_the_cores_picture(blender, loaded, view, 
     scene = scene_file.read(scene_path)
     for t in (0.2, 0.95):
         go_to(blender, t)
-        assert psnr(preview(blender), core_picture(scene, scene_player.frame(scene, t))) > 45
+        assert psnr(preview(blender), core_picture(scene, scene_player.Player(scene).frame(t))) > 45
 
 
 def test_exported_cameras_of_the_file_are_those_of_the_data_sets_world(blender, view, scene_path, tmp_path):

@@ -56,7 +56,7 @@ def test_a_part_hangs_on_the_anchor_of_its_parent_and_plays_as_in_the_core(blend
     collection = loaded
     assert anchor_of(collection, 2).parent == anchor_of(collection, 1)
     for frame in FRAMES:
-        expected = scene_player.frame(scene, (frame - 1) / scene.frames_per_unit).means
+        expected = scene_player.Player(scene).frame((frame - 1) / scene.frames_per_unit).means
         for motion_id in (1, 2):
             points, rows = shown(blender, collection, scene, motion_id, frame)
             np.testing.assert_allclose(points, expected[rows], atol=2e-5 * scene.extent)
@@ -134,8 +134,8 @@ def test_an_arm_under_a_moved_and_turned_parent_keeps_its_joint(blender, loaded,
 def assert_moved(scene, moved, place):
     rows = np.isin(scene.gaussians.motion_ids, (1, 2))
     for t in (0.0, 0.41, 0.75, 0.95):
-        expected = place(scene_player.frame(scene, t).means[rows])
-        np.testing.assert_allclose(scene_player.frame(moved, t).means[rows], expected, atol=5e-5)
+        expected = place(scene_player.Player(scene).frame(t).means[rows])
+        np.testing.assert_allclose(scene_player.Player(moved).frame(t).means[rows], expected, atol=5e-5)
 
 
 def test_an_edited_motion_of_a_part_loses_its_joint(blender, loaded, scene, addon, tmp_path):

@@ -25,7 +25,7 @@ def instances(bpy):
 
 def expected(scene, t):
     """The same from playback: rotation times standard deviations."""
-    frame = scene_player.frame(scene, t)
+    frame = scene_player.Player(scene).frame(t)
     turned = rotations.quats_to_rotmats(frame.quats.astype(np.float64)) * np.exp(frame.log_scales)[:, None, :]
     order = sorted(range(len(turned)), key=lambda row: tuple(frame.means[row].astype(float).round(4)))
     return turned[order], frame.means[order]

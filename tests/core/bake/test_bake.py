@@ -43,7 +43,7 @@ def assert_shows_what_was_trained(run_made, scene, bar=45.0):
     for view, trained_view in list(zip(trainer.dataset.train, trainer.views, strict=True))[::7]:
         with torch.no_grad():
             expected = trainer.render(trained_view.camera, trained_view.t).numpy()
-        shown = scene_renderer.render_frame(scene, scene_player.frame(scene, view.t), view.camera).color
+        shown = scene_renderer.render_frame(scene, scene_player.Player(scene).frame(view.t), view.camera).color
         assert psnr(shown.clip(0, 1), expected.clip(0, 1)) > bar
 
 
@@ -93,7 +93,7 @@ def test_poses_at_the_knots_are_the_trained_ones_in_the_world(trained, kept):
     draws = np.random.default_rng(0)
     points = draws.normal(size=(20, 3)) * 0.5  # canonical, training coordinates
     for t in tracks.times:
-        quats, displacements = scene_player.group_poses(kept, float(t))
+        quats, displacements = scene_player.Player(kept).group_poses(float(t))
         with torch.no_grad():
             now, last = tracks.poses(float(t)), tracks.poses(float(tracks.times[-1]))
             centers = tracks.group_centers()
@@ -112,10 +112,10 @@ def test_poses_at_the_knots_are_the_trained_ones_in_the_world(trained, kept):
 
 
 def test_at_t_max_nothing_moves(baked):
-    quats, displacements = scene_player.group_poses(baked, baked.t_max)
+    quats, displacements = scene_player.Player(baked).group_poses(baked.t_max)
     np.testing.assert_array_equal(quats, rotations.identity(len(baked.groups)))
     np.testing.assert_array_equal(displacements, 0)
-    np.testing.assert_array_equal(scene_player.frame(baked, baked.t_max).means, baked.gaussians.means)
+    np.testing.assert_array_equal(scene_player.Player(baked).frame(baked.t_max).means, baked.gaussians.means)
 
 
 def test_objects_keep_their_motion_and_continue_it_past_t_max(baked, tiny):
@@ -124,7 +124,7 @@ def test_objects_keep_their_motion_and_continue_it_past_t_max(baked, tiny):
         arm = tiny.center(k, tiny_datasets.T_MAX) - group.pivot
         travel = np.linalg.norm(tiny.center(k, 0.0) - tiny.center(k, tiny_datasets.T_MAX))
         for t, tolerance in ((0.0, 0.06), (0.3, 0.06), (0.85, 0.06), (1.0, 0.15)):
-            quats, displacements = scene_player.group_poses(baked, t)
+            quats, displacements = scene_player.Player(baked).group_poses(t)
             found = group.pivot + rotations.rotate(quats[k], arm) + displacements[k]
             assert np.linalg.norm(found - tiny.center(k, t)) < tolerance * travel, (k, t)
 
@@ -160,7 +160,9 @@ def test_a_baked_scene_survives_its_file(baked, tmp_path):
     assert again.needs == baked.needs and again.objects == baked.objects
     view = baked.cameras[0]
     for t in (0.0, 0.5, 1.0):
-        one, other = (scene_renderer.render_frame(s, scene_player.frame(s, t), view).color for s in (baked, again))
+        one, other = (
+            scene_renderer.render_frame(s, scene_player.Player(s).frame(t), view).color for s in (baked, again)
+        )
         assert psnr(one, other) > 45
 
 

@@ -41,7 +41,7 @@ def test_bodies_of_different_objects_stay_apart():
 def test_true_bodies_of_one_object_are_compared_with_the_parts_that_move_alike():
     scene = arms.make_arm()
     times = np.array([0.0, 0.2, 0.5, 0.75, 1.0])
-    poses = [scene_player.group_poses(scene, float(t)) for t in times]
+    poses = [scene_player.Player(scene).group_poses(float(t)) for t in times]
     truth = np.stack(
         [np.stack([se3.pose_to_matrix(scene.groups[g].pivot, q[g], d[g]) for q, d in poses]) for g in (2, 1)]
     )

@@ -82,7 +82,7 @@ def test_noise_is_simplified_to_rest_and_slow_motion_is_kept(given):
     assert decisions["motion"] == ("on" if name == "slide" else "off")
     model = scene.groups[BRICK].model
     for t in (0.0, 0.4, truth.t_max, 2 * truth.t_max):
-        quats, displacements = scene_player.group_poses(scene, t)
+        quats, displacements = scene_player.Player(scene).group_poses(t)
         expected = [MOTIONS[name].angular_velocity * (t - truth.t_max), MOTIONS[name].velocity * (t - truth.t_max)]
         turn = rotations.quats_to_rotvecs(quats[BRICK])
         np.testing.assert_allclose(turn, expected[0], atol=2e-3 if name == "turn" else 0)
@@ -114,7 +114,7 @@ def test_a_turn_that_carries_a_shadow_is_kept_while_it_is_seen_and_not_foretold(
     row = rows["rotation"]
     assert row["decision"] == "on" and "only fits colours" in row["reason"] and "dB" in row["reason"]
     np.testing.assert_allclose(scene.tracks.poses[BRICK], poses[BRICK], atol=1e-12)
-    later = scene_player.group_poses(scene, 2 * truth.t_max)
+    later = scene_player.Player(scene).group_poses(2 * truth.t_max)
     assert scene.groups[BRICK].model.kind == "static"
     np.testing.assert_array_equal(later[0][BRICK], [1, 0, 0, 0])
     np.testing.assert_array_equal(later[1][BRICK], 0)
@@ -147,7 +147,7 @@ def test_another_bind_state_shows_the_same_and_followers_follow(given):
     np.testing.assert_allclose(
         rebound.tracks.poses[3, :, 4:], rebound.tracks.poses[BRICK, :, 4:] * [1, 1, 0], atol=1e-12
     )
-    before, after = scene_player.frame(scene, 0.3), scene_player.frame(rebound, 0.3)
+    before, after = scene_player.Player(scene).frame(0.3), scene_player.Player(rebound).frame(0.3)
     np.testing.assert_allclose(after.means, before.means, atol=1e-6)
 
 

@@ -347,15 +347,15 @@ def test_playing_draws_each_camera_in_the_order_of_time(baked, tiny, monkeypatch
 
 def test_modes_alternate_in_each_round(baked, tiny, monkeypatch):
     still = baked.with_arrays(dynamics=np.zeros((len(baked.gaussians.means), 12), np.float32))
-    drawn, frame = [], scene_player.frame
+    drawn, frame = [], scene_player.Player.frame
 
-    def watch(scene, t, mode="rigid"):
-        drawn.append(mode)
-        return frame(scene, t, mode)
+    def watch(player, t, origin=None):
+        drawn.append(player.mode)
+        return frame(player, t, origin)
 
-    monkeypatch.setattr(scene_player, "frame", watch)
+    monkeypatch.setattr(scene_player.Player, "frame", watch)
     views = datasets.read(tiny.root).test
     found = playback_speed.measure(still, views, ["rigid", "standard"])
     turn = ["rigid"] * len(views) + ["standard"] * len(views)
-    assert drawn == turn * (len(drawn) // len(turn))
+    assert drawn and drawn == turn * (len(drawn) // len(turn))
     assert found["rigid"]["frames"] == found["standard"]["frames"] >= playback_speed.MIN_FRAMES

@@ -27,7 +27,7 @@ def test_ply_holds_the_gaussians_of_a_time(path, scene, tmp_path):
     out = tmp_path / "a.ply"
     for t in (0.3, scene.t_max + 0.4):
         assert export(path, "--to", "ply", "--out", out, "--time", t, "--overwrite") == 0
-        frame, found = scene_player.frame(scene, t), ply.read(out)
+        frame, found = scene_player.Player(scene).frame(t), ply.read(out)
         np.testing.assert_array_equal(found.means, frame.means)
         np.testing.assert_allclose(found.quats, frame.quats, atol=1e-6)
         np.testing.assert_array_equal(found.object_ids, scene.gaussians.object_ids)
@@ -43,7 +43,7 @@ def test_each_frame_of_a_range_is_a_file(path, scene, tmp_path, capsys):
     assert export(path, *arguments) == 0
     paths = [str(tmp_path / f"a_{number:04d}.ply") for number in (9, 10, 11)]
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["paths"] == paths
-    means = scene_player.frame(scene, 9 / scene.frames_per_unit).means
+    means = scene_player.Player(scene).frame(9 / scene.frames_per_unit).means
     np.testing.assert_array_equal(ply.read(paths[1]).means, means)
 
 

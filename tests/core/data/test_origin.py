@@ -36,7 +36,10 @@ def psnr(a, b):
 
 
 def drawn(scene, views):
-    return [scene_renderer.render_frame(scene, scene_player.frame(scene, view.t), view.camera).color for view in views]
+    return [
+        scene_renderer.render_frame(scene, scene_player.Player(scene).frame(view.t), view.camera).color
+        for view in views
+    ]
 
 
 def test_near_scenes_keep_the_origin_of_their_world(tiny):

@@ -34,7 +34,7 @@ def pose(tiny):
     """Splats of the true scene at a view's time."""
 
     def at(view):
-        frame = scene_player.frame(tiny.truth, view.t)
+        frame = scene_player.Player(tiny.truth).frame(view.t)
         return PosedSplats(
             *(torch.from_numpy(np.asarray(a, np.float32)) for a in (frame.means, frame.quats)),
             torch.from_numpy(np.exp(np.asarray(tiny.truth.gaussians.log_scales, np.float32))),

@@ -32,7 +32,7 @@ def played(scene, motion_id, times):
     """Maps from the bind state that playback gives a motion group. [T, 4, 4]"""
     result = []
     for t in times:
-        quats, moves = scene_player.group_poses(scene, t)
+        quats, moves = scene_player.Player(scene).group_poses(t)
         turn, pivot = rotations.quats_to_rotmats(quats[motion_id]), np.asarray(scene.groups[motion_id].pivot)
         result.append(matrix_of(turn, pivot + moves[motion_id] - turn @ pivot))
     return np.array(result)
@@ -134,7 +134,9 @@ def test_deleted_objects_are_removed_with_all_their_data():
     assert result.lookup.thresholds == (0, 1, 2, 4) and result.lookup.views[3] == scene.lookup.views[4]
     np.testing.assert_array_equal(result.classifier.weight, scene.classifier.weight[[0, 1, 3]])
     for t in (0.1, 0.6, 0.95):
-        np.testing.assert_array_equal(scene_player.frame(result, t).means, scene_player.frame(scene, t).means[keep])
+        np.testing.assert_array_equal(
+            scene_player.Player(result).frame(t).means, scene_player.Player(scene).frame(t).means[keep]
+        )
 
 
 def test_without_its_leader_a_shadow_keeps_its_motion():
@@ -145,7 +147,7 @@ def test_without_its_leader_a_shadow_keeps_its_motion():
     rows, old = result.gaussians.motion_ids == shadow.id, scene.gaussians.motion_ids == 4
     for t in (0.3, 0.9):
         np.testing.assert_allclose(
-            scene_player.frame(result, t).means[rows], scene_player.frame(scene, t).means[old], atol=1e-4
+            scene_player.Player(result).frame(t).means[rows], scene_player.Player(scene).frame(t).means[old], atol=1e-4
         )
 
 
@@ -164,7 +166,9 @@ def test_a_moved_object_keeps_the_motion_of_its_group(matrix):
         bent = np.zeros(len(rows), bool)
         bent[scene.residuals.rows] = True
         straight = ~bent[rows]
-        np.testing.assert_allclose(scene_player.frame(result, t).means[rows][straight], wanted[straight], atol=2e-5)
+        np.testing.assert_allclose(
+            scene_player.Player(result).frame(t).means[rows][straight], wanted[straight], atol=2e-5
+        )
 
 
 def test_residuals_and_shading_rotate_with_their_object():
@@ -172,7 +176,7 @@ def test_residuals_and_shading_rotate_with_their_object():
     matrix = matrix_of(1.4 * TURN, (0.2, -1.0, 0.3))
     result, _ = edit(scene, pieces_of(scene, before={k: matrix for k in range(-1, 4)}))
     for t in (0.02, 0.4, 0.75, 0.9):
-        found, plain = scene_player.frame(result, t), scene_player.frame(scene, t)
+        found, plain = scene_player.Player(result).frame(t), scene_player.Player(scene).frame(t)
         np.testing.assert_allclose(found.means, plain.means @ matrix[:3, :3].T + matrix[:3, 3], atol=5e-5)
         np.testing.assert_allclose(found.log_scales, plain.log_scales + np.log(1.4), atol=1e-5)
         turned = rotations.multiply(rotations.rotmats_to_quats(TURN), plain.quats.astype(np.float64))
@@ -191,8 +195,8 @@ def test_a_parent_turns_the_learned_motion_and_its_model(mirror):
     np.testing.assert_allclose(turned.angular_velocity, mirror * linear / 0.7 @ model.angular_velocity)
     rows = (scene.gaussians.object_ids == 1) & ~np.isin(np.arange(300), scene.residuals.rows)
     for t in (0.0, 0.31, 0.75, 0.99):
-        wanted = scene_player.frame(scene, t).means[rows] @ matrix[:3, :3].T + matrix[:3, 3]
-        np.testing.assert_allclose(scene_player.frame(result, t).means[rows], wanted, atol=2e-5)
+        wanted = scene_player.Player(scene).frame(t).means[rows] @ matrix[:3, :3].T + matrix[:3, 3]
+        np.testing.assert_allclose(scene_player.Player(result).frame(t).means[rows], wanted, atol=2e-5)
 
 
 def test_a_covariance_is_turned_with_its_model():
@@ -225,9 +229,9 @@ def test_new_curves_become_a_track_and_the_nearest_model():
     bent = np.isin(np.flatnonzero(rows), scene.residuals.rows)
     for k in (0, 5, len(t) - 1):
         wanted = scene.gaussians.means[rows] @ maps[k, :3, :3].T + maps[k, :3, 3]
-        np.testing.assert_allclose(scene_player.frame(result, t[k]).means[rows][~bent], wanted[~bent], atol=5e-5)
+        np.testing.assert_allclose(scene_player.Player(result).frame(t[k]).means[rows][~bent], wanted[~bent], atol=5e-5)
     np.testing.assert_array_equal(
-        scene_player.frame(result, 0.9).means[~rows], scene_player.frame(scene, 0.9).means[~rows]
+        scene_player.Player(result).frame(0.9).means[~rows], scene_player.Player(scene).frame(0.9).means[~rows]
     )
 
 
@@ -263,7 +267,7 @@ def test_a_still_object_that_is_animated_gets_its_own_group():
     assert (group.role, group.object_id, group.model.kind) == ("body", 0, "translation")
     rows = result.gaussians.motion_ids == group.id
     np.testing.assert_allclose(
-        scene_player.frame(result, 0.95).means[rows], result.gaussians.means[rows] + (0, 0, 0.1), atol=1e-5
+        scene_player.Player(result).frame(0.95).means[rows], result.gaussians.means[rows] + (0, 0, 0.1), atol=1e-5
     )
 
 
@@ -283,12 +287,12 @@ def test_a_copy_is_a_separate_object_with_the_motion_and_embedding_of_the_origin
     straight = ~np.isin(np.flatnonzero(old), scene.residuals.rows)
     for t in (0.2, 0.9):
         np.testing.assert_allclose(
-            scene_player.frame(result, t).means[rows],
-            scene_player.frame(result, t).means[result.gaussians.object_ids == 3] + aside[:3, 3], atol=2e-5,
+            scene_player.Player(result).frame(t).means[rows],
+            scene_player.Player(result).frame(t).means[result.gaussians.object_ids == 3] + aside[:3, 3], atol=2e-5,
         )  # fmt: skip
         np.testing.assert_array_equal(
-            scene_player.frame(result, t).means[result.gaussians.object_ids == 3][straight],
-            scene_player.frame(scene, t).means[old][straight],
+            scene_player.Player(result).frame(t).means[result.gaussians.object_ids == 3][straight],
+            scene_player.Player(scene).frame(t).means[old][straight],
         )
 
 

@@ -34,7 +34,7 @@ def test_the_developers_page_adds_a_format(scene, tmp_path, monkeypatch):
     path = scene_file.write(scene, tmp_path / "scene.r5dgs")
     assert main.main(["export", str(path), "--to", "csv", "--out", str(tmp_path / "a.csv"), "--time", "0.5"]) == 0
     head, *rows = (tmp_path / "a.csv").read_text().splitlines()
-    means = scene_player.frame(scene_file.read(path), 0.5).means
+    means = scene_player.Player(scene_file.read(path)).frame(0.5).means
     assert head == "x,y,z" and len(rows) == len(means)
     assert [float(value) for value in rows[7].split(",")] == pytest.approx(means[7], rel=1e-5)
 

@@ -31,7 +31,7 @@ def covariances(frame: scene_player.Frame) -> np.ndarray:
 
 def assert_drawn(scene, t: float, expected: Drawn, mode: str = "rigid", tolerance: float = 1e-4) -> None:
     """Centres and covariances of the scene at a time are the expected ones."""
-    frame = scene_player.frame(scene, t, mode)
+    frame = scene_player.Player(scene, mode).frame(t)
     np.testing.assert_allclose(frame.means, expected.means.numpy(), atol=tolerance)
     wanted = expected.covariances.numpy()
     size = np.abs(wanted).max(axis=(1, 2), keepdims=True)
@@ -41,7 +41,9 @@ def assert_drawn(scene, t: float, expected: Drawn, mode: str = "rigid", toleranc
 def assert_pictured(scene, t: float, cloud, expected: Drawn, background: float, mode: str = "rigid") -> None:
     """The scene's picture is the one that the rule of its layout blends."""
     camera = scene.cameras[0]
-    seen = scene_renderer.render_frame(scene, scene_player.frame(scene, t, mode), camera, backend="reference").color
+    seen = scene_renderer.render_frame(
+        scene, scene_player.Player(scene, mode).frame(t), camera, backend="reference"
+    ).color
     wanted = foreign.picture(cloud, expected, camera, background)
     np.testing.assert_allclose(seen, wanted, atol=2e-3)
     assert wanted.std() > 0.05
@@ -235,7 +237,9 @@ def test_freegave_rotates_against_the_sign_of_its_weights(tmp_path, width, depth
     for t in scene.tracks.times:
         assert_drawn(scene, t, rule(t))
     near, far = T_MAX + 0.02, T_MAX + 0.04
-    errors = [np.abs(scene_player.frame(scene, t, "standard").means - rule(t).means.numpy()).max() for t in (near, far)]
+    errors = [
+        np.abs(scene_player.Player(scene, "standard").frame(t).means - rule(t).means.numpy()).max() for t in (near, far)
+    ]
     assert errors[1] < 2e-4
     assert_drawn(scene, far, rule(far), "standard", 2e-4)
     scene = importer.dataclasses.replace(scene, near_plane=0.2)

@@ -108,7 +108,7 @@ def test_a_placed_range_has_the_colours_that_the_renderer_gives_it(tint):
 
 def test_a_placed_range_is_lit_as_playback_lights_it():
     scene = make_scene(n=200, shading=True)
-    frame = scene_player.frame(scene, 0.2)
+    frame = scene_player.Player(scene).frame(0.2)
     group = scene.groups[1]
     rows = np.flatnonzero(scene.gaussians.motion_ids == 1)
     turn = rotations.quats_to_rotmats(frame.group_quats[1])

@@ -211,12 +211,14 @@ def test_kabsch_carries_members_where_their_own_dynamics_bring_them(scene):
     noise = rng.normal(scale=[0.1] * 3 + [0.8] * 3 + [0.1] * 3 + [0.8] * 3, size=(len(scene.gaussians.means), 12))
     rough = scene.with_arrays(dynamics=scene.dynamics.rates + noise * (scene.dynamics.rates != 0))
     t = T_MAX * (1 + group_dynamics.HORIZON)
-    goal = scene_player.frame(rough, t, "standard").means
+    goal = scene_player.Player(rough, "standard").frame(t).means
     body = scene.gaussians.motion_ids == 1
     best = rigid_fit.fit_rigid(scene.gaussians.means[body], goal[body]).residuals.mean()
 
     def error(source):
-        return np.linalg.norm(scene_player.frame(rough, t, f"rigid/{source}").means[body] - goal[body], axis=-1).mean()
+        return np.linalg.norm(
+            scene_player.Player(rough, f"rigid/{source}").frame(t).means[body] - goal[body], axis=-1
+        ).mean()
 
     assert error("kabsch") < 1.02 * best
     assert error("kabsch") <= 1.01 * min(error("least_squares"), error("median"), error("representative"))

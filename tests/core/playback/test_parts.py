@@ -14,7 +14,7 @@ LATER = (0.75, 0.8, 1.0, 1.9)
 
 def gap(scene, t):
     """Distance between both parts' images of the joint's point."""
-    quats, moves = scene_player.group_poses(scene, t)
+    quats, moves = scene_player.Player(scene).group_poses(t)
     point, ends = scene.groups[2].joint.point, []
     for row in (1, 2):
         pivot = scene.groups[row].pivot
@@ -33,16 +33,16 @@ def test_joints_stay_closed_at_all_times(kind):
 def test_parts_keep_their_knots_and_their_bind_state():
     scene = arms.make_arm()
     for s, t in enumerate(scene.tracks.times):
-        quats, moves = scene_player.group_poses(scene, float(t))
+        quats, moves = scene_player.Player(scene).group_poses(float(t))
         np.testing.assert_allclose(moves, scene.tracks.poses[:, s, 4:], atol=1e-12)
         np.testing.assert_allclose(np.abs((quats * scene.tracks.poses[:, s, :4]).sum(-1)), 1, atol=1e-12)
-    still = scene_player.frame(scene, scene.t_max)
+    still = scene_player.Player(scene).frame(scene.t_max)
     np.testing.assert_array_equal(still.means, scene.gaussians.means)
 
 
 def test_a_part_moves_with_its_parent_past_t_max():
     scene = arms.make_arm()
-    quats, moves = scene_player.group_poses(scene, 1.1)
+    quats, moves = scene_player.Player(scene).group_poses(1.1)
     part, tau = scene.groups[2], 1.1 - scene.t_max
     parent = models.evaluate(scene.groups[1].model, tau)
     expected = joints.composed(parent, scene.groups[1].pivot, part.joint.poses(tau), part.joint.point, part.pivot)
@@ -57,7 +57,7 @@ def test_a_part_stops_at_its_limit():
     scene = dataclasses.replace(scene, groups=tuple(groups))
 
     def turn(t):
-        quats, moves = scene_player.group_poses(scene, t)
+        quats, moves = scene_player.Player(scene).group_poses(t)
         pivots = [g.pivot for g in scene.groups]
         return joints.relative((quats[1], moves[1]), pivots[1], (quats[2], moves[2]), pivots[2], arms.POINT)[0]
 

@@ -77,7 +77,7 @@ def test_residuals_are_the_curves_of_their_knots(knots):
 
 @pytest.mark.parametrize("k", [0, 3, 7])
 def test_residuals_change_the_bind_state_before_the_group_moves_it(bending, k):
-    frame, i = scene_player.frame(bending, float(TIMES[k])), 11
+    frame, i = scene_player.Player(bending).frame(float(TIMES[k])), 11
     row = int(bending.residuals.rows[i])
     group = bending.groups[int(bending.gaussians.motion_ids[row])]
     q, d = frame.group_quats[group.id], frame.group_displacements[group.id]
@@ -96,11 +96,13 @@ def test_residuals_change_the_bind_state_before_the_group_moves_it(bending, k):
 
 def test_residuals_are_smooth_between_knots_and_gone_at_t_max(bending):
     times = np.linspace(0.0, T_MAX, 201)
-    paths = np.stack([scene_player.frame(bending, t).means for t in times])
+    paths = np.stack([scene_player.Player(bending).frame(t).means for t in times])
     steps = np.linalg.norm(np.diff(paths, axis=0), axis=-1)
     assert steps.max() < 0.2
-    np.testing.assert_array_equal(scene_player.frame(bending, T_MAX).means, bending.gaussians.means)
-    np.testing.assert_array_equal(scene_player.frame(bending, -1.0).means, scene_player.frame(bending, 0.0).means)
+    np.testing.assert_array_equal(scene_player.Player(bending).frame(T_MAX).means, bending.gaussians.means)
+    np.testing.assert_array_equal(
+        scene_player.Player(bending).frame(-1.0).means, scene_player.Player(bending).frame(0.0).means
+    )
 
 
 def test_the_sign_of_a_residual_quaternion_does_not_matter(bending):
@@ -108,13 +110,13 @@ def test_the_sign_of_a_residual_quaternion_does_not_matter(bending):
     flipped[:, ::2] *= -1
     other = bending.with_arrays(residual_quats=flipped)
     for t in (0.02, 0.13, 0.5):
-        a, b = scene_player.frame(bending, t).quats, scene_player.frame(other, t).quats
+        a, b = scene_player.Player(bending).frame(t).quats, scene_player.Player(other).frame(t).quats
         assert rotations.angle_between(a.astype(float), b.astype(float)).max() < 1e-3
 
 
 def test_equal_twists_move_a_body_rigidly_in_mode_standard():
     scene = twisting(make_scene())
-    frame = scene_player.frame(scene, 1.0, "standard")
+    frame = scene_player.Player(scene, "standard").frame(1.0)
     for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
         before, after = scene.gaussians.means[start:stop].astype(float), frame.means[start:stop].astype(float)
         pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
@@ -124,14 +126,14 @@ def test_equal_twists_move_a_body_rigidly_in_mode_standard():
 
 def test_the_literal_form_is_rigid_only_if_offsets_are_those_at_t_max():
     scene = twisting(make_scene())
-    standard, literal = (scene_player.frame(scene, 1.0, mode) for mode in ("standard", "rigid_paper"))
+    standard, literal = (scene_player.Player(scene, mode).frame(1.0) for mode in ("standard", "rigid_paper"))
     np.testing.assert_allclose(literal.means, standard.means, atol=2e-3)
     body = scene.gaussians.motion_ids == 1
     turn = rotations.rotvecs_to_quats(np.array([0, 0, 1.0]))
     canonical = scene.dynamics.canonical_means.astype(float)
     canonical[body] = rotations.rotate(turn, canonical[body])
     turned = scene.with_arrays(canonical_means=canonical.astype(np.float32))
-    off = scene_player.frame(turned, 1.0, "rigid_paper").means.astype(float)
+    off = scene_player.Player(turned, "rigid_paper").frame(1.0).means.astype(float)
     after, before = off[body], scene.gaussians.means[body].astype(float)
     pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
     assert np.abs(pairs[1] - pairs[0]).max() > 0.05
@@ -146,18 +148,23 @@ def twisted() -> Scene:
 def test_all_modes_meet_at_t_max_and_agree_before_it(twisted, mode):
     scene = twisted
     assert mode in scene_player.modes(scene)
-    frame, rigid = scene_player.frame(scene, T_MAX, mode), scene_player.frame(scene, 0.2)
+    frame, rigid = scene_player.Player(scene, mode).frame(T_MAX), scene_player.Player(scene).frame(0.2)
     for name in ("means", "quats"):
         np.testing.assert_array_equal(getattr(frame, name), scene.arrays()[name])
-        np.testing.assert_array_equal(getattr(scene_player.frame(scene, 0.2, mode), name), getattr(rigid, name))
-    np.testing.assert_allclose(scene_player.frame(scene, T_MAX + 1e-9, mode).means, scene.gaussians.means, atol=1e-6)
+        np.testing.assert_array_equal(getattr(scene_player.Player(scene, mode).frame(0.2), name), getattr(rigid, name))
+    np.testing.assert_allclose(
+        scene_player.Player(scene, mode).frame(T_MAX + 1e-9).means, scene.gaussians.means, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("source", group_dynamics.SOURCES[1:])
 def test_bodies_of_one_twist_move_alike_in_all_modes(twisted, source):
     scene = twisted
     for t in (0.8, 1.1):
-        rigid, own = scene_player.frame(scene, t, f"rigid/{source}"), scene_player.frame(scene, t, "standard")
+        rigid, own = (
+            scene_player.Player(scene, f"rigid/{source}").frame(t),
+            scene_player.Player(scene, "standard").frame(t),
+        )
         np.testing.assert_allclose(rigid.means, own.means, atol=3 * residuals.TOLERANCE * scene.extent)
         assert rotations.angle_between(rigid.quats.astype(float), own.quats.astype(float)).max() < 2e-3
         np.testing.assert_allclose(rigid.shading_factor, own.shading_factor, atol=2e-3)
@@ -205,12 +212,15 @@ def test_hybrid_is_rigid_except_for_gaussians_that_no_group_explains(twisted, va
     dynamics = twisted.dynamics.rates + (twisted.dynamics.rates != 0) * np.float32(0.2)
     dynamics[np.flatnonzero(twisted.gaussians.motion_ids == 1)[::6]] = 0.0  # a stray that rests while its group moves
     scene = twisted.with_arrays(dynamics=dynamics)
-    rigid, own = scene_player.frame(scene, 1.1, f"rigid{variant}"), scene_player.frame(scene, 1.1, "standard")
+    rigid, own = (
+        scene_player.Player(scene, f"rigid{variant}").frame(1.1),
+        scene_player.Player(scene, "standard").frame(1.1),
+    )
     everyone = np.arange(len(scene.gaussians.means), dtype=np.int32)
     some = np.flatnonzero(scene.gaussians.motion_ids == 1)[::3].astype(np.int32)
     for rows, size in ((None, 0.0), (everyone, 1e-3), (some[:1], 0.5), (some, 0.5), (everyone, 0.5)):
         changed = scene if rows is None else loose(scene, rows, size)
-        frame = scene_player.frame(changed, 1.1, f"hybrid{variant}")
+        frame = scene_player.Player(changed, f"hybrid{variant}").frame(1.1)
         free = np.zeros(len(scene.gaussians.means), bool)
         if rows is not None and size > 0.1:
             free[rows] = True
@@ -228,7 +238,7 @@ def test_the_literal_form_is_rigid_if_the_object_only_translated(twisted):
     dynamics[:, 9:] *= 0.1
     moved = twisted.gaussians.means + np.float32(0.3) * (twisted.gaussians.motion_ids[:, None] == 1)
     scene = twisted.with_arrays(dynamics=dynamics, canonical_means=moved.astype(np.float32))
-    literal, rigid = (scene_player.frame(scene, 1.0, mode) for mode in ("rigid_paper", "rigid/representative"))
+    literal, rigid = (scene_player.Player(scene, mode).frame(1.0) for mode in ("rigid_paper", "rigid/representative"))
     np.testing.assert_allclose(literal.means, rigid.means, atol=1e-4)
     np.testing.assert_allclose(literal.quats, rigid.quats, atol=1e-4)
 
@@ -238,7 +248,7 @@ def test_an_anchored_background_goes_with_its_representative(twisted):
     dynamics = twisted.dynamics.rates.copy()
     dynamics[still, :3] = [0.3, 0.0, -0.1]
     scene = twisted.with_arrays(dynamics=dynamics)
-    pinned, anchored = (scene_player.frame(scene, 1.0, f"rigid_paper/{kind}") for kind in ("pinned", "anchored"))
+    pinned, anchored = (scene_player.Player(scene, f"rigid_paper/{kind}").frame(1.0) for kind in ("pinned", "anchored"))
     np.testing.assert_array_equal(pinned.means[still], scene.gaussians.means[still])
     moved = 0.25 * np.array([0.3, 0.0, -0.1])
     np.testing.assert_allclose(anchored.means[still], scene.gaussians.means[still] + moved, atol=1e-6)
@@ -252,7 +262,7 @@ def test_the_first_gaussian_of_a_scene_can_represent_a_body_in_the_literal_form(
     dynamics[0] = [0.3, 0.0, -0.1] + [0] * 9
     scene = dataclasses.replace(twisted.with_arrays(dynamics=dynamics), groups=groups)
     body = scene.gaussians.motion_ids == 1
-    moved = scene_player.frame(scene, T_MAX + 0.5, "rigid_paper").means[body] - scene.gaussians.means[body]
+    moved = scene_player.Player(scene, "rigid_paper").frame(T_MAX + 0.5).means[body] - scene.gaussians.means[body]
     np.testing.assert_allclose(moved, np.broadcast_to([0.15, 0.0, -0.05], moved.shape), atol=1e-6)
 
 
@@ -263,7 +273,7 @@ def test_scenes_without_canonical_centres_lack_the_literal_form():
 
 def test_a_mode_without_data_is_refused():
     with pytest.raises(ValueError, match="expected one of rigid for the scene .* got 'standard'"):
-        scene_player.frame(make_scene(), 1.0, "standard")
+        scene_player.Player(make_scene(), "standard").frame(1.0)
 
 
 def test_residuals_and_dynamics_survive_the_file(bending, tmp_path):

@@ -17,7 +17,7 @@ def scene():
 
 
 def test_the_bind_state_plays_at_t_max_to_the_bit(scene):
-    frame = scene_player.frame(scene, T_MAX)
+    frame = scene_player.Player(scene).frame(T_MAX)
     np.testing.assert_array_equal(frame.means, scene.gaussians.means)
     np.testing.assert_array_equal(frame.quats, scene.gaussians.quats)
     assert (frame.shading_factor == 1).all()
@@ -27,32 +27,38 @@ def test_the_bind_state_plays_at_t_max_to_the_bit(scene):
 
 def test_playback_is_continuous_at_t_max(scene):
     for t in (np.nextafter(T_MAX, 0.0), AFTER, T_MAX + 1e-9, T_MAX - 1e-9):
-        frame = scene_player.frame(scene, t)
+        frame = scene_player.Player(scene).frame(t)
         np.testing.assert_allclose(frame.means, scene.gaussians.means, atol=1e-6)
         assert rotations.angle_between(frame.group_quats, rotations.identity(1)).max() < 1e-7
 
 
 def test_knots_are_met_exactly(scene):
     for k, t in enumerate(scene.tracks.times):
-        quats, displacements = scene_player.group_poses(scene, t)
+        quats, displacements = scene_player.Player(scene).group_poses(t)
         np.testing.assert_allclose(displacements, scene.tracks.poses[:, k, 4:], atol=1e-12)
         assert rotations.angle_between(quats, scene.tracks.poses[:, k, :4]).max() < 1e-7
 
 
 def test_before_the_first_time_the_first_pose_is_held(scene):
-    for first, early in zip(scene_player.group_poses(scene, 0.0), scene_player.group_poses(scene, -3.0), strict=True):
+    for first, early in zip(
+        scene_player.Player(scene).group_poses(0.0), scene_player.Player(scene).group_poses(-3.0), strict=True
+    ):
         np.testing.assert_array_equal(first, early)
 
 
 def test_between_knots_the_curve_is_smooth_and_near_the_motion(scene):
     times = np.linspace(0.001, T_MAX - 0.001, 400)
-    quats, displacements = (np.stack(x) for x in zip(*(scene_player.group_poses(scene, t) for t in times), strict=True))
+    quats, displacements = (
+        np.stack(x) for x in zip(*(scene_player.Player(scene).group_poses(t) for t in times), strict=True)
+    )
     for group in scene.groups[1:6]:
         true_quats, true, _, _ = models.curve(group.model, times - T_MAX)
         assert np.linalg.norm(displacements[:, group.id] - true, axis=-1).max() < 2e-3
         assert rotations.angle_between(quats[:, group.id], true_quats).max() < 2e-3
     inner = scene.tracks.times[1:-1]
-    before, at, after = (np.stack([scene_player.group_poses(scene, t + h)[1] for t in inner]) for h in (-1e-7, 0, 1e-7))
+    before, at, after = (
+        np.stack([scene_player.Player(scene).group_poses(t + h)[1] for t in inner]) for h in (-1e-7, 0, 1e-7)
+    )
     np.testing.assert_allclose((at - before) / 1e-7, (after - at) / 1e-7, atol=1e-4)
 
 
@@ -61,13 +67,13 @@ def test_keys_at_the_knots_reproduce_playback(scene):
     rule.
     """
     quats, displacements = group_dynamics.knots(scene)
-    quat_slopes, slopes = scene_player.knot_slopes(scene)
+    quat_slopes, slopes = (cubic_curves.slopes(scene.tracks.times, values) for values in (quats, displacements))
     times = np.linspace(0, T_MAX, 131)
     for g in range(len(scene.groups)):
         location = cubic_curves.Keys(scene.tracks.times, displacements[g], slopes[g], slopes[g])
         rotation = cubic_curves.Keys(scene.tracks.times, quats[g], quat_slopes[g], quat_slopes[g])
         keyed = cubic_curves.evaluate(location, times), cubic_curves.evaluate(rotation, times, unit=True)
-        played = [scene_player.group_poses(scene, t) for t in times]
+        played = [scene_player.Player(scene).group_poses(t) for t in times]
         np.testing.assert_allclose(keyed[0], np.stack([p[1][g] for p in played]), atol=1e-12)
         np.testing.assert_allclose(keyed[1], np.stack([p[0][g] for p in played]), atol=1e-12)
 
@@ -86,13 +92,15 @@ def test_signs_of_quaternions_in_the_file_do_not_matter(scene):
     flipped[:, ::2, :4] *= -1
     other = scene.with_arrays(track_poses=flipped)
     for t in (0.13, 0.5, 0.74):
-        for a, b in zip(scene_player.group_poses(scene, t), scene_player.group_poses(other, t), strict=True):
+        for a, b in zip(
+            scene_player.Player(scene).group_poses(t), scene_player.Player(other).group_poses(t), strict=True
+        ):
             np.testing.assert_allclose(a, b, atol=1e-14)
 
 
 @pytest.mark.parametrize("t", [0.0, 0.33, 0.9, 3.0])
 def test_every_group_moves_rigidly(scene, t):
-    frame = scene_player.frame(scene, t)
+    frame = scene_player.Player(scene).frame(t)
     for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
         before, after = scene.gaussians.means[start:stop].astype(float), frame.means[start:stop].astype(float)
         pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
@@ -106,29 +114,29 @@ def test_every_group_moves_rigidly(scene, t):
 def test_pinned_gaussians_never_change(scene):
     still = scene.gaussians.motion_ids == 0
     for t in (0.0, 2.0):
-        frame = scene_player.frame(scene, t)
+        frame = scene_player.Player(scene).frame(t)
         np.testing.assert_array_equal(frame.means[still], scene.gaussians.means[still])
         assert (frame.shading_factor[still] == 1).all()
 
 
 def test_a_follower_takes_its_leaders_displacement_without_rotating(scene):
     shadow = next(g for g in scene.groups if g.follows is not None)
-    quats, displacements = scene_player.group_poses(scene, 1.4)
+    quats, displacements = scene_player.Player(scene).group_poses(1.4)
     np.testing.assert_allclose(displacements[shadow.id], shadow.follow_matrix @ displacements[shadow.follows])
     assert np.linalg.norm(displacements[shadow.id]) > 0.1
     assert quats[shadow.id].tolist() == [1, 0, 0, 0]
 
 
 def test_shading_follows_the_light_in_the_objects_frame(scene):
-    frame = scene_player.frame(scene, 1.1)
+    frame = scene_player.Player(scene).frame(1.1)
     row = int(np.flatnonzero(scene.gaussians.motion_ids == 1)[0])
     rotmat = rotations.quats_to_rotmats(frame.group_quats[1])
     light = scene.shading.light
     expected = 1 + (rotmat.T @ light - light) @ scene.shading.vectors[row]
     assert frame.shading_factor[row] == pytest.approx(max(expected, 0), rel=1e-5)
     dark = scene.with_arrays(shading=scene.shading.vectors * 1e4)
-    assert scene_player.frame(dark, 1.1).shading_factor.min() == 0
-    assert scene_player.frame(make_scene(shading=False), 1.1).shading_factor is None
+    assert scene_player.Player(dark).frame(1.1).shading_factor.min() == 0
+    assert scene_player.Player(make_scene(shading=False)).frame(1.1).shading_factor is None
 
 
 def test_one_turn_lights_gaussians_as_the_same_turn_for_each(scene):
@@ -143,14 +151,14 @@ def test_one_turn_lights_gaussians_as_the_same_turn_for_each(scene):
 
 @pytest.mark.parametrize("t", [0.2, T_MAX, 1.1])
 def test_posing_groups_like_playback_gives_its_frame(scene, t):
-    played = scene_player.frame(scene, t)
-    posed = scene_player.pose(scene, played.group_quats, played.group_displacements, t)
+    played = scene_player.Player(scene).frame(t)
+    posed = scene_player.Player(scene).frame_at_poses(played.group_quats, played.group_displacements, t)
     for one, other in zip(dataclasses.astuple(posed), dataclasses.astuple(played), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 def test_sh_rotations_bring_directions_into_the_bind_frame(scene):
-    quats, _ = scene_player.group_poses(scene, 0.2)
+    quats, _ = scene_player.Player(scene).group_poses(0.2)
     direction = np.array([0.6, 0.0, 0.8])
     back = scene_player.sh_rotations(quats) @ direction
     np.testing.assert_allclose(rotations.rotate(quats, back), np.broadcast_to(direction, back.shape), atol=1e-12)
@@ -158,12 +166,12 @@ def test_sh_rotations_bring_directions_into_the_bind_frame(scene):
 
 def test_scenes_without_gaussians_objects_or_motion_play():
     empty = make_scene(n=0, objects=0, unassigned=0)
-    assert len(scene_player.frame(empty, 5.0).means) == 0
+    assert len(scene_player.Player(empty).frame(5.0).means) == 0
     still = make_scene(n=30, objects=0)
-    np.testing.assert_array_equal(scene_player.frame(still, 5.0).means, still.gaussians.means)
+    np.testing.assert_array_equal(scene_player.Player(still).frame(5.0).means, still.gaussians.means)
     base = make_scene()
     single = base.with_arrays(track_times=base.tracks.times[-1:], track_poses=base.tracks.poses[:, -1:])
-    np.testing.assert_array_equal(scene_player.frame(single, 0.0).means, base.gaussians.means)
+    np.testing.assert_array_equal(scene_player.Player(single).frame(0.0).means, base.gaussians.means)
 
 
 @pytest.mark.parametrize("t", [1e12, 1e15])
@@ -215,7 +223,7 @@ def test_frames_do_not_depend_on_earlier_frames_of_the_player(scene):
     for t in (0.2, T_MAX, 1.7, 1.1):
         frame = player.frame(t)
         for one, other in zip(
-            dataclasses.astuple(frame), dataclasses.astuple(scene_player.frame(scene, t)), strict=True
+            dataclasses.astuple(frame), dataclasses.astuple(scene_player.Player(scene).frame(t)), strict=True
         ):
             np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(first.means, kept)
@@ -235,8 +243,8 @@ def test_modes_have_one_spelling_and_a_default_variant(scene):
 
 def test_unknown_modes_and_times_are_refused(scene):
     with pytest.raises(ValueError, match="mode"):
-        scene_player.frame(scene, 1.0, mode="wobbly")
+        scene_player.Player(scene, "wobbly").frame(1.0)
     with pytest.raises(ValueError, match="origin"):
-        scene_player.frame(scene, 1.0, origin=np.array([0.0, np.nan, 0.0]))
+        scene_player.Player(scene).frame(1.0, origin=np.array([0.0, np.nan, 0.0]))
     with pytest.raises(ValueError, match="finite"):
-        scene_player.frame(scene, float("nan"))
+        scene_player.Player(scene).frame(float("nan"))

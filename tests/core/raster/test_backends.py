@@ -39,7 +39,7 @@ def test_a_scene_is_rendered_with_its_colours_and_sky():
     scene = scenes.make_scene(60, sh_degree=2)
     from r5dgs_core.playback import scene_player
 
-    frame = scene_player.frame(scene, 0.5)
+    frame = scene_player.Player(scene).frame(0.5)
     drawn, solid = (
         scene_renderer.render_frame(scene, frame, scenes.orbit_camera(0.4), backend=backend)
         for backend in ("points", "reference")

@@ -256,7 +256,7 @@ def test_without_numba_scenes_keep_their_colours(monkeypatch):
     from r5dgs_core.render import scene_renderer
 
     scene, camera = scenes.make_scene(300, sh_degree=3), scenes.orbit_camera(0.4)
-    posed = posed_scene.pose_frame(scene, scene_player.frame(scene, 1.1))
+    posed = posed_scene.pose_frame(scene, scene_player.Player(scene).frame(1.1))
     fused = scene_renderer.colors(posed, camera)
     monkeypatch.setattr(backends, "MODULES", {"reference": "reference"})
     np.testing.assert_allclose(scene_renderer.colors(posed, camera), fused, atol=2e-6)

@@ -12,7 +12,7 @@ from tests.support import scenes
 @pytest.fixture(scope="module")
 def posed():
     scene = scenes.make_scene(n=500, objects=4, seed=3)
-    return scene, posed_scene.pose_frame(scene, scene_player.frame(scene, 0.4))
+    return scene, posed_scene.pose_frame(scene, scene_player.Player(scene).frame(0.4))
 
 
 def shares(posed, groups, ranks):

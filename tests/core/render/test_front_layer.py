@@ -20,7 +20,7 @@ TRIANGLE = np.array([[0, 1, 2]])
 @pytest.fixture(scope="module")
 def posed():
     scene = scenes.make_scene(n=500, objects=4, seed=3)
-    return scene, posed_scene.pose_frame(scene, scene_player.frame(scene, 0.4))
+    return scene, posed_scene.pose_frame(scene, scene_player.Player(scene).frame(0.4))
 
 
 def test_a_triangle_has_the_depths_of_its_plane():

@@ -17,7 +17,7 @@ LATER = 1.1
 
 
 def drawn(scene, t, background):
-    frame = scene_player.frame(scene, t, origin=CAMERA.center)
+    frame = scene_player.Player(scene).frame(t, origin=CAMERA.center)
     return scene_renderer.render_frame(scene, frame, CAMERA, background=background, backend=BACKEND)
 
 

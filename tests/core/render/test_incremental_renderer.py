@@ -253,7 +253,7 @@ def bending(request):
 @pytest.mark.parametrize("t", [-0.1, 0.13, 0.4, scenes.T_MAX, 0.9])
 def test_deformed_gaussians_match_playback(bending, t):
     found = incremental_renderer.IncrementalRenderer(bending).render(bent_instances(bending, t), CAMERA)
-    expected = scene_renderer.render_frame(bending, scene_player.frame(bending, t), CAMERA)
+    expected = scene_renderer.render_frame(bending, scene_player.Player(bending).frame(t), CAMERA)
     np.testing.assert_allclose(found.color, expected.color, atol=5e-3)  # a cut-off may fall differently
     if 0 < t < scenes.T_MAX:
         stiff = incremental_renderer.IncrementalRenderer(bending).render(group_instances(bending, t), CAMERA)

@@ -44,7 +44,7 @@ def image(scene, pose, camera=CAMERA, **options):
 
 
 def group_instances(scene, t):
-    quats, displacements = scene_player.group_poses(scene, t)
+    quats, displacements = scene_player.Player(scene).group_poses(t)
     result = []
     for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
         pivot = scene.groups[g].pivot
@@ -56,7 +56,7 @@ def group_instances(scene, t):
 
 @pytest.mark.parametrize("t", [0.0, 0.31, scenes.T_MAX, 0.93])
 def test_instances_at_the_groups_poses_render_like_playback(scene, t):
-    played = image(scene, scene_player.frame(scene, t))
+    played = image(scene, scene_player.Player(scene).frame(t))
     posed = image(scene, posed_scene.pose_instances(scene, group_instances(scene, t)))
     np.testing.assert_allclose(posed, played, atol=TOLERANCE)
 
@@ -185,7 +185,7 @@ def test_the_sky_is_the_one_of_training(scene, bases):
 
 
 def test_the_near_plane_is_the_scene_s(scene):
-    frame = scene_player.frame(scene, scenes.T_MAX)
+    frame = scene_player.Player(scene).frame(scenes.T_MAX)
     far = dataclasses.replace(scene, near_plane=100.0)
     np.testing.assert_array_equal(image(far, frame), scene_renderer.sky(scene, CAMERA))
     np.testing.assert_array_equal(image(far, frame, settings=RasterSettings()), image(scene, frame))
@@ -198,7 +198,7 @@ def test_negative_colours_and_shading_never_add_light(scene):
         sh=rng.normal(scale=3.0, size=(300, 1, 3)).astype(np.float32),
         shading=rng.normal(scale=3.0, size=(300, 3)).astype(np.float32),
     )
-    frame = scene_player.frame(dark, 0.1)
+    frame = scene_player.Player(dark).frame(0.1)
     rgb = 0.5 + 0.28209479177387814 * dark.gaussians.sh[:, 0].astype(np.float64)
     rotmats = rotations.quats_to_rotmats(frame.group_quats)[frame.motion_ids]
     factor = 1 + ((np.swapaxes(rotmats, 1, 2) @ dark.shading.light - dark.shading.light) * dark.shading.vectors).sum(-1)
@@ -224,9 +224,9 @@ def test_a_picture_far_from_the_origin_equals_the_one_near_it(t):
     scene = scenes.make_scene(n=300, sh_degree=2, seed=3)
     scene = scene.with_arrays(means=(np.round(scene.gaussians.means * 64) / 64).astype(np.float32))
     far, camera = moved_away(scene, np.array([1e5, -1e5, 65536.0]))
-    near = image(scene, scene_player.frame(scene, t))
-    sharp = image(far, scene_player.frame(far, t, origin=camera.center), camera)
-    blunt = image(far, scene_player.frame(far, t), camera)
+    near = image(scene, scene_player.Player(scene).frame(t))
+    sharp = image(far, scene_player.Player(far).frame(t, origin=camera.center), camera)
+    blunt = image(far, scene_player.Player(far).frame(t), camera)
 
     def psnr(picture):
         return -10 * np.log10(np.mean((picture.clip(0, 1) - near.clip(0, 1)) ** 2) + 1e-30)
@@ -245,8 +245,8 @@ def test_harmonics_follow_gaussians_that_rotate_on_their_own():
         dynamics[rows, :3] = np.cross(spin, scene.gaussians.means[rows] - group.pivot)
         dynamics[rows, 3:6] = spin
     scene = scene.with_arrays(dynamics=dynamics)
-    together = image(scene, scene_player.frame(scene, 1.2, "rigid/median"))
-    apart = image(scene, scene_player.frame(scene, 1.2, "standard"))
+    together = image(scene, scene_player.Player(scene, "rigid/median").frame(1.2))
+    apart = image(scene, scene_player.Player(scene, "standard").frame(1.2))
     np.testing.assert_allclose(apart, together, atol=TOLERANCE)
 
 

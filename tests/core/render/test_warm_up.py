@@ -36,7 +36,7 @@ from r5dgs_core.train import run
 
 scene = scene_file.read(Path(sys.argv[1]))
 for t in (0.1, 0.9):
-    scene_renderer.render_frame(scene, scene_player.frame(scene, t), scene.cameras[0])
+    scene_renderer.render_frame(scene, scene_player.Player(scene).frame(t), scene.cameras[0])
 drawn, body = incremental_renderer.IncrementalRenderer(scene), scene.object(2)
 for x in (0.0, 0.1, 0.2, 0.3):
     moved = np.eye(4)

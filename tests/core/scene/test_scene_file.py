@@ -125,7 +125,7 @@ def test_a_scene_without_gaussians_is_a_scene(tmp_path):
 def test_playback_from_the_file_is_within_rounding(scene, path):
     read = scene_file.read(path)
     for t in (0.1, 0.75, 1.3):
-        ours, theirs = scene_player.frame(scene, t), scene_player.frame(read, t)
+        ours, theirs = scene_player.Player(scene).frame(t), scene_player.Player(read).frame(t)
         np.testing.assert_array_equal(ours.means, theirs.means)
         turn = rotations.angle_between(ours.quats.astype(float), theirs.quats.astype(float))
         assert turn.max() < 1e-4

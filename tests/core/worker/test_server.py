@@ -75,7 +75,7 @@ def test_hello_returns_missing_packages_and_protocol_version():
 
 def test_a_rendered_time_is_the_cores_picture(path):
     scene = scene_file.read(path)
-    expected = scene_renderer.render_frame(scene, scene_player.frame(scene, 0.9, origin=CAMERA.center), CAMERA)
+    expected = scene_renderer.render_frame(scene, scene_player.Player(scene).frame(0.9, origin=CAMERA.center), CAMERA)
     request = {"command": "render", "camera": CAMERA_JSON, "t": 0.9, "want": ["depth", "alpha", "ids"]}
     _, (header, arrays) = talk(load(path), request)
     assert header["ok"] and header["result"]["gaussians"] == len(scene.gaussians.means)

@@ -181,7 +181,7 @@ def test_the_baked_scene_is_valid_and_renders_like_the_trained_state(made, scene
     for view, trained_view in [pair for pair in pairs if pair[0].t < scene.t_max][::5]:
         with torch.no_grad():
             expected = trainer.render(trained_view.camera, trained_view.t).numpy()
-        shown = scene_renderer.render_frame(scene, scene_player.frame(scene, view.t), view.camera).color
+        shown = scene_renderer.render_frame(scene, scene_player.Player(scene).frame(view.t), view.camera).color
         assert np.abs(shown.clip(0, 1) - expected.clip(0, 1)).mean() < 2e-3
 
 
@@ -193,7 +193,7 @@ def test_mode_standard_follows_the_trained_dynamics(made, scene):
         with torch.no_grad():
             splats = trainer.splats(camera, t)
         world = np.sort(trainer.normalization.points_to_world(splats.means.numpy()), axis=0)
-        played = np.sort(scene_player.frame(scene, t, "standard").means, axis=0)
+        played = np.sort(scene_player.Player(scene, "standard").frame(t).means, axis=0)
         np.testing.assert_allclose(played, world, atol=2e-3)
 
 
@@ -350,7 +350,7 @@ def test_harmonics_rotate_with_their_moving_gaussians(tiny, tmp_path):
     camera = trainer.dataset.train[0].camera
     with torch.no_grad():
         expected = trainer.render(view.camera, scene.t_max).numpy()
-    shown = scene_renderer.render_frame(scene, scene_player.frame(scene, scene.t_max), camera).color
+    shown = scene_renderer.render_frame(scene, scene_player.Player(scene).frame(scene.t_max), camera).color
     assert np.abs(shown.clip(0, 1) - expected.clip(0, 1)).mean() < 2e-5
 
 
@@ -368,7 +368,7 @@ def test_at_a_single_time_a_field_is_a_still_scene(tiny):
 def test_disabled_motion_does_not_return_as_residuals(made, scene, tiny):
     def travel(scene) -> float:
         mine = scene.gaussians.object_ids == tiny_datasets.BRICK
-        early, late = (scene_player.frame(scene, t).means[mine].mean(0) for t in (0.0, scene.t_max))
+        early, late = (scene_player.Player(scene).frame(t).means[mine].mean(0) for t in (0.0, scene.t_max))
         return float(np.linalg.norm(late - early))
 
     changed = dataclasses.replace(made, config=made.config.override(("needs.tracks=off",)))

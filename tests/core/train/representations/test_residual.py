@@ -322,11 +322,13 @@ def test_the_scene_shows_what_was_trained_and_then_keeps_its_last_shape(breathin
     for view, drawn in list(zip(trainer.dataset.train, trainer.views, strict=True))[::5]:
         with torch.no_grad():
             expected = trainer.render(drawn.camera, drawn.t).numpy().clip(0, 1)
-        shown = scene_renderer.render_frame(scene, scene_player.frame(scene, view.t), view.camera).color.clip(0, 1)
+        shown = scene_renderer.render_frame(scene, scene_player.Player(scene).frame(view.t), view.camera).color.clip(
+            0, 1
+        )
         assert (
             -10 * np.log10(np.mean((shown - expected) ** 2)) > 45
         )  # the noise of a track that does not turn is left out
-    later = scene_player.frame(scene, scene.t_max + 0.3)
+    later = scene_player.Player(scene).frame(scene.t_max + 0.3)
     rows = scene.gaussians.motion_ids == BALL
     gaps = [
         np.linalg.norm(np.diff(m[rows].astype(np.float64), axis=0), axis=1)

@@ -36,7 +36,7 @@ for name in sys.argv[3:]:
     settings = tiny_datasets.settings("train.iterations=25", f"train.representation={name}")
     run.train(data, folder / name, settings)
     bake.run_bake(folder / name, folder / f"{name}.r5dgs")
-    scene_player.frame(scene_file.read(folder / f"{name}.r5dgs"), 2.0)
+    scene_player.Player(scene_file.read(folder / f"{name}.r5dgs")).frame(2.0)
 print(json.dumps(sorted(name for name in sys.modules if name.startswith("r5dgs_core"))))
 """
 
@@ -77,7 +77,7 @@ def test_the_file_of_a_scene_at_rest_has_nothing_that_moves(baked_at_rest, repre
     assert {decisions[name] for name in ("tracks", "rotation", "shading", "shadows", "residuals")} == {"off"}
     assert [o.name for o in scene.objects] == ["background", "brick", "ball"]
     assert all(group.model.is_static for group in scene.groups)
-    np.testing.assert_array_equal(scene_player.frame(scene, 7.0).means, scene.gaussians.means)
+    np.testing.assert_array_equal(scene_player.Player(scene).frame(7.0).means, scene.gaussians.means)
 
 
 def test_small_motion_is_detected(still, tiny):
