@@ -26,7 +26,7 @@ def add(folder: Path) -> Path:
     kind, rate = shown
     models = folder / "r5dgs_core/motion/models"
     (models / f"{NAME}.py").write_text(kind)
-    _insert(models / "__init__.py", r"MENU_NUMBERS = \{\n(?:    .*\n)*", f'    "{NAME}": {NUMBER},\n')
+    _insert(models / "registry.py", r"MENU_NUMBERS = \{\n(?:    .*\n)*", f'    "{NAME}": {NUMBER},\n')
     _insert(models / "motion_model.py", r"class MotionModel:\n(?:.*\n)*?(?=    inertia: )", rate)
     return folder
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from .. import rotations
 from .base import Curve
-from .motion_model import KINDS, MotionModel
+from .motion_model import MotionModel
+from .registry import KINDS
 
 log = logging.getLogger(__name__)
 

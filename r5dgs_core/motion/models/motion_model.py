@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-KINDS: dict[str, Any] = {}
-"""Kinds (`MotionKind`) by name, in the order of Blender's menu; the package fills it."""
+from .registry import KINDS
 
 
 class Unit(NamedTuple):
