@@ -34,7 +34,7 @@ from ...raster import shade
 from ...scene import spherical_harmonics
 from ...scene.cameras import Camera
 from ..observed_motion import ObservedMotion
-from . import field_fitting, field_to_groups, fused_posing, gating, rigidity
+from . import field_fitting, field_to_groups, fused_posing, gating, rigidity, shading
 from .field_motion import Clock, FieldMotion
 from .representation import FIELD, Representation
 
@@ -122,10 +122,9 @@ class FieldRepresentation(Representation):
             both = torch.cat([params["sh"][rows], params["sh_rest"][rows]], dim=1)
             colors = colors.index_copy(0, rows, spherical_harmonics.to_rgb(both, seen))
         if self._config.train.shading:
-            change = rotations.rotate(rotations.conjugate(moved.quats), self.light) - self.light
-            factor = 1 + (change * params["shading"][rows]).sum(-1, keepdim=True)
-            lit = colors[rows].clamp(min=0) * factor.clamp(min=0)
-            colors = colors.index_copy(0, rows, lit)
+            seen_light = shading.seen_light(moved.quats, self.light)
+            factor = shading.factors(1, params["shading"][rows], seen_light, self.light)
+            colors = shading.shade_rows(colors, rows, factor)
         return fused_posing.activate(means, quats, log_scales, params["opacity_logits"], colors)
 
     def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:

@@ -13,7 +13,7 @@ from ...model.tracks import Tracks
 from ...motion import rotations
 from .. import checkpoint_content
 from ..observed_motion import PointMotion
-from . import shading as shading_vectors
+from . import shading
 
 PREFIX = "residual."
 GAINS = checkpoint_content.RESIDUAL_GAINS
@@ -34,14 +34,14 @@ def residual_of(tensors: Mapping[str, Tensor]) -> ResidualField | None:
 
 
 def relight(
-    change: Change, colors: Tensor, shading: Tensor, light: Tensor, rotmats: Tensor, groups: Tensor
+    change: Change, colors: Tensor, vectors: Tensor, light: Tensor, rotmats: Tensor, groups: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Shade the members of non-rigid bodies by their own rotations.
 
     Args:
         change: The members and their rotations.
         colors: Colours of all Gaussians, before the shading. [N, 3]
-        shading: The vectors g. [N, 3]
+        vectors: The shading vectors g. [N, 3]
         light: The vector l. [3]
         rotmats: Rotations of the motion groups. [G, 3, 3]
         groups: Group of each member. [n]
@@ -49,10 +49,9 @@ def relight(
     Returns:
         Colours that include the members' shading [N, 3], and shading vectors that are zero for the members [N, 3].
     """
-    seen = rotations.rotate(rotations.conjugate(change.quats), (light @ rotmats)[groups])  # l from the member's frame
-    factor = (1 + (shading[change.rows] * (seen - light)).sum(1, keepdim=True)).clamp(min=0)
-    lit = colors[change.rows].clamp(min=0) * factor
-    return colors.index_copy(0, change.rows, lit), shading.index_fill(0, change.rows, 0.0)
+    seen_light = shading.seen_light(change.quats, (light @ rotmats)[groups])
+    factor = shading.factors(1, vectors[change.rows], seen_light, light)
+    return shading.shade_rows(colors, change.rows, factor), vectors.index_fill(0, change.rows, 0.0)
 
 
 @torch.no_grad()
@@ -89,7 +88,7 @@ def point_motion(
             sh = np.concatenate([bind["sh"], bind["sh_rest"]], axis=1)[rows]
             since, light = change.quats.numpy().astype(np.float64), tensors["light"].numpy().astype(np.float64)
             ones = np.ones(len(rows))
-            sh, vectors, lit = shading_vectors.rebind(sh, bind["shading"][rows], ones, since, light)
+            sh, vectors, lit = shading.rebind(sh, bind["shading"][rows], ones, since, light)
             bind["shading_rest"] = np.ones(len(bind["means"]))
             bind["shading_rest"][rows] = lit
             state = {"means": means.numpy(), "quats": quats.numpy(), "log_scales": sizes.numpy()}

@@ -9,11 +9,52 @@ c s, Q g / s and b / s with a small s: dark now, but lit as in training after tu
 from __future__ import annotations
 
 import numpy as np
+from torch import Tensor
 
 from ...motion import rotations
+from ...motion.rotations import Array
 from ...scene import spherical_harmonics
 
 MIN_FACTOR = 0.1  # the s above
+
+
+def seen_light(quats: Array, light: Array) -> Array:
+    """Return R^T l, the light as seen from turned bodies.
+
+    Args:
+        quats: Rotations R, unit wxyz. [..., 4]
+        light: The vector l, one for all or one for each. [3] or [..., 3]
+
+    Returns:
+        Directions. [..., 3]
+    """
+    return rotations.rotate(rotations.conjugate(quats), light)
+
+
+def factors(rest: float | Array, shading: Array, seen: Array, light: Array) -> Array:
+    """Return r + (R^T l - l) . g, before clamping at 0; numpy or torch.
+
+    Args:
+        rest: The factor r, one for all or one for each. [N]
+        shading: The vectors g. [N, 3]
+        seen: R^T l, see `seen_light`; one for all or one for each. [3] or [N, 3]
+        light: The vector l. [3]
+
+    Returns:
+        The factors. [N]
+    """
+    return rest + (shading * (seen - light)).sum(-1)
+
+
+def shade_rows(colors: Tensor, rows: Tensor, factor: Tensor) -> Tensor:
+    """Return colours with those of some rows multiplied by their factors; both are clamped at 0.
+
+    Args:
+        colors: Colours of all Gaussians. [N, 3]
+        rows: Rows to shade. [n] int64
+        factor: Their factors. [n]
+    """
+    return colors.index_copy(0, rows, colors[rows].clamp(min=0) * factor[:, None].clamp(min=0))
 
 
 def rebind(
@@ -31,8 +72,7 @@ def rebind(
     Returns:
         Harmonics [N, K, 3], vectors [N, 3] and factors at rest [N] of the new state.
     """
-    change = rotations.rotate(rotations.conjugate(quats), light) - light
-    factor = rest + (shading * change).sum(-1)
+    factor = factors(rest, shading, seen_light(quats, light), light)
     scale = np.maximum(factor, MIN_FACTOR)
     colored = sh * scale[:, None, None]
     # The offset of one half scales too: dc_to_rgb(dc') = scale * dc_to_rgb(dc).
