@@ -12,6 +12,8 @@ from ..masks import videos
 from ..playback import scene_player
 from ..raster import RasterSettings
 from ..render import posed_scene, scene_renderer, segment_weights
+from ..scene import cameras
+from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from . import segment_stack
 
@@ -41,8 +43,7 @@ def draw(
     number = {which: k for k, which in enumerate(dict.fromkeys(video_of.values()))}
     player, drawn = scene_player.Player(scene), []
     for done, (view, mask) in enumerate(zip(views, masks, strict=True)):
-        posed = posed_scene.pose_frame(scene, player.frame(view.t))
-        gaussians = scene_renderer.PosedGaussians(posed)
+        gaussians, camera = relative_to_camera(player, view.camera, view.t)
         ids, segments, pixels = np.unique(mask, return_inverse=True, return_counts=True)
         known = ids != id_masks.UNKNOWN
         weights = segment_weights.segment_weights(
@@ -50,7 +51,7 @@ def draw(
             gaussians.quats,
             gaussians.scales,
             gaussians.opacities,
-            view.camera,
+            camera,
             segments.reshape(mask.shape),
             len(ids),
             settings=RasterSettings(near_plane=scene.near_plane),
@@ -66,6 +67,17 @@ def draw(
         if progress is not None:
             progress(done + 1)
     return drawn
+
+
+def relative_to_camera(
+    player: scene_player.Player, camera: Camera, t: float
+) -> tuple[scene_renderer.PosedGaussians, Camera]:
+    """Return the Gaussians at a time relative to the position of a camera, and the camera moved to the origin.
+
+    Near the origin float32 is most precise, as in `scene_renderer.render`.
+    """
+    posed = posed_scene.pose_frame(player.scene, player.frame(t, camera.center))
+    return scene_renderer.PosedGaussians(posed), cameras.moved(camera, -posed.origin)
 
 
 def paths(scene: Scene, times: np.ndarray) -> np.ndarray:

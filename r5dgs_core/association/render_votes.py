@@ -9,9 +9,8 @@ import numpy as np
 from ..data import dataset as datasets
 from ..playback import scene_player
 from ..raster import RasterSettings, rasterize_splats
-from ..render import posed_scene, scene_renderer
 from ..scene.scene import Scene
-from . import associate, mending, segment_stack
+from . import associate, mending, render_segments, segment_stack
 
 
 def mend(
@@ -41,7 +40,7 @@ def mend(
         if not mending.lacks(found, image):
             yield mending.relabel(mask, images[image].ids, found.ids[image])
             continue
-        posed = scene_renderer.PosedGaussians(posed_scene.pose_frame(scene, player.frame(view.t)))
+        posed, camera = render_segments.relative_to_camera(player, view.camera, view.t)
         # Gaussians outside the image's bag cannot occlude.
         drawn = rasterize_splats(
             posed.means[seen],
@@ -49,7 +48,7 @@ def mend(
             posed.scales[seen],
             posed.opacities[seen],
             part,
-            view.camera,
+            camera,
             settings=RasterSettings(near_plane=scene.near_plane),
             backend=backend,
         ).image

@@ -145,15 +145,13 @@ class ImageEvidence:
             octants: Patch of each Gaussian; without it, the returned patches are meaningless. [N]
         """
         view = self._views[row]
-        frame = player.frame(view.t)
+        frame = player.frame(view.t, view.camera.center)
         if factor is not None:
             frame = dataclasses.replace(frame, shading_factor=factor)
         if octants is not None:
             frame = dataclasses.replace(frame, object_ids=octants)
         output = scene_renderer.render_frame(self._scene, frame, view.camera)
-        ids = output.ids
-        color = output.color
-        return np.clip(color, 0, 1), np.where(ids < 0, PATCHES, ids)
+        return np.clip(output.color, 0, 1), np.where(output.ids < 0, PATCHES, output.ids)
 
     def _psnr(self, scene: Scene) -> float:
         player = scene_player.Player(scene)
@@ -206,8 +204,7 @@ def make_renderer(scene: Scene) -> Callable[[datasets.View], np.ndarray]:
     player = scene_player.Player(scene)
 
     def draw(view: datasets.View) -> np.ndarray:
-        output = scene_renderer.render_frame(scene, player.frame(view.t), view.camera)
-        return output.color
+        return scene_renderer.render(player, view.camera, view.t).color
 
     return draw
 

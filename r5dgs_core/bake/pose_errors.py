@@ -115,19 +115,18 @@ def measure(scene: Scene, dataset: datasets.Dataset, config: Config, groups: Col
     for knot in range(len(scene.tracks.times)) if groups else ():
         views = [view for view, k in zip(dataset.train, knots, strict=True) if k == knot]
         shown = sampling.spread(views, VIEWS)
-        posed: dict[float, list[PosedScene]] = {}
         for number, view in enumerate(shown):
-            if view.t not in posed:
-                posed[view.t] = [posed_scene.pose_frame(scene, player.frame(view.t)) for player in players]
+            center = view.camera.center  # float32 is most precise near the camera
+            posed = [posed_scene.pose_frame(scene, player.frame(view.t, center)) for player in players]
             truth, ids = datasets.load_image(view, behind), datasets.load_mask(view) if masked else None
             if ids is None or number == 0:
-                picture = scene_renderer.render_frame(scene, posed[view.t][0], view.camera)
+                picture = scene_renderer.render_frame(scene, posed[0], view.camera)
                 misfits.append(float(((np.clip(picture.color, 0, 1) - truth) ** 2).mean()))
                 ids = picture.ids if ids is None else ids
             for group in groups:
                 mine = ids == scene.groups[group].object_id
                 if mine.sum() >= MIN_PIXELS:
-                    look = _look(scene, group, posed[view.t], view, truth, mine)
+                    look = _look(scene, group, posed, view, truth, mine)
                     looks.setdefault((group, knot), []).append(look)
     usual, count = float(np.mean(misfits)) if misfits else 0.0, len(scene.tracks.times)
     found: dict[int, PoseErrors] = {}
