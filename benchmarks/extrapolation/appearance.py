@@ -46,7 +46,7 @@ from r5dgs_core.render.warm_up import warm_up
 from r5dgs_core.scene import cameras
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.scene.scene import Scene
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import run_folder
 
 KINDS = ("borders", "unseen sides", "objects", "shadows", "background")
 NEAR = math.cos(math.radians(30))
@@ -345,7 +345,7 @@ def main() -> None:
     args = parser.parse_args()
     warm_up()
     dataset = datasets.read(args.data)
-    scene = bake.bake(checkpoint.open_run(args.run), dataset)
+    scene = bake.bake(run_folder.open_run(args.run), dataset)
     result = measure(scene, dataset)
     print("test, pooled PSNR: " + ", ".join(f"{name} {value:.2f} dB" for name, value in result["psnr_pooled"].items()))
     print(f"{'cause':>14} {'pixels':>7} {'share':>7} {'if gone':>8} {'excess':>7}")

@@ -25,7 +25,7 @@ from r5dgs_core.error_vs_time import image_task, pose_task
 from r5dgs_core.evaluation import evaluate
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene.scene import Scene
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import run_folder
 
 ORACLE = "true poses"
 
@@ -43,7 +43,7 @@ def refitted(scene: Scene, name: str) -> Scene:
 
 def measure(folder: Path, split: str) -> dict[str, Any]:
     """Measure a run: PSNR by mode or motion model, pose errors, and the share of true errors inside the band."""
-    run = checkpoint.open_run(folder)
+    run = run_folder.open_run(folder)
     dataset = datasets.read(run.data())
     scene = bake.bake(run, dataset)
     ways: dict[str, evaluate.Move]
@@ -71,7 +71,7 @@ def measure(folder: Path, split: str) -> dict[str, Any]:
     }
 
 
-def _training(run: checkpoint.Run) -> str:
+def _training(run: run_folder.Run) -> str:
     config = run.config
     if config.train.representation == "tracks":
         return "tracks"

@@ -18,7 +18,7 @@ from typing import Any
 from r5dgs_core.bench.benchmark import RESULT_FILE
 from r5dgs_core.config.config import Config
 from r5dgs_core.model import deformation, trd
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import run_folder
 
 NOTE = "Our implementation, reduced networks."
 POINTS = 12  # most columns of the table of PSNR against steps
@@ -36,7 +36,7 @@ def networks(config: Config) -> str:
 
 def probes(run: Path) -> dict[int, float]:
     """Return the PSNR of the held-out views by step, from the log of a run."""
-    path = run / checkpoint.LOG_FILE
+    path = run / run_folder.LOG_FILE
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     events = [json.loads(line) for line in lines if line.endswith("}")]
     return {event["iteration"]: event["val_psnr"] for event in events if "val_psnr" in event}
@@ -47,9 +47,9 @@ def rows(bench: Path) -> list[dict[str, Any]]:
     found = bench / RESULT_FILE
     results = json.loads(found.read_text(encoding="utf-8"))["results"] if found.exists() else []
     made = []
-    for path in sorted(bench.glob(f"*/*/{checkpoint.RUN_FILE}")):
+    for path in sorted(bench.glob(f"*/*/{run_folder.RUN_FILE}")):
         run, (scene, name) = path.parent, path.parts[-3:-1]
-        config = checkpoint.open_run(run).config
+        config = run_folder.open_run(run).config
         own = [r for r in results if (r["scene"], f"{r['variant']}_seed{r['seed']}") == (scene, name)]
         made.append(
             {

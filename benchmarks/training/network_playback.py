@@ -26,13 +26,13 @@ from r5dgs_core.bake import bake
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
-from r5dgs_core.train import checkpoint, trainer, warm_up
+from r5dgs_core.train import checkpoint, run_folder, trainer, warm_up
 from r5dgs_core.train.representations import field
 
 
 def players(run: Path) -> tuple[dict[str, Callable[[], object]], int]:
     """Return functions that draw all test views, by label, and the number of these views."""
-    opened = checkpoint.open_run(run)
+    opened = run_folder.open_run(run)
     dataset = datasets.read(opened.data())
     trained = trainer.Trainer(dataset, opened.config)
     trained.restore(checkpoint.load(run))

@@ -12,14 +12,14 @@ from ..data.dataset import Dataset
 from ..errors import CheckpointError
 from ..scene import scene_file
 from ..scene.scene import Scene
-from ..train import checkpoint
+from ..train import run_folder
 from . import assemble, hulls, needs, parts, point_motion, provenance, read_checkpoint, simplify_motion
 from .draft import Stage
 
 STAGES: tuple[Stage, ...] = (point_motion, simplify_motion, parts, needs, hulls, provenance)
 
 
-def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
+def bake(run: run_folder.Run, dataset: Dataset | None = None) -> Scene:
     """Bake the last checkpoint of a run into a scene.
 
     Args:
@@ -53,7 +53,7 @@ def run_bake(folder: Path, out: Path, dataset_root: Path | None = None, override
         ConfigError, UsageError: An override is invalid.
         DatasetError, SceneFileError: The data set cannot be read, or the scene file cannot be written.
     """
-    run = checkpoint.open_run(folder)
+    run = run_folder.open_run(folder)
     configs.require_needs(overrides)
     run = dataclasses.replace(run, config=run.config.override(overrides))
     dataset = datasets.read(run.data(dataset_root), run.config.data.masks, run.config.data.min_registered)

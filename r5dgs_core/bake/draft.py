@@ -15,7 +15,7 @@ from ..config.config import Config
 from ..config.sections.needs import NeedsSection
 from ..data.dataset import Dataset
 from ..scene.scene import MotionGroup, Scene
-from ..train import checkpoint, checkpoint_content
+from ..train import checkpoint, checkpoint_content, run_folder
 from ..train.normalization import Normalization
 from ..train.observed_motion import ObservedMotion
 
@@ -31,7 +31,7 @@ class Context:
         norm: Training coordinates to world coordinates.
     """
 
-    run: checkpoint.Run
+    run: run_folder.Run
     state: checkpoint.Checkpoint
     dataset: Dataset
     norm: Normalization

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ..scene.scene import Scene
-from ..train import checkpoint
+from ..train import run_folder
 from . import assemble, read_checkpoint, simplify_motion
 
 
-def scene_of(run: checkpoint.Run) -> Scene:
+def scene_of(run: run_folder.Run) -> Scene:
     """Return a scene with the motion past t_max fitted to the trained poses alone.
 
     Compared with `bake.bake`, slight motion is not checked against the images, and the errors of the poses are unknown.

@@ -10,13 +10,13 @@ from ..data import dataset as datasets
 from ..data.dataset import Dataset
 from ..errors import CheckpointError
 from ..motion import rotations
-from ..train import checkpoint
+from ..train import checkpoint, run_folder
 from ..train.normalization import Normalization
 from ..train.representations import registry
 from .draft import Cloud, Context, ObservedScene, is_discovered
 
 
-def open_context(run: checkpoint.Run, dataset: Dataset | None) -> Context:
+def open_context(run: run_folder.Run, dataset: Dataset | None) -> Context:
     """Load the last checkpoint of a run, and the data set if None is given.
 
     Raises:

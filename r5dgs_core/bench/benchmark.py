@@ -18,7 +18,7 @@ from ..playback import scene_player
 from ..progress import make as make_progress
 from ..render import machine as machines
 from ..scene import scene_file
-from ..train import checkpoint, interrupt, warm_up
+from ..train import checkpoint, interrupt, run_folder, warm_up
 from . import cases, playback_speed, plot, process, tables
 from .cases import BenchmarkRequest, Case
 
@@ -105,7 +105,7 @@ def _train(plan: BenchmarkRequest, case: Case, progress: Progress) -> None:
     """Train a case in a separate process, from its last checkpoint if it has one."""
     record = cases.read_record(case)
     arguments = ["train", str(case.root), "--out", str(case.run)]
-    if (case.run / checkpoint.RUN_FILE).exists():
+    if (case.run / run_folder.RUN_FILE).exists():
         arguments.append("--resume")
     else:
         record = {"sittings": []}
@@ -144,7 +144,7 @@ def _measure(
 ) -> dict[str, Any]:
     """Bake a run, write its scene, and measure the lacking modes that the scene supports."""
     progress({"event": "bake", "text": case.title})
-    run = checkpoint.open_run(case.run)
+    run = run_folder.open_run(case.run)
     dataset = datasets.read(case.root)
     if dataset.digest != run.digest:
         raise CheckpointError(f"{case.run}: was trained on other data than {case.root} now holds; restore the data")

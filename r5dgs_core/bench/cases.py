@@ -18,7 +18,7 @@ from ..config import config as configs
 from ..data import dataset as datasets
 from ..errors import CheckpointError, ConfigError
 from ..playback import modes
-from ..train import checkpoint
+from ..train import checkpoint, run_folder
 from . import variants as kinds
 
 # Evaluating held-out views during training would add to its time. The user's settings override these.
@@ -130,9 +130,9 @@ def make(plan: BenchmarkRequest) -> list[Case]:
 
 def _check_settings(case: Case, wanted: configs.Config) -> None:
     """Raise ConfigError if the case's run was started with other settings; CheckpointError if it is damaged."""
-    if not (case.run / checkpoint.RUN_FILE).exists():
+    if not (case.run / run_folder.RUN_FILE).exists():
         return
-    found = checkpoint.open_run(case.run).config.to_dict()
+    found = run_folder.open_run(case.run).config.to_dict()
     for section, keys in wanted.to_dict().items():
         for key, value in keys.items():
             if found[section][key] != value:
@@ -146,7 +146,7 @@ def _check_data(case: Case, digest: str) -> None:
     """Raise CheckpointError if the case was trained on other data than the current data set."""
     if checkpoint.newest_file(case.run) is None:
         return  # no checkpoint depends on the data yet
-    if checkpoint.open_run(case.run).digest != digest:
+    if run_folder.open_run(case.run).digest != digest:
         raise CheckpointError(
             f"{case.run}: was trained on other data than {case.root} now holds; restore the data, choose another "
             f"--out, or remove {case.run} and {case.beside('.json').name} beside it to train it again"

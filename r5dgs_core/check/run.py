@@ -11,21 +11,21 @@ from . import data, scene
 from .codes import CODES
 
 if TYPE_CHECKING:  # torch
-    from ..train.checkpoint import Run
+    from ..train.run_folder import Run
 
 
 def check(folder: Path) -> list[Finding]:
     """Return all faults of a run folder."""
-    from ..train import checkpoint
+    from ..train import run_folder
 
     collect = Collector(CODES, "R01")
-    run: checkpoint.Run | None = None
+    run: run_folder.Run | None = None
     with collect():
-        run = checkpoint.open_run(folder)
+        run = run_folder.open_run(folder)
     steps = _check_checkpoints(folder, collect)
     if run is not None and steps is not None and steps < run.config.train.iterations:
         collect.add("R12", f"{folder}: stopped at step {steps} of {run.config.train.iterations}")
-    evaluation = folder / checkpoint.EVALUATION_FILE
+    evaluation = folder / run_folder.EVALUATION_FILE
     if evaluation.exists():
         with collect(), coded("R04"):
             content = strict_json.read(evaluation, errors.CheckpointError)

@@ -49,10 +49,10 @@ def open_target(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]
     from ..bake import bake
     from ..data import dataset as datasets
     from ..scene import scene_file
-    from ..train import checkpoint
+    from ..train import run_folder
 
     if target.is_dir():
-        run = checkpoint.open_run(target)
+        run = run_folder.open_run(target)
         dataset = datasets.read(run.data(data), run.config.data.masks, run.config.data.min_registered)
         scene, trained_on = bake.bake(run, dataset), run.digest
     else:

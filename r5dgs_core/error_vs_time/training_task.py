@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..train import step_log
-from ..train.checkpoint import LOG_FILE, RUN_FILE
+from ..train.run_folder import LOG_FILE, RUN_FILE
 from . import image_task
 from .report_rows import Row
 from .task import Goal, Measured, Panel, Request, Task, decibels, method_and_setting

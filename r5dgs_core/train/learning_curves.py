@@ -11,7 +11,7 @@ from typing import Any
 
 from .. import atomic_files
 from . import step_log
-from .checkpoint import CURVES_FILE, LOG_FILE
+from .run_folder import CURVES_FILE, LOG_FILE
 
 log = logging.getLogger(__name__)
 

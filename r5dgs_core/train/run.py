@@ -22,7 +22,7 @@ from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted, TrainingError
 from ..render import warm_up
 from ..time_left import Phase, TimedProgress
-from . import checkpoint, checkpoint_content, finish, held_out_psnr, interrupt, learning_curves, step_log
+from . import checkpoint, checkpoint_content, finish, held_out_psnr, interrupt, learning_curves, run_folder, step_log
 from .identity import packed_masks
 from .representations.representation import TRACKS
 from .trainer import Trainer
@@ -44,7 +44,7 @@ def train(
     overwrite: bool = False,
     resume_command: str | None = None,
     progress: Progress | None = None,
-) -> checkpoint.Run:
+) -> run_folder.Run:
     """Train a run folder from a data set.
 
     Args:
@@ -72,7 +72,7 @@ def train(
 
         def claim() -> None:
             if stack.enter_context(folder_lock.hold(request.folder)):  # no other process is writing to these files
-                checkpoint.remove_leftovers(request.folder)
+                run_folder.remove_leftovers(request.folder)
 
         timed = progress if isinstance(progress, TimedProgress) else TimedProgress(progress or (lambda event: None))
         return _train(request, timed, claim)
@@ -105,7 +105,7 @@ class _Session:
         curves: Plot of the log.
     """
 
-    run: checkpoint.Run
+    run: run_folder.Run
     trainer: Trainer
     began: float
     began_cpu: float | None
@@ -115,7 +115,7 @@ class _Session:
     curves: learning_curves.LearningCurves
 
 
-def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]) -> checkpoint.Run:
+def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]) -> run_folder.Run:
     """Implementation of `train`; ``claim`` locks the folder."""
     request, dataset = _prepare(request, claim)
     folder, resume_command = request.folder, request.resume_command
@@ -142,12 +142,12 @@ def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]
         trainer = Trainer(dataset, run.config, found)
         held_out = _held_out_psnr(trainer)
     if replaces:
-        run = checkpoint.create_run(folder, dataset, request.config)
+        run = run_folder.create_run(folder, dataset, request.config)
     if state is not None:
         trainer.restore(state)
         began -= state.seconds
-    step_log.clean_up(folder / checkpoint.LOG_FILE, trainer.iteration)
-    began_cpu = step_log.processor_start(folder / checkpoint.LOG_FILE, began_cpu)
+    step_log.clean_up(folder / run_folder.LOG_FILE, trainer.iteration)
+    began_cpu = step_log.processor_start(folder / run_folder.LOG_FILE, began_cpu)
     curves = learning_curves.LearningCurves(run.folder)
     _plan(trainer, progress)
     _complete(_Session(run, trainer, began, began_cpu, resume_command, progress, held_out, curves))
@@ -160,36 +160,36 @@ def _prepare(request: _Request, claim: Callable[[], None]) -> tuple[_Request, da
     is_new = not folder.is_dir()
     if not is_new:
         claim()
-    if request.resume and not (folder / checkpoint.RUN_FILE).exists():
+    if request.resume and not (folder / run_folder.RUN_FILE).exists():
         log.warning("%s: no run to resume; starting a new one", folder)
         request = dataclasses.replace(request, resume=False)
     if not request.resume and not request.overwrite:
-        checkpoint.refuse_to_lose(folder)
-    settled = checkpoint.open_run(folder).config if request.resume else request.config
+        run_folder.refuse_to_lose(folder)
+    settled = run_folder.open_run(folder).config if request.resume else request.config
     dataset = datasets.read(request.dataset_root, settled.data.masks, settled.data.min_registered)
     dataset.require_one_numbering()
     if is_new:  # created only now, so that an unreadable data set leaves no folder
-        checkpoint.plan_run(folder, dataset, request.config)
+        run_folder.plan_run(folder, dataset, request.config)
         claim()
         if not request.overwrite:
-            checkpoint.refuse_to_lose(folder)  # another process may have created a run meanwhile
+            run_folder.refuse_to_lose(folder)  # another process may have created a run meanwhile
     return request, dataset
 
 
-def _open(request: _Request, dataset: datasets.Dataset) -> tuple[checkpoint.Run, checkpoint.Checkpoint | None, bool]:
+def _open(request: _Request, dataset: datasets.Dataset) -> tuple[run_folder.Run, checkpoint.Checkpoint | None, bool]:
     """Return the run, its last state or None, and True if the files of an earlier run are still to be replaced."""
     folder = request.folder
     if not request.resume:
         replaces = checkpoint.newest_file(folder) is not None
         return (
-            (checkpoint.plan_run if replaces else checkpoint.create_run)(folder, dataset, request.config),
+            (run_folder.plan_run if replaces else run_folder.create_run)(folder, dataset, request.config),
             None,
             replaces,
         )
-    run = checkpoint.open_run(folder)
+    run = run_folder.open_run(folder)
     state = None if checkpoint.newest_file(folder) is None else checkpoint.load(folder, mend=True)
     if run.digest != dataset.digest and state is None:  # no step has used the other data yet
-        run = checkpoint.create_run(folder, dataset, run.config)
+        run = run_folder.create_run(folder, dataset, run.config)
     if run.digest != dataset.digest:
         raise CheckpointError(
             f"{folder}: was trained on other data than {request.dataset_root} now holds; "
@@ -277,7 +277,7 @@ def _optimise(session: _Session) -> None:
     trainer, held_out = session.trainer, session.held_out
     section = trainer.config.train
     decision = decision_step(trainer)
-    with interrupt.collected() as asked, step_log.StepLog(session.run.folder / checkpoint.LOG_FILE) as steps:
+    with interrupt.collected() as asked, step_log.StepLog(session.run.folder / run_folder.LOG_FILE) as steps:
         while not trainer.done:
             take_step(trainer, decision, session.progress)
             due = held_out is not None and (trainer.done or trainer.iteration % section.probe_every == 0)

@@ -6,7 +6,7 @@ import pytest
 
 from r5dgs_core.bench.benchmark import RESULT_FILE
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import run_folder
 from tests.support import benchmark_modules, tiny_datasets
 
 FIELD = ("train.representation='field'", "train.iterations=40")
@@ -20,10 +20,10 @@ def tables(monkeypatch):
 
 def bench(folder, tiny, *overrides, finished):
     run = folder / "room" / "r5dgs_seed0"
-    checkpoint.create_run(run, datasets.read(tiny.root), tiny_datasets.settings(*FIELD, *overrides))
+    run_folder.create_run(run, datasets.read(tiny.root), tiny_datasets.settings(*FIELD, *overrides))
     events = [{"iteration": n, "loss": 1.0, **({"val_psnr": 20.0 + n} if n % 20 == 0 else {})} for n in (10, 20, 40)]
     lines = "".join(json.dumps(event) + "\n" for event in events)
-    (run / checkpoint.LOG_FILE).write_text(lines + '{"iteration": 50, "val_ps')  # a kill cut the last line
+    (run / run_folder.LOG_FILE).write_text(lines + '{"iteration": 50, "val_ps')  # a kill cut the last line
     if finished:
         common = {"scene": "room", "variant": "r5dgs", "seed": 0, "train": {"cpu_seconds": 90.0}}
         splits = {

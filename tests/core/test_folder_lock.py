@@ -11,7 +11,7 @@ import pytest
 from r5dgs_core import folder_lock
 from r5dgs_core.cli.commands import associate, bake, evaluate, import_run, lookup, name
 from r5dgs_core.errors import CheckpointError
-from r5dgs_core.train import checkpoint, run
+from r5dgs_core.train import checkpoint, run, run_folder
 from tests.support import tiny_datasets
 
 pytestmark = pytest.mark.heavy
@@ -103,7 +103,7 @@ def test_a_file_system_without_locks_is_named_and_keeps_half_written_files(tiny,
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    half = tmp_path / f".{checkpoint.RUN_FILE}.12ab.part"
+    half = tmp_path / f".{run_folder.RUN_FILE}.12ab.part"
     half.write_text("of a process that may live")
     run.train(tiny.root, tmp_path, SETTINGS)
     told = [record.getMessage() for record in caplog.records if "has no locks" in record.getMessage()]
@@ -168,14 +168,14 @@ WRITERS = {
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_no_command_that_writes_into_a_run_folder_waits_for_the_lock(tmp_path, name):
-    (tmp_path / checkpoint.RUN_FILE).write_text('{"format_version": 1, "dataset": "data"}')
+    (tmp_path / run_folder.RUN_FILE).write_text('{"format_version": 1, "dataset": "data"}')
     with folder_lock.hold(tmp_path), pytest.raises(CheckpointError, match="in use by"):
         WRITERS[name](tmp_path)
 
 
 @pytest.mark.parametrize(("text", "ours"), [('{"jobs": 3}', False), ("[]", False), ('{"format_version": 1', True)])
 def test_a_run_file_of_another_program_makes_no_run_folder_and_a_damaged_one_does(tmp_path, text, ours):
-    (tmp_path / checkpoint.RUN_FILE).write_text(text)
+    (tmp_path / run_folder.RUN_FILE).write_text(text)
     (tmp_path / "deep").mkdir()
     with folder_lock.hold_run_around(tmp_path / "deep" / "a.r5dgs"):
         assert (tmp_path / folder_lock.LOCK_FILE).exists() == ours
@@ -183,7 +183,7 @@ def test_a_run_file_of_another_program_makes_no_run_folder_and_a_damaged_one_doe
 
 def test_reading_a_run_and_writing_elsewhere_need_no_lock(tmp_path, trained):
     with folder_lock.hold(trained.folder):
-        assert checkpoint.open_run(trained.folder).digest == trained.digest
+        assert run_folder.open_run(trained.folder).digest == trained.digest
         assert checkpoint.load(trained.folder).finished
         bake.run_bake(trained.folder, tmp_path / "a.r5dgs", None)
     assert (tmp_path / "a.r5dgs").exists()

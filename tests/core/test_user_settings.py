@@ -10,7 +10,7 @@ from r5dgs_core.cli import main
 from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.config import config, config_keys
 from r5dgs_core.errors import ConfigError
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import run_folder
 from tests.support import tiny_datasets
 from tests.support.command_line import complaint
 
@@ -132,7 +132,7 @@ def test_config_prints_defaults_files_and_runs(tiny, tmp_path, capsys):
     settled = tiny_datasets.settings("train.seed=5")
     from r5dgs_core.data import dataset as datasets
 
-    checkpoint.create_run(tmp_path / "run", datasets.read(tiny.root), settled)
+    run_folder.create_run(tmp_path / "run", datasets.read(tiny.root), settled)
     assert shown(tmp_path / "run")["train.seed"]["value"] == 5
     assert main.main(["config", str(tmp_path / "run")]) == 0
     text = capsys.readouterr().out

@@ -30,7 +30,7 @@ from r5dgs_core.scene import cameras, quality, scene_file, stored_embeddings
 from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, Table
 from r5dgs_core.scene.scene import Scene
 from r5dgs_core.search import embedding_search, object_search
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import checkpoint, run_folder
 from tests.fuzz import mutations
 from tests.fuzz.campaign import Files, Reader
 from tests.support import colmap_files, foreign_runs, scenes
@@ -565,10 +565,10 @@ def knots_reader() -> Reader:
 def checkpoint_reader() -> Reader:
     """Run folders of ours: ``run.json`` and the checkpoint, with a digest of its bytes or without."""
     from tests.core.train.test_checkpoint import STATE
-    from tests.core.train.test_checkpoint import dataset as owner
+    from tests.core.train.test_run_folder import dataset as owner
 
     with tempfile.TemporaryDirectory() as folder:
-        checkpoint.create_run(Path(folder), owner(), config.Config())
+        run_folder.create_run(Path(folder), owner(), config.Config())
         checkpoint.save(Path(folder), STATE)
         files = files_in(Path(folder))
     content = torch.load(io.BytesIO(files[checkpoint.CHECKPOINT_FILE]), weights_only=True)
@@ -576,7 +576,7 @@ def checkpoint_reader() -> Reader:
     def make(random: Random) -> Files:
         kind = random.randrange(4)
         if kind == 0:
-            return files | {checkpoint.RUN_FILE: mutations.tree(random, files[checkpoint.RUN_FILE])}
+            return files | {run_folder.RUN_FILE: mutations.tree(random, files[run_folder.RUN_FILE])}
         if kind == 1:
             return files | {checkpoint.CHECKPOINT_FILE: mutations.data(random, files[checkpoint.CHECKPOINT_FILE])}
         if kind == 2:
@@ -591,7 +591,7 @@ def checkpoint_reader() -> Reader:
         return files
 
     def read(folder: Path) -> None:
-        checkpoint.open_run(folder)
+        run_folder.open_run(folder)
         state = checkpoint.load(folder)
         with as_defects():
             checkpoint.save(folder, state)

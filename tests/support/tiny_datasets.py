@@ -20,7 +20,7 @@ from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import cameras
 from r5dgs_core.scene.scene import Gaussians, MotionGroup, Scene, SceneObject, Tracks
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import run_folder
 from tests.support import scenes
 
 T_MAX = 0.75
@@ -154,7 +154,7 @@ def settings(*overrides: str) -> config.Config:
     return config.load(None, [*SETTINGS, *overrides])
 
 
-def as_trained(made: checkpoint.Run) -> checkpoint.Run:
+def as_trained(made: run_folder.Run) -> run_folder.Run:
     """The run, to be baked with its trained motion including noise."""
     kept = made.config.override(("needs.tracks=on", "needs.rotation=on"))
     return dataclasses.replace(made, config=kept)

@@ -16,7 +16,7 @@ from .. import options
 if TYPE_CHECKING:
     from ...data.dataset import Dataset
     from ...scene.scene import Scene
-    from ...train.checkpoint import Run
+    from ...train.run_folder import Run
 
 NAME = "demo"
 SHORT = "train, bake and evaluate the bundled data set"
@@ -86,7 +86,7 @@ def run_demo(
     from ...evaluation import contact_sheet, evaluate, evaluation_table
     from ...progress import make
     from ...scene import predictability
-    from ...train import checkpoint, interrupt, run
+    from ...train import interrupt, run, run_folder
 
     options.use_threads(threads)
     resume_command = shlex.join(["r5dgs", "demo", "--out", str(out), "--resume"])
@@ -97,7 +97,7 @@ def run_demo(
             out,
             settings,
             resume=resume,
-            overwrite=overwrite or _is_demo(out / checkpoint.RUN_FILE),
+            overwrite=overwrite or _is_demo(out / run_folder.RUN_FILE),
             resume_command=resume_command,
             progress=progress,
         )
@@ -109,7 +109,7 @@ def run_demo(
         terminal.print_lines(predictability.warnings(scene))
     stopped = f"stopped before the contact sheet; continue with: {resume_command}"
     with make(progress_kind) as progress, interrupt.at_once(stopped), folder_lock.hold(out):
-        json_path = evaluate.write(result, out / checkpoint.EVALUATION_FILE)
+        json_path = evaluate.write(result, out / run_folder.EVALUATION_FILE)
         progress({"event": "sheet", "text": "contact sheet"})
         sheet = contact_sheet.write(scene, dataset, out / "contact_sheet.png")
         if progress_kind == "json":

@@ -67,10 +67,10 @@ def run_evaluate(
     from ...evaluation import evaluate, evaluation_table
     from ...progress import make
     from ...scene import predictability
-    from ...train import checkpoint
+    from ...train import run_folder
 
     options.use_threads(threads)
-    default = target / checkpoint.EVALUATION_FILE if target.is_dir() else target.with_suffix(".evaluation.json")
+    default = target / run_folder.EVALUATION_FILE if target.is_dir() else target.with_suffix(".evaluation.json")
     with make(progress_kind) as progress:
         progress({"event": "prepare", "text": "the scene"})
         scene, dataset = inputs.open_target(target, data)

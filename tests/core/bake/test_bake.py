@@ -15,7 +15,7 @@ from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import scene_file, validation
-from r5dgs_core.train import checkpoint, finish, normalization, run
+from r5dgs_core.train import checkpoint, finish, normalization, run, run_folder
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
@@ -71,7 +71,7 @@ def test_unfinished_runs_with_other_options_bake_to_their_current_state(tiny, tm
     monkeypatch.setattr(finish, "final_tensors", stop)
     with pytest.raises(Interrupted):
         train_briefly(tiny, tmp_path / "run", *overrides)
-    made = checkpoint.open_run(tmp_path / "run")
+    made = run_folder.open_run(tmp_path / "run")
     if overrides[0] == "train.sh_degree=2":  # strong harmonics, so that a wrong frame is visible
         state = checkpoint.load(made.folder)
         draws = torch.Generator().manual_seed(1)
@@ -143,7 +143,7 @@ def test_an_object_that_lost_all_its_gaussians_stays_in_the_table(trained, tmp_p
     keep = (tensors["gaussians.motion_ids"] != 2) & (tensors["labels"] != 2)
     for name in [n for n in tensors if n.startswith("gaussians.")] + ["labels", "identities", "held"]:
         tensors[name] = tensors[name][keep]
-    made = checkpoint.create_run(tmp_path, datasets.read(trained.dataset_root), trained.config)
+    made = run_folder.create_run(tmp_path, datasets.read(trained.dataset_root), trained.config)
     checkpoint.save(tmp_path, state)
     scene = bake.bake(made)
     validation.check(scene, "scene")

@@ -11,7 +11,7 @@ from r5dgs_core.bake import bake, track_checks
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.motion import rotations
 from r5dgs_core.scene import validation
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import checkpoint, run_folder
 from tests.support import tiny_datasets
 
 pytestmark = pytest.mark.heavy
@@ -25,7 +25,7 @@ def test_a_bad_track_is_held_in_place_and_the_others_keep_their_bits(trained, ke
     state.tensors[f"tracks.{name}"] = state.tensors[f"tracks.{name}"].clone()
     state.tensors[f"tracks.{name}"][2, 3] = bad
     trained = tiny_datasets.as_trained(trained)
-    made = checkpoint.create_run(tmp_path, datasets.read(trained.dataset_root), trained.config)
+    made = run_folder.create_run(tmp_path, datasets.read(trained.dataset_root), trained.config)
     checkpoint.save(tmp_path, state)
     with caplog.at_level(logging.WARNING):
         scene = bake.bake(made)

@@ -19,7 +19,7 @@ from r5dgs_core.evaluation import evaluate
 from r5dgs_core.playback import modes, scene_player
 from r5dgs_core.render import machine
 from r5dgs_core.scene import scene_file
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import checkpoint, run_folder
 from tests.support import tiny_datasets
 
 pytestmark = pytest.mark.heavy
@@ -87,7 +87,7 @@ def test_a_record_holds_the_results_of_evaluation_and_playback(made, tiny):
     assert found["playback"]["fps"] == pytest.approx(1e3 / found["playback"]["ms_frame"])
     assert found["gaussians"] == len(scene_file.read(case.beside(".r5dgs")).gaussians.means)
     assert main.main(["evaluate", str(case.run), "--progress", "none"]) == 0
-    alone = json.loads((case.run / checkpoint.EVALUATION_FILE).read_text())
+    alone = json.loads((case.run / run_folder.EVALUATION_FILE).read_text())
     assert alone["splits"]["test"]["rigid"]["psnr"] == pytest.approx(found["splits"]["test"]["psnr"], abs=1e-6)
     assert json.loads((plan.out / benchmark.RESULT_FILE).read_text()) == result
 
@@ -185,7 +185,7 @@ def test_a_record_stores_the_machines_of_training_and_measurement(made):
 
 def test_results_measured_elsewhere_keep_their_machine(made, monkeypatch):
     plan, _, _, result = made
-    monkeypatch.setattr(checkpoint, "machine", lambda: {"processor": "another"})
+    monkeypatch.setattr(run_folder, "machine", lambda: {"processor": "another"})
     (found,) = benchmark.run_bench(plan, progress_kind="none")["results"]
     assert found["machine"] == result["results"][0]["machine"]
 

@@ -29,7 +29,7 @@ from r5dgs_core.playback import modes
 from r5dgs_core.raster import thread_pool
 from r5dgs_core.scene import scene_file
 from r5dgs_core.time_left import TimedProgress
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import checkpoint, run_folder
 from tests.support import pages, tiny_datasets
 from tests.support.command_line import complaint
 
@@ -176,7 +176,7 @@ def test_a_cap_and_a_preset_reach_the_run(tiny, tmp_path, capsys):
     assert main.main([*given, "--out", str(run), "--max-gaussians", "120", "--preset", "fast"]) == 0
     kept = checkpoint.load(run)
     assert len(kept.tensors["gaussians.means"]) <= 120 and kept.iteration == 20  # --set wins over the preset
-    assert checkpoint.open_run(run).config.densify.max_gaussians == 120
+    assert run_folder.open_run(run).config.densify.max_gaussians == 120
     fresh = ("train", tiny.root, "--out", tmp_path / "no")
     line = complaint(capsys, *fresh, "--max-gaussians", "many", status=ExitStatus.USAGE)
     assert "--max-gaussians: expected an integer of at least 0, got 'many'" in line
@@ -544,7 +544,7 @@ def test_steps_and_seed_reach_the_run_and_threads_leave_its_bits(tiny, tmp_path)
             states.append(checkpoint.load(folder))
     finally:
         thread_pool.set_threads(before)
-    settled = checkpoint.open_run(folder).config.train
+    settled = run_folder.open_run(folder).config.train
     assert (settled.iterations, settled.seed, states[0].iteration) == (4, 7, 4)
     assert all((states[0].tensors[name] == tensor).all() for name, tensor in states[1].tensors.items())
 

@@ -23,7 +23,7 @@ import torch
 from r5dgs_core.bake import bake
 from r5dgs_core.cli import main
 from r5dgs_core.errors import CheckpointError
-from r5dgs_core.train import checkpoint, checkpoint_content, checkpoint_file, run
+from r5dgs_core.train import checkpoint, checkpoint_content, checkpoint_file, run, run_folder
 from tests.support import tiny_datasets
 
 pytestmark = pytest.mark.heavy
@@ -55,7 +55,7 @@ def assert_same(ours, theirs):
 
 
 def steps(folder):
-    lines = (folder / checkpoint.LOG_FILE).read_text().splitlines()
+    lines = (folder / run_folder.LOG_FILE).read_text().splitlines()
     return [[json.loads(line)[key] for key in ("iteration", "loss", "gaussians")] for line in lines]
 
 
@@ -163,7 +163,7 @@ def test_a_run_with_a_damaged_newest_checkpoint_continues_from_the_previous_one(
         newest.unlink()
     assert checkpoint.load(newest.parent).iteration < stopped
     if damage == "flipped":
-        assert len(bake.bake(tiny_datasets.as_trained(checkpoint.open_run(newest.parent))).gaussians.means) > 0
+        assert len(bake.bake(tiny_datasets.as_trained(run_folder.open_run(newest.parent))).gaussians.means) > 0
     caplog.clear()
     assert main.main(["train", str(tiny.root), "--out", str(newest.parent), "--resume", "--progress", "none"]) == 0
     told = [record.getMessage() for record in caplog.records if "previous checkpoint" in record.getMessage()]
@@ -235,7 +235,7 @@ def test_a_mask_of_numbers_is_refused(reference, tmp_path):
 @pytest.mark.parametrize("name", ["adam.means.exp_avg", "gradients.total", "generator"])
 def test_a_state_that_does_not_fit_the_run_is_named_on_resuming(tiny, reference, tmp_path, name):
     state = checkpoint.load(reference)
-    checkpoint.create_run(tmp_path, run.datasets.read(tiny.root), tiny_datasets.settings(*OVERRIDES))
+    run_folder.create_run(tmp_path, run.datasets.read(tiny.root), tiny_datasets.settings(*OVERRIDES))
     changed = {**state.tensors, name: STRANGE["half as long"](state.tensors[name])}
     checkpoint.save(tmp_path, dataclasses.replace(state, tensors=changed, finished=False))
     with pytest.raises(CheckpointError, match=name.partition(".")[0]):

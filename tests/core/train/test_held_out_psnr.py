@@ -8,7 +8,7 @@ import torch
 
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.evaluation import evaluate
-from r5dgs_core.train import checkpoint, held_out_psnr, run
+from r5dgs_core.train import checkpoint, held_out_psnr, run, run_folder
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
@@ -30,7 +30,7 @@ def test_measuring_held_out_views_does_not_change_a_run(tiny, tmp_path):
     assert ours.tensors.keys() == theirs.tensors.keys() and ours.running_loss == theirs.running_loss
     seen = [event["iteration"] for event in looking if "val_psnr" in event]
     assert seen == [7, 14, 21, 28, 35, 42, 45] and not any("val_psnr" in event for event in blind)
-    logged = [json.loads(line) for line in (tmp_path / "looking" / checkpoint.LOG_FILE).read_text().splitlines()]
+    logged = [json.loads(line) for line in (tmp_path / "looking" / run_folder.LOG_FILE).read_text().splitlines()]
     assert logged == looking and {10, 20, 30, 40} < {event["iteration"] for event in logged}
 
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from r5dgs_core import atomic_files
-from r5dgs_core.train import checkpoint, learning_curves, run
+from r5dgs_core.train import learning_curves, run, run_folder
 from tests.support import tiny_datasets
 
 pytestmark = [pytest.mark.usefixtures("plots"), pytest.mark.heavy]
@@ -24,7 +24,7 @@ def size(png):
 
 
 def write_log(folder, rows, tail=""):
-    (folder / checkpoint.LOG_FILE).write_text("".join(json.dumps(row) + "\n" for row in rows) + tail)
+    (folder / run_folder.LOG_FILE).write_text("".join(json.dumps(row) + "\n" for row in rows) + tail)
     return learning_curves.LearningCurves(folder)
 
 
@@ -43,7 +43,7 @@ def test_some_steps_may_have_no_measurement_of_held_out_views():
 
 def test_a_finished_run_is_drawn_whatever_the_time_and_a_torn_line_is_left_out(tmp_path):
     write_log(tmp_path, ROWS, '{"iterat').update(finished=True)
-    assert (tmp_path / checkpoint.CURVES_FILE).read_bytes() == learning_curves.draw(ROWS)
+    assert (tmp_path / run_folder.CURVES_FILE).read_bytes() == learning_curves.draw(ROWS)
 
 
 def test_an_active_run_is_plotted_rarely_enough_to_cost_little(tmp_path, monkeypatch):
@@ -67,7 +67,7 @@ def test_an_active_run_is_plotted_rarely_enough_to_cost_little(tmp_path, monkeyp
 
 def test_a_single_point_is_not_plotted(tmp_path):
     write_log(tmp_path, ROWS[:1]).update(finished=True)
-    assert not (tmp_path / checkpoint.CURVES_FILE).exists()
+    assert not (tmp_path / run_folder.CURVES_FILE).exists()
 
 
 def full_disk(*args):
@@ -82,16 +82,16 @@ def test_a_plot_that_cannot_be_drawn_is_one_warning(tmp_path, monkeypatch, caplo
     elif fault == "disk":
         monkeypatch.setattr(atomic_files, "write", full_disk)
     else:
-        (tmp_path / checkpoint.LOG_FILE).unlink()
+        (tmp_path / run_folder.LOG_FILE).unlink()
     for _ in range(2):
         pictures.update(finished=True)
     assert len(caplog.records) == 1 and "learning curves cannot be drawn" in caplog.text
-    assert not (tmp_path / checkpoint.CURVES_FILE).exists()
+    assert not (tmp_path / run_folder.CURVES_FILE).exists()
 
 
 def test_a_run_writes_its_curves_and_a_new_run_removes_them(tiny, tmp_path):
     folder, short = tmp_path / "run", ("identity.iterations=0", "train.log_every=5")
     run.train(tiny.root, folder, tiny_datasets.settings("train.iterations=20", *short))
-    assert size((folder / checkpoint.CURVES_FILE).read_bytes())[0] > 300
+    assert size((folder / run_folder.CURVES_FILE).read_bytes())[0] > 300
     run.train(tiny.root, folder, tiny_datasets.settings("train.iterations=2", *short), overwrite=True)
-    assert not (folder / checkpoint.CURVES_FILE).exists()
+    assert not (folder / run_folder.CURVES_FILE).exists()

@@ -13,7 +13,7 @@ from r5dgs_core.config import training_needs
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.evaluation import evaluate
 from r5dgs_core.scene import validation
-from r5dgs_core.train import checkpoint, checkpoint_content, object_discovery, run
+from r5dgs_core.train import checkpoint, checkpoint_content, object_discovery, run, run_folder
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
@@ -89,7 +89,7 @@ def test_a_resumed_run_keeps_the_masks_that_it_began_with(unmasked, tiny, tmp_pa
     whole = run.train(unmasked.root, tmp_path / "whole", config)
     expected = checkpoint.load(whole.folder).tensors
     half = Trainer(datasets.read(unmasked.root), config, true_masks(tiny))
-    parted = checkpoint.create_run(tmp_path / "parted", datasets.read(unmasked.root), config)
+    parted = run_folder.create_run(tmp_path / "parted", datasets.read(unmasked.root), config)
     while half.iteration < 20:
         half.step()
     checkpoint.save(parted.folder, half.state())

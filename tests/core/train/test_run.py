@@ -12,7 +12,7 @@ import torch
 from r5dgs_core import atomic_files
 from r5dgs_core.cli import main
 from r5dgs_core.errors import CheckpointError, Interrupted, TrainingError
-from r5dgs_core.train import checkpoint, run, step_log
+from r5dgs_core.train import checkpoint, run, run_folder, step_log
 from tests.support import processes, tiny_datasets
 
 pytestmark = pytest.mark.heavy
@@ -52,7 +52,7 @@ def assert_equal_runs(folder, reference):
 
 def log_of(folder):
     """Steps, losses and counts of a run's log, without its clock."""
-    lines = (folder / checkpoint.LOG_FILE).read_text().splitlines()
+    lines = (folder / run_folder.LOG_FILE).read_text().splitlines()
     return [[json.loads(line)[key] for key in ("iteration", "loss", "gaussians")] for line in lines]
 
 
@@ -65,7 +65,7 @@ def contents(folder):
 def test_a_stopped_run_resumes_to_the_same_bits(tiny, unbroken, tmp_path, capsys, number):
     folder = tmp_path / "run"
     stop_at(25, number, arguments(tiny, folder), folder)
-    with open(folder / checkpoint.LOG_FILE, "a") as stream:
+    with open(folder / run_folder.LOG_FILE, "a") as stream:
         stream.write('{"event": "step", "itera')  # what a crash of the machine may leave
     assert main.main(["train", str(tiny.root), "--out", str(folder), "--resume", "--progress", "none"]) == 0
     assert capsys.readouterr().err == ""
@@ -163,7 +163,7 @@ def test_progress_counts_up_to_the_end(unbroken):
     assert [e["iteration"] for e in identities] == [10, 20] and identities[-1]["seconds_left"] == 0
     prepared = [event["text"] for event in events if event["event"] == "prepare"]
     assert len(prepared) == 3 and "kernels" in prepared[0] and "objects" in prepared[1] and "labels" in prepared[2]
-    logged = [json.loads(line) for line in (folder / checkpoint.LOG_FILE).read_text().splitlines()]
+    logged = [json.loads(line) for line in (folder / run_folder.LOG_FILE).read_text().splitlines()]
     assert logged == steps
 
 
@@ -193,7 +193,7 @@ def copied(unbroken, tmp_path):
     """A finished run that a test may change."""
     folder = tmp_path / "run"
     shutil.copytree(unbroken[0], folder)
-    (folder / checkpoint.EVALUATION_FILE).write_text("{}")
+    (folder / run_folder.EVALUATION_FILE).write_text("{}")
     return folder
 
 
@@ -212,9 +212,9 @@ def test_a_run_is_replaced_only_on_request(tiny, copied):
 def test_overwriting_starts_again_without_files_of_the_old_run(tiny, copied):
     settings = tiny_datasets.settings("train.iterations=3", "identity.iterations=0")
     run.train(tiny.root, copied, settings, overwrite=True)
-    assert checkpoint.open_run(copied).config == settings and checkpoint.load(copied).iteration == 3
+    assert run_folder.open_run(copied).config == settings and checkpoint.load(copied).iteration == 3
     assert [step for step, *_ in log_of(copied)] == [3]
-    assert not (copied / checkpoint.EVALUATION_FILE).exists()
+    assert not (copied / run_folder.EVALUATION_FILE).exists()
 
 
 @pytest.mark.parametrize("failure", [TrainingError("no start"), KeyboardInterrupt()], ids=["error", "signal"])
@@ -241,16 +241,16 @@ def test_resuming_without_a_run_starts_a_new_one_with_a_message(tiny, tmp_path, 
 def test_files_half_written_by_a_killed_run_are_removed(tiny, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / f".{checkpoint.RUN_FILE}.12ab.part").write_text("half")
+    (folder / f".{run_folder.RUN_FILE}.12ab.part").write_text("half")
     settings = tiny_datasets.settings("train.iterations=2", "identity.iterations=0")
     run.train(tiny.root, folder, settings)
     (folder / f".{checkpoint.CHECKPOINT_FILE}.12ab.part").write_text("half")
     run.train(tiny.root, folder, settings, resume=True)
     run.train(tiny.root, folder, settings, overwrite=True)
-    assert {p.name for p in folder.iterdir()} == {checkpoint.RUN_FILE, checkpoint.LOG_FILE, *checkpoint.GENERATIONS}
+    assert {p.name for p in folder.iterdir()} == {run_folder.RUN_FILE, run_folder.LOG_FILE, *checkpoint.GENERATIONS}
 
 
-@pytest.mark.parametrize("name", [checkpoint.RUN_FILE, checkpoint.LOG_FILE, checkpoint.CHECKPOINT_FILE])
+@pytest.mark.parametrize("name", [run_folder.RUN_FILE, run_folder.LOG_FILE, checkpoint.CHECKPOINT_FILE])
 def test_unwritable_files_are_named(tiny, tmp_path, monkeypatch, name):
     real = atomic_files.replacing
 
@@ -260,7 +260,7 @@ def test_unwritable_files_are_named(tiny, tmp_path, monkeypatch, name):
         return real(path, *previous)
 
     monkeypatch.setattr(atomic_files, "replacing", full)
-    if name == checkpoint.LOG_FILE:
+    if name == run_folder.LOG_FILE:
         monkeypatch.setattr(step_log, "open", full_disk, raising=False)
     settings = tiny_datasets.settings("train.iterations=2", "identity.iterations=0")
     with pytest.raises(CheckpointError, match="run.*cannot be .*written: .*No space left"):
