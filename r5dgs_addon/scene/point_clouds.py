@@ -7,8 +7,7 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core.color import srgb
-from ...r5dgs_core.playback import posing
-from ...r5dgs_core.scene import spherical_harmonics
+from ...r5dgs_core.scene import diffuse_shading, spherical_harmonics
 from ...r5dgs_core.scene.scene import Scene
 from ...r5dgs_core.scene.splats import to_opacities
 from .. import compat
@@ -59,7 +58,7 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
         written[f"{HARMONICS}{k}"] = _write(cloud, f"{HARMONICS}{k}", "FLOAT_VECTOR", "vector", plane)
     if scene.shading is not None:
         _write(cloud, SHADING, "FLOAT_VECTOR", "vector", scene.shading.vectors[rows])
-        _write(cloud, SHADING_REST, "FLOAT", "value", posing.rest_factors(scene)[rows])
+        _write(cloud, SHADING_REST, "FLOAT", "value", diffuse_shading.rest_factors(scene)[rows])
     cloud[FINGERPRINTS] = {name: fingerprint(values) for name, values in written.items()}
     _write(cloud, "object_id", "INT", "value", scene.gaussians.object_ids[rows], np.int32)
     _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", np.concatenate([shown, opacities[:, None]], axis=-1))

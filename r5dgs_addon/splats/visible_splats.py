@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 
-from ...r5dgs_core.playback import affine_transform, posing
+from ...r5dgs_core.playback import affine_transform
+from ...r5dgs_core.scene import diffuse_shading
 from .. import compat
 from ..engine import visible_clouds
 from ..scene import evaluated_points, loaded_scenes, viewport_display
@@ -179,7 +180,7 @@ def _groups(numbers: list[int], clouds: list[visible_clouds.VisibleCloud]) -> tu
     for number, cloud, turn in zip(numbers, clouds, turns, strict=True):
         light, lit = loaded_scenes.light(cloud.collection), {}
         if light is not None:
-            lit = {"light_change": tuple(posing.light_change(light, turn)), "light": tuple(light)}
+            lit = {"light_change": tuple(diffuse_shading.light_change(light, turn)), "light": tuple(light)}
         found.append(renderer.Group(number, cloud.matrix, cloud.tint, holdout=cloud.holdout, **lit))
     return tuple(found)
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from ..color import tints
 from ..motion import rotations
-from ..playback import affine_transform, posing
+from ..playback import affine_transform
+from ..scene import diffuse_shading
 from ..scene.scene import Scene
 from .piece_clusters import Cluster
 
@@ -89,14 +90,14 @@ def placed(scene: Scene, rows: slice | np.ndarray, bind: np.ndarray | None) -> d
         ``means quats log_scales sh``, and ``shading shading_rest`` if the scene has shading. [n, ...] each
     """
     shading = None if scene.shading is None else scene.shading.vectors[rows]
-    rest = posing.rest_factors(scene)[rows]
+    rest = diffuse_shading.rest_factors(scene)[rows]
     splats = affine_transform.bind_state(scene, rows)
     if bind is not None:
         splats = affine_transform.carry(splats, bind)
         if scene.shading is not None:
             turn = affine_transform.nearest_rotation(bind[:3, :3])
             light = np.asarray(scene.shading.light, np.float64)
-            rest = (rest + scene.shading.vectors[rows] @ posing.light_change(light, turn)).astype(np.float32)
+            rest = (rest + scene.shading.vectors[rows] @ diffuse_shading.light_change(light, turn)).astype(np.float32)
             shading = (scene.shading.vectors[rows] @ turn.T).astype(np.float32)
     values = {"means": splats.means, "quats": splats.quats, "log_scales": splats.log_scales, "sh": splats.sh}
     if shading is not None:

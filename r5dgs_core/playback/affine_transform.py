@@ -12,7 +12,7 @@ import numpy as np
 
 from ..color import tints
 from ..motion import rotations
-from ..scene import spherical_harmonics
+from ..scene import diffuse_shading, spherical_harmonics
 from ..scene.scene import Scene
 from ..scene.splats import Splats
 from . import posing
@@ -148,9 +148,9 @@ def _relight(scene: Scene, start: int, factor: np.ndarray | None, turn: np.ndarr
         return
     light = np.asarray(scene.shading.light, np.float64)
     turns = turn @ rotations.quats_to_rotmats(bend.turns)
-    factor[bend.rows - start, 0] = posing.lit(
-        posing.rest_factors(scene)[bend.rows], scene.shading.vectors[bend.rows], light, turns
-    )
+    change = diffuse_shading.light_change(light, turns).astype(np.float32)
+    rest = diffuse_shading.rest_factors(scene)[bend.rows]
+    factor[bend.rows - start, 0] = diffuse_shading.factors(rest, scene.shading.vectors[bend.rows], change)
 
 
 def join(parts: Sequence[Splats]) -> Splats:
@@ -227,4 +227,6 @@ def shading_factors(scene: Scene, rows: slice, rotation: np.ndarray) -> np.ndarr
     if scene.shading is None:
         return None
     light = np.asarray(scene.shading.light, np.float64)
-    return posing.lit(posing.rest_factors(scene)[rows], scene.shading.vectors[rows], light, rotation)[:, None]
+    change = diffuse_shading.light_change(light, rotation).astype(np.float32)
+    rest = diffuse_shading.rest_factors(scene)[rows]
+    return diffuse_shading.factors(rest, scene.shading.vectors[rows], change)[:, None]

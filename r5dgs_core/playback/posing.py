@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..motion import quaternion_columns, rotations
+from ..scene import diffuse_shading
 from ..scene.row_runs import runs
 from ..scene.scene import Scene
 
@@ -24,7 +25,7 @@ class Poser:
         self._scene = scene
         self._runs = runs(scene.gaussians.motion_ids)
         self.pivots = np.array([group.pivot for group in scene.groups], np.float64).reshape(-1, 3)
-        self._rest = rest_factors(scene)
+        self._rest = diffuse_shading.rest_factors(scene)
         self._arms: np.ndarray | None = None
         self._still: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -92,11 +93,11 @@ class Poser:
         if self._scene.shading is None:
             return None
         vectors, light = self._scene.shading.vectors, self._scene.shading.light
-        result = np.maximum(self._rest, 0)
+        result = self._rest.clip(min=0)
         change = (rotations.rotate(rotations.conjugate(group_quats), light) - light).astype(np.float32)
         for start, stop, g in self._runs:
             if change[g].any():
-                result[start:stop] = np.maximum(self._rest[start:stop] + vectors[start:stop] @ change[g], 0)
+                result[start:stop] = diffuse_shading.factors(self._rest[start:stop], vectors[start:stop], change[g])
         return result
 
     def relight(self, factors: np.ndarray | None, rows: np.ndarray, turns: np.ndarray) -> None:
@@ -110,10 +111,8 @@ class Poser:
         if factors is None or self._scene.shading is None:
             return
         vectors, light = self._scene.shading.vectors, self._scene.shading.light
-        lit = self._rest[rows] + (
-            vectors[rows].T * quaternion_columns.direction_changes(turns, light.astype(turns.dtype))
-        ).sum(0)
-        factors[rows] = np.maximum(lit, 0)
+        change = quaternion_columns.direction_changes(turns, light.astype(turns.dtype))
+        factors[rows] = diffuse_shading.factors(self._rest[rows], vectors[rows], change.T)
 
     @property
     def arms(self) -> np.ndarray:
@@ -131,33 +130,6 @@ class Poser:
         if self._still is None or not np.array_equal(self._still[0], origin):
             self._still = origin.copy(), (self._scene.gaussians.means.astype(np.float64) - origin).astype(np.float32)
         return self._still[1]
-
-
-def rest_factors(scene: Scene) -> np.ndarray:
-    """Colour factor of each Gaussian in the bind state, before clamping at 0. [N] float32"""
-    rest = None if scene.shading is None else scene.shading.rest
-    return np.ones(len(scene.gaussians.means), np.float32) if rest is None else rest
-
-
-def lit(rest: np.ndarray, shading: np.ndarray, light: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Colour factors of Gaussians rotated since the bind state.
-
-    Args:
-        rest: Factors in the bind state, before clamping at 0. [n]
-        shading: Gradient of the factors with respect to the light direction. [n, 3]
-        light: Light direction. [3]
-        turns: One rotation for all, or one for each. [3, 3] or [n, 3, 3]
-
-    Returns:
-        The factors, >= 0. [n]
-    """
-    change = light_change(light, turns).astype(np.float32)
-    return np.maximum(rest + (shading @ change if change.ndim == 1 else (shading * change).sum(-1)), 0)
-
-
-def light_change(light: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Change of the light direction as seen from rotated Gaussians. [3] and [..., 3, 3] -> [..., 3]"""
-    return np.swapaxes(turns, -1, -2) @ light - light
 
 
 def move_points(points: np.ndarray, linear: np.ndarray, shift: np.ndarray, result: np.ndarray) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from ..motion import quaternion_columns, rotations
 from ..playback import affine_transform, posing, scene_player
 from ..playback.residuals import Residuals
+from ..scene import diffuse_shading
 from ..scene.instance import Instance
 from ..scene.scene import Scene
 
@@ -75,7 +76,7 @@ def join_scenes(scenes: Sequence[Scene]) -> JoinedScenes:
         sh=stacked([padded(scene.gaussians.sh) for scene in scenes], (bases, 3)),
         starts=(0, *(int(stop) for stop in np.cumsum([len(scene.gaussians.means) for scene in scenes]))),
         shading=stacked([vectors(scene) for scene in scenes], (3,)) if lit else None,
-        shading_rest=stacked([posing.rest_factors(scene) for scene in scenes], ()) if lit else None,
+        shading_rest=stacked([diffuse_shading.rest_factors(scene) for scene in scenes], ()) if lit else None,
         lights=tuple(
             None if scene.shading is None else np.asarray(scene.shading.light, np.float64) for scene in scenes
         ),
@@ -333,4 +334,5 @@ def _shading(given: JoinedScenes, rows: slice | np.ndarray, turns: np.ndarray, l
     """Shading factors of rotated rows under a light; one rotation [3, 3], or one per row [n, 3, 3]. [n] float32"""
     if given.shading is None or given.shading_rest is None or light is None:
         return np.ones(len(given.means[rows]), np.float32)
-    return posing.lit(given.shading_rest[rows], given.shading[rows], light, turns)
+    change = diffuse_shading.light_change(light, turns).astype(np.float32)
+    return diffuse_shading.factors(given.shading_rest[rows], given.shading[rows], change)
