@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core import errors
+from ...r5dgs_core.scene import sampling
 from ..export import frame_range
 from ..ui.stepwise_operator import Step
 from . import cameras, captured_objects, files, render
@@ -202,8 +203,7 @@ def _check_ids(highest: int) -> None:
 
 def _jobs(plan: TimePlan, views: cameras.Views, test_views: int) -> Iterator[tuple[str, float, cameras.NamedCamera]]:
     """Split, frame and view of every image, grouped by frame because changing the frame costs most."""
-    picks = np.linspace(0, len(views.observed) - 1, min(test_views, len(views.observed))).round().astype(int)
-    later_views = [views.observed[i] for i in picks] + list(views.novel)
+    later_views = sampling.spread(views.observed, test_views) + list(views.novel)
     for frame in plan.frames:
         if frame in plan.observed:
             yield from (("train", frame, view) for view in views.observed)

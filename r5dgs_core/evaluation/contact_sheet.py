@@ -13,6 +13,7 @@ from matplotlib.patches import Patch
 
 from ..data import dataset as datasets
 from ..data import images
+from ..scene import sampling
 from ..scene.scene import Scene
 from . import metrics, miou
 from .evaluate import Rendering, is_later, render, truth_background
@@ -163,9 +164,6 @@ def color_ids(scene: Scene, ids: np.ndarray) -> np.ndarray:
 
 
 def _spread(views: Sequence[datasets.View], count: int) -> list[datasets.View]:
-    """Return ``count`` views spread over the times of ``views``, including the last, and the first if count > 1."""
+    """Return at most ``count`` views spread over their times: the last, the first if count > 1, and others between."""
     ordered = sorted(views, key=lambda view: view.t)
-    if count <= 0:
-        return []
-    at = np.linspace(0, len(ordered) - 1, count) if count > 1 else np.array([len(ordered) - 1.0])
-    return [ordered[int(i)] for i in np.unique(np.rint(at).astype(int))]
+    return ordered[-1:] if count == 1 else sampling.spread(ordered, count)
