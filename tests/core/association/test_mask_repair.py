@@ -14,7 +14,7 @@ from r5dgs_core.cli import main
 from r5dgs_core.cli.commands import associate as cli_associate
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import mask_notes, masks, view_masks
-from r5dgs_core.scene import scene_file
+from r5dgs_core.scene import cameras, scene_file
 from tests.support import tiny_datasets
 
 pytestmark = pytest.mark.heavy
@@ -219,3 +219,18 @@ def test_masks_without_any_object_are_an_error(baked, tiny, tmp_path, value):
     rewrite(tiny.root, tmp_path / "masks", lambda view, ids: np.full_like(ids, value))
     with pytest.raises(errors.DatasetError, match="expected objects in the masks, found only background and unknown"):
         mask_repair.repair(baked, datasets.read(tiny.root, str(tmp_path / "masks")))
+
+
+def test_bags_are_as_precise_far_from_the_world_origin(tiny, baked):
+    views = datasets.read(tiny.root).train[:3]
+    given = [datasets.load_mask(view) for view in views]
+    shift = np.array([4096.0, -4096.0, 4096.0])
+    means = np.round(baked.gaussians.means * 1024) / 1024  # float32 also represents the shifted ones exactly
+    scenes = []
+    for offset in (np.zeros(3), shift):
+        groups = tuple(dataclasses.replace(g, pivot=np.asarray(g.pivot) + offset) for g in baked.groups)
+        scenes.append(dataclasses.replace(baked.with_arrays(means=(means + offset).astype(np.float32)), groups=groups))
+    moved = [dataclasses.replace(view, camera=cameras.moved(view.camera, shift)) for view in views]
+    near, far = (render_segments.draw(scene, v, given) for scene, v in zip(scenes, (views, moved), strict=True))
+    for here, there in zip(near, far, strict=True):
+        assert abs(here.weights - there.weights).sum() < 1e-4 * here.weights.sum()
