@@ -62,7 +62,7 @@ def steps(
             for camera in _cameras(scene, which, notes):
                 name = image_name(frame) if which == "ACTIVE" else f"images/{folders[camera]}/{frame:04d}.png"
                 own = in_axes(depsgraph, camera, axes, world)
-                found.append(CameraFrame(name, cameras.moved(own, origin) if axes == "FILE" else own, t))
+                found.append(CameraFrame(name, cameras.translated(own, origin) if axes == "FILE" else own, t))
     if not found:
         raise errors.ConfigError(f"{scene.name}: expected a camera, found none; add one to the scene")
     try:

@@ -139,7 +139,7 @@ def splats_of(
             parts.append(_placed(scene, one, matrix, turn, sources))
         else:
             points = from_points(evaluated_points.evaluated(one.object, depsgraph), one.object.r5dgs.object_id)
-            parts.append(affine_transform.carry(points, matrix, np.array(one.tint)))
+            parts.append(affine_transform.transform(points, matrix, np.array(one.tint)))
         if parts[-1].sh.shape[1] > 1 and not affine_transform.is_similarity(matrix[:3, :3]):
             sources.note(f"{names[-1]}: scaled non-uniformly; its view-dependent colors are a best fit")
     return affine_transform.join(parts), names

@@ -13,8 +13,8 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core import errors
-from ...r5dgs_core.motion import confidence, free_top, models, rotations
-from ...r5dgs_core.motion.history import NONE as NO_HISTORY
+from ...r5dgs_core.motion import confidence, models, rotations, torque_free_rotation
+from ...r5dgs_core.motion.history import EMPTY as NO_HISTORY
 from ...r5dgs_core.motion.history import Band, History
 from ...r5dgs_core.motion.models import MotionModel
 from ...r5dgs_core.scene import history_json, json_row
@@ -54,7 +54,7 @@ def remember(
             {
                 "model": group.own_model.to_dict(),
                 "stop_time": None if group.joint is None else group.joint.stop_time,
-                "history": history_json.tree(group.history),
+                "history": history_json.to_json(group.history),
                 "follow_matrix": None if group.follow_matrix is None else np.asarray(group.follow_matrix).tolist(),
                 "reach": float(reaches[motion_id]) if motion_id else 0.0,
                 "allowed": tolerance * extent,
@@ -216,7 +216,7 @@ def model(anchor: bpy.types.Object) -> MotionModel:
     if "kind" in changed:
         values.update(kind=state.kind, inertia=inertia(anchor) if models.KINDS[state.kind].needs_inertia else None)
     try:
-        return confidence.without(replace(base, **values), changed)
+        return confidence.with_exact_fields(replace(base, **values), changed)
     except ValueError as error:
         raise errors.ConfigError(f"{anchor.name}: {error}") from error
 
@@ -226,7 +226,7 @@ def inertia(anchor: bpy.types.Object) -> np.ndarray:
     points = _points(anchor)
     if len(points) == 0:
         return np.eye(3) / 3
-    body = free_top.inertia(points)
+    body = torque_free_rotation.inertia(points)
     return body + _MIN_MOMENT * float(np.linalg.eigvalsh(body)[-1]) * np.eye(3)
 
 

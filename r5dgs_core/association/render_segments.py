@@ -77,7 +77,7 @@ def relative_to_camera(
     Near the origin float32 is most precise, as in `scene_renderer.render`.
     """
     posed = posed_scene.pose_frame(player.scene, player.frame(t, camera.center))
-    return scene_renderer.PosedGaussians(posed), cameras.moved(camera, -posed.origin)
+    return scene_renderer.PosedGaussians(posed), cameras.translated(camera, -posed.origin)
 
 
 def paths(scene: Scene, times: np.ndarray) -> np.ndarray:

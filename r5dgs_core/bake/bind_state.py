@@ -40,7 +40,7 @@ def bind(observed: ObservedScene, context: Context) -> BoundScene:
         q, d = group.quats[-1], path[-1]
         means[members] = center + rotations.rotate(q, means[members] - center) + d
         quats[members] = rotations.multiply(q, quats[members])
-        turned = spherical_harmonics.turned(sh[members], q)
+        turned = spherical_harmonics.rotate(sh[members], q)
         sh[members], shading[members], rest[members] = shading_vectors.rebind(
             turned, shading[members], rest[members], q, observed.light
         )
@@ -97,7 +97,7 @@ def _move(
     if not np.any(q[1:] != 0):
         return
     arrays["quats"][rows] = rotations.normalize(rotations.multiply(q, arrays["quats"][rows].astype(np.float64)))
-    sh = spherical_harmonics.turned(arrays["sh"][rows].astype(np.float64), q)
+    sh = spherical_harmonics.rotate(arrays["sh"][rows].astype(np.float64), q)
     if scene.shading is not None:
         vectors, rest = (arrays[name][rows].astype(np.float64) for name in ("shading", "shading_rest"))
         sh, arrays["shading"][rows], arrays["shading_rest"][rows] = shading_vectors.rebind(

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from ..motion import free_top
+from ..motion import torque_free_rotation
 from ..motion.history import PoseErrors
 from ..motion_fit import model_selection, shared_gravity
 from ..motion_fit import noise as noises
@@ -49,7 +49,7 @@ def fit(
     """
     members = scene.gaussians.motion_ids == group
     opacities = to_opacities(scene.gaussians.opacity_logits[members])
-    body = free_top.inertia(scene.gaussians.means[members][visibility.seen(opacities)].astype(np.float64))
+    body = torque_free_rotation.inertia(scene.gaussians.means[members][visibility.seen(opacities)].astype(np.float64))
     radius, turns = scene.groups[group].model.radius, bool(np.any(poses[:, 1:4] != 0))
     weights, drift = observed.astype(np.float64), (0.0, 0.0)
     if errors is not None:

@@ -106,7 +106,7 @@ class Dataset:
         if not shift.any():
             return self
         splits = {
-            split: tuple(replace(view, camera=cameras.moved(view.camera, shift)) for view in self.views(split))
+            split: tuple(replace(view, camera=cameras.translated(view.camera, shift)) for view in self.views(split))
             for split in SPLITS
         }
         return replace(

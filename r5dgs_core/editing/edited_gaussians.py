@@ -42,7 +42,7 @@ def gather(scene: Scene, clusters: Sequence[Cluster]) -> tuple[np.ndarray, dict[
         bind = np.asarray(piece.matrices[last], np.float64)
         moved = _displacement(scene, rows, bind) > TOLERANCE * scene.extent
         untouched &= not moved
-        values = placed(scene, rows, bind if moved else None)
+        values = transformed_rows(scene, rows, bind if moved else None)
         if piece.tint is not None:
             values["sh"] = tints.tint_sh(values["sh"], piece.tint)
         for name, parts in columns.items():
@@ -78,7 +78,7 @@ def _displacement(scene: Scene, rows: slice, bind: np.ndarray) -> float:
     return float(moved + size * np.linalg.norm(linear))
 
 
-def placed(scene: Scene, rows: slice | np.ndarray, bind: np.ndarray | None) -> dict[str, np.ndarray]:
+def transformed_rows(scene: Scene, rows: slice | np.ndarray, bind: np.ndarray | None) -> dict[str, np.ndarray]:
     """Arrays of rows transformed by an affine map of the bind state.
 
     Args:
@@ -93,7 +93,7 @@ def placed(scene: Scene, rows: slice | np.ndarray, bind: np.ndarray | None) -> d
     rest = diffuse_shading.rest_factors(scene)[rows]
     splats = affine_transform.bind_state(scene, rows)
     if bind is not None:
-        splats = affine_transform.carry(splats, bind)
+        splats = affine_transform.transform(splats, bind)
         if scene.shading is not None:
             turn = affine_transform.nearest_rotation(bind[:3, :3])
             light = np.asarray(scene.shading.light, np.float64)
@@ -113,11 +113,11 @@ def _residuals(scene: Scene, rows: slice, shift: int, linear: np.ndarray | None)
     inside = (found.rows >= rows.start) & (found.rows < rows.stop)
     offsets, quats = found.offsets[inside], found.quats[inside]
     if linear is not None:
-        offsets, quats = turned_residuals(offsets, quats, linear)
+        offsets, quats = rotated_residuals(offsets, quats, linear)
     return found.rows[inside] + shift, offsets, quats, found.log_scales[inside]
 
 
-def turned_residuals(
+def rotated_residuals(
     offsets: np.ndarray,  # [n, S, 3]
     quats: np.ndarray,  # [n, S, 4]
     linear: np.ndarray,  # [3, 3]

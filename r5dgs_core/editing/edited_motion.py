@@ -114,7 +114,7 @@ def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[
     Returns:
         The clusters in the same order.
     """
-    quats, moves = group_dynamics.knots(scene)
+    quats, moves = group_dynamics.knot_poses(scene)
     known = np.concatenate([quats, moves], axis=-1)
     carried = {group.id: number for number, (group, _) in enumerate(group_dynamics.parts_of(scene), start=1)}
     courses = [_course(scene, cluster, known) for cluster in found]

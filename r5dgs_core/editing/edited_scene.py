@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..playback import group_dynamics
-from ..scene.lookup_table import Table
+from ..scene.lookup_table import LookupTable
 from ..scene.scene import MotionGroup, Scene, SceneObject
 from . import edited_gaussians, edited_motion, piece_clusters
 from .edited_motion import MovedCluster
@@ -131,7 +131,7 @@ def _groups(
 
 def _by_object(
     scene: Scene, objects: tuple[SceneObject, ...], kept: np.ndarray, object_ids: np.ndarray
-) -> tuple[dict[str, np.ndarray], Table | None]:
+) -> tuple[dict[str, np.ndarray], LookupTable | None]:
     """Rows of the classifier and the embeddings for the new objects; a new object inherits those of its source."""
     rows: dict[int, int] = {item.id: row for row, item in enumerate(scene.objects)}
     for item in objects:

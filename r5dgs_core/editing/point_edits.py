@@ -294,14 +294,14 @@ def _copy_numbers(rows: np.ndarray) -> np.ndarray:
 def _moved(part: Scene, chosen: np.ndarray, matrix: np.ndarray) -> Scene:
     """Transform some points by an affine map. chosen [k]"""
     old, arrays = part.arrays(), {}
-    for name, values in edited_gaussians.placed(part, chosen, matrix).items():
+    for name, values in edited_gaussians.transformed_rows(part, chosen, matrix).items():
         whole = old[name].copy() if name in old else np.ones(len(part.gaussians.means), np.float32)
         whole[chosen] = values
         arrays[name] = whole
     if part.residuals is not None:
         at = np.isin(part.residuals.rows, chosen)
         offsets, quats = part.residuals.offsets.copy(), part.residuals.quats.copy()
-        offsets[at], quats[at] = edited_gaussians.turned_residuals(offsets[at], quats[at], matrix[:3, :3])
+        offsets[at], quats[at] = edited_gaussians.rotated_residuals(offsets[at], quats[at], matrix[:3, :3])
         arrays |= {"residual_offsets": offsets, "residual_quats": quats}
     return part.with_arrays(**arrays)
 

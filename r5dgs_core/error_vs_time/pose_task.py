@@ -12,7 +12,7 @@ import numpy as np
 from .. import timing
 from ..data.dataset import GroundTruth
 from ..evaluation import ground_truth_poses, metrics
-from ..motion import free_top, models, rigid_fit, se3
+from ..motion import models, rigid_fit, se3, torque_free_rotation
 from ..motion_fit import candidates, model_selection, noise
 from ..playback import group_dynamics, modes, scene_player
 from ..scene.scene import MotionGroup, Scene
@@ -148,11 +148,13 @@ def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -
     """
     track = scene.tracks.poses[group.id]
     first, last = group.seen or (-np.inf, np.inf)
-    rows, weights = group_dynamics.voters(scene, np.flatnonzero(scene.gaussians.motion_ids == group.id))
+    rows, weights = group_dynamics.opaque_members(scene, np.flatnonzero(scene.gaussians.motion_ids == group.id))
     # Only a free top needs the inertia, so it is computed only if that model is a candidate.
     shape = None
     if names is None or names == (candidates.FREE_TOP.name,):
-        shape = free_top.inertia(scene.gaussians.means[rows] - group.pivot, weights) + _MIN_MOMENT * np.eye(3)
+        shape = torque_free_rotation.inertia(scene.gaussians.means[rows] - group.pivot, weights) + _MIN_MOMENT * np.eye(
+            3
+        )
     seen = (scene.tracks.times >= first - _SAME) & (scene.tracks.times <= last + _SAME)
     return model_selection.fit(
         scene.tracks.times,
@@ -192,7 +194,7 @@ def _member_motion(
     members = []
     for body in bodies:
         own = (scene.gaussians.object_ids == body.object_id) & (scene.gaussians.motion_ids == body.group.id)
-        members.append(group_dynamics.voters(scene, np.flatnonzero(own)))
+        members.append(group_dynamics.opaque_members(scene, np.flatnonzero(own)))
     result = np.empty((len(bodies), len(times), 4, 4))
     for k, t in enumerate(times):
         means = player.frame(float(t)).means.astype(np.float64)

@@ -56,7 +56,7 @@ def summary(scene: Scene, path: Path | None = None) -> str:
         f"extent     {scene.extent:.3g} world units",
         f"moving     {len(moving)} of {len(objects)} objects",
         *(f"  {terminal.printable(item.name)}: {motion}{_band(scene, outlooks[item.id])}" for item, motion in moving),
-        f"quality    {quality.of(scene, path).text()}",
+        f"quality    {quality.measure(scene, path).text()}",
         *_loss_of_baking(scene),
     ]
     return "\n".join(lines)

@@ -68,7 +68,7 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     views = []
     for number, t in enumerate(options.times):
         end = ".png" if options.frames is None else f"/{options.frames[number]:04d}.png"
-        views += [CameraFrame(f"images/{c.name}{end}", cameras.moved(c, scene.origin), t) for c in scene.cameras]
+        views += [CameraFrame(f"images/{c.name}{end}", cameras.translated(c, scene.origin), t) for c in scene.cameras]
     if not views:
         raise errors.ConfigError(f"{scene.name}: expected cameras in the scene, found none; train it from a data set")
     yield write_transforms(path, views)

@@ -132,7 +132,7 @@ def _among_cameras(scene: Scene, folder: Path) -> Scene:
     )
     return dataclasses.replace(
         scene.with_arrays(means=(scene.gaussians.means.astype(np.float64) - origin).astype(np.float32), origin=origin),
-        cameras=tuple(cameras.moved(camera, -origin) for camera in scene.cameras),
+        cameras=tuple(cameras.translated(camera, -origin) for camera in scene.cameras),
     )
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import errors
-from ..scene.lookup_table import EmbeddingSource, Table
+from ..scene.lookup_table import EmbeddingSource, LookupTable
 from ..scene.scene import Scene, SceneObject
 from ..search import english, object_search
 from . import best_views, calibration, common_nouns
@@ -178,7 +178,7 @@ def _assembled(
     thresholds = dict(zip(filled, whole.thresholds.tolist(), strict=True))
     of_views = dict(zip(places, single.thresholds.tolist(), strict=True))
     sources = dict(zip(filled, (own.sources for own in found.values()), strict=True))
-    table = Table(
+    table = LookupTable(
         encoder=encoder.card,
         canonical=encoder_base.CANONICAL,
         views=tuple(

@@ -10,7 +10,7 @@ import numpy as np
 _HALVINGS = 54  # bisection steps of the curve parameter, down to rounding
 
 
-def within(segment: np.ndarray) -> np.ndarray:
+def clamp_handles(segment: np.ndarray) -> np.ndarray:
     """Shorten handles that reach past the other key, as Blender does on evaluation. [4, 2] -> [4, 2]
 
     Handles may still overlap; time stays monotonic along the curve.
@@ -32,9 +32,9 @@ def line(start: np.ndarray, stop: np.ndarray) -> np.ndarray:
 def split(segment: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
     """Split a segment at a time without changing the curve (de Casteljau).
 
-    `within` would shorten a handle of a part that reaches past the part's other key. This can happen only if both
-    handles of the whole segment span more than two thirds of it, and only in the part that contains the parameter at
-    which time advances slowest. That part is therefore split once more at this parameter: on either side of it, the
+    `clamp_handles` would shorten a handle of a part that reaches past the part's other key. This can happen only if
+    both handles of the whole segment span more than two thirds of it, and only in the part that contains the parameter
+    at which time advances slowest. That part is therefore split once more at this parameter: on either side of it, the
     control times of the cubic lie between its ends.
 
     Args:
@@ -44,7 +44,7 @@ def split(segment: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         The segments before that time and those after it, one or two each, in order. [n, 4, 2]
     """
-    points = within(segment)
+    points = clamp_handles(segment)
     if not points[0, 0] < time < points[3, 0]:
         raise ValueError(f"time: expected between {points[0, 0]} and {points[3, 0]}, got {time}")
     low, high = 0.0, 1.0
@@ -55,9 +55,9 @@ def split(segment: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
     slowest = _slowest(points[:, 0])
     before, after = _halves(points, share)
     parts = (before[None], after[None])
-    if (within(before) != before).any() and 0 < slowest < share:
+    if (clamp_handles(before) != before).any() and 0 < slowest < share:
         parts = (np.stack(_halves(before, slowest / share)), parts[1])
-    if (within(after) != after).any() and share < slowest < 1:
+    if (clamp_handles(after) != after).any() and share < slowest < 1:
         parts = (parts[0], np.stack(_halves(after, (slowest - share) / (1 - share))))
     return parts
 
@@ -92,7 +92,7 @@ def evaluate(segments: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.nd
     Returns:
         Values [S] and slopes per unit of time [S].
     """
-    points = np.stack([within(segment) for segment in segments])
+    points = np.stack([clamp_handles(segment) for segment in segments])
     starts = points[:, 0, 0]
     chosen = points[np.clip(np.searchsorted(starts, times, side="right") - 1, 0, len(points) - 1)]  # [S, 4, 2]
     x, y = chosen[..., 0], chosen[..., 1]
@@ -102,7 +102,7 @@ def evaluate(segments: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.nd
         before = _cubic(x, middle) < times
         low, high = np.where(before, middle, low), np.where(before, high, middle)
     share = 0.5 * (low + high)
-    run, rise = _rate(x, share), _rate(y, share)
+    run, rise = _cubic_derivative(x, share), _cubic_derivative(y, share)
     return _cubic(y, share), np.divide(rise, run, out=np.zeros_like(rise), where=np.abs(run) > 1e-12)
 
 
@@ -113,7 +113,7 @@ def _cubic(points: np.ndarray, share: np.ndarray) -> np.ndarray:
     return (weights * points).sum(-1)
 
 
-def _rate(points: np.ndarray, share: np.ndarray) -> np.ndarray:
+def _cubic_derivative(points: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Derivative of `_cubic` with respect to the parameter. [S, 4], [S] -> [S]"""
     rest = 1 - share
     weights = np.stack([rest**2, 2 * share * rest, share**2], axis=-1)

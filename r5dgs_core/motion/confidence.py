@@ -30,7 +30,7 @@ def position_sigma(model: models.MotionModel, tau: np.ndarray) -> np.ndarray:
     if model.covariance is None or len(model.covariance_names) == 0:
         return np.zeros(len(tau))
     sigmas = np.sqrt(np.maximum(np.diag(model.covariance), 0.0))
-    known = [k for k in np.flatnonzero(sigmas > 0) if _has(model, model.covariance_names[k])]
+    known = [k for k in np.flatnonzero(sigmas > 0) if _affects_motion(model, model.covariance_names[k])]
     if not known:
         return np.zeros(len(tau))
     quats, displacements = models.evaluate(model, tau)
@@ -46,7 +46,7 @@ def position_sigma(model: models.MotionModel, tau: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-def without(model: models.MotionModel, names: set[str]) -> models.MotionModel:
+def with_exact_fields(model: models.MotionModel, names: set[str]) -> models.MotionModel:
     """Zero the covariance of some of the model's fields, so that they count as exact.
 
     Args:
@@ -59,7 +59,7 @@ def without(model: models.MotionModel, names: set[str]) -> models.MotionModel:
     return replace(model, covariance=model.covariance * keep[:, None] * keep[None, :])
 
 
-def _has(model: models.MotionModel, name: str) -> bool:
+def _affects_motion(model: models.MotionModel, name: str) -> bool:
     """Return False for a rate that does not affect the motion: "frequency" of a model that does not oscillate."""
     return name != "frequency" or model.frequency > 0
 

@@ -13,7 +13,7 @@ from .models import VECTORS
 EVENTS = ("start", "stop", "impact", "change")
 MAX_KNOTS = 16
 UNKNOWN_TURN = 1.0  # standard deviation of a rotation that the images do not determine, rad
-_DONE = {"start": "set off", "stop": "stopped", "impact": "hit", "change": "changed"}
+_EVENT_VERBS = {"start": "set off", "stop": "stopped", "impact": "hit", "change": "changed"}
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Event:
 
     def text(self) -> str:
         """Event in words, such as "hit at 0.55"."""
-        return f"{_DONE[self.kind]} at {self.time:.2f}"
+        return f"{_EVENT_VERBS[self.kind]} at {self.time:.2f}"
 
 
 @dataclass(frozen=True)
@@ -150,4 +150,4 @@ class History:
         return ", ".join([*words, *([warning] if warning else [])])
 
 
-NONE = History()
+EMPTY = History()

@@ -160,7 +160,7 @@ def _sampled(sample: Sampler, t0: float, t1: float, limits: _Limits) -> tuple[tu
         location, rotation = _Curve.pair(sample(grid), grid, limits)
         possible = np.arange(0, len(grid), _FINER)
         too_fast = frames is not None and rotation.turn(min(frames.duration, t1 - t0)) > MAX_FRAME_TURN_RAD
-        followed = location.holds_steps(possible), not too_fast and rotation.holds_steps(possible)
+        followed = location.steps_within_tolerance(possible), not too_fast and rotation.steps_within_tolerance(possible)
         settled = followed[0] and (followed[1] or too_fast)
         if settled or 2 * intervals > limit or t1 - t0 < 2 * intervals * nearest:
             return (location, rotation), followed
@@ -215,7 +215,7 @@ class _Curve:
         """Upper bound of the rotation angle within a duration, from the sampled rates; rad."""
         return 2.0 * duration * float(np.linalg.norm(self.slopes, axis=-1).max())
 
-    def holds_steps(self, possible: np.ndarray) -> bool:
+    def steps_within_tolerance(self, possible: np.ndarray) -> bool:
         """Return True if every single interval between candidate key times is within the tolerance."""
         inside = possible[:-1, None] + np.arange(1, _FINER)
         return self.constant or bool(self._segments_hold(possible[:-1], possible[1:], inside).all())

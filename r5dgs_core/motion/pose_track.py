@@ -38,11 +38,11 @@ class Window:
         """True if some frequency is neither too low nor too high."""
         return self.low < self.high
 
-    def frequency(self, pace: np.ndarray) -> np.ndarray:
+    def frequency(self, logit: np.ndarray) -> np.ndarray:
         """Map an unbounded parameter to an angular frequency between `low` and `high` by the logistic function."""
-        return self.low + (self.high - self.low) / (1 + np.exp(-np.clip(pace, -30, 30)))
+        return self.low + (self.high - self.low) / (1 + np.exp(-np.clip(logit, -30, 30)))
 
-    def pace(self, frequency: float) -> float:
+    def frequency_logit(self, frequency: float) -> float:
         """Inverse of `frequency`."""
         share = min(max((frequency - self.low) / (self.high - self.low), 1e-3), 1 - 1e-3)
         return math.log(share / (1 - share))
@@ -84,7 +84,7 @@ class PoseTrack:
         return rotations.quats_to_rotvecs(steps)
 
     @functools.cached_property
-    def turned(self) -> np.ndarray:
+    def accumulated_rotation(self) -> np.ndarray:
         """Sum of the rotations since the first pose: an unwrapped rotation vector if the axis is fixed. [S, 3]"""
         return np.concatenate([np.zeros((1, 3)), np.cumsum(self.turns, axis=0)])
 

@@ -20,7 +20,7 @@ from . import quaternion_columns, rotations, se3
 log = logging.getLogger(__name__)
 
 MAX_STEPS = 512  # steps per frame of thousands of points, to bound the time
-WILD = 1e12  # difficulty above which results may be inaccurate or not finite
+MAX_DIFFICULTY = 1e12  # difficulty above which results may be inaccurate or not finite
 CHUNK = 2048  # points per block, sized for the CPU cache
 _TINY = 1e-30
 
@@ -63,7 +63,7 @@ class Propagator:
             speed = (reach * turning[0] + _norms(v)) / limit
         commuting = (omitted <= 1e-15 * speed).all(0)
         omitted[:, commuting], turning[:, commuting], difficulty[commuting] = 0.0, 0.0, 0.0
-        wild = ~(difficulty < WILD)
+        wild = ~(difficulty < MAX_DIFFICULTY)
         kind = np.where(wild, 2, np.where(~commuting & (e == 0).all(0), 1, 0))
         order = np.lexsort((difficulty, kind))
         edges = np.searchsorted(kind[order], [0, 1, 2, 3])

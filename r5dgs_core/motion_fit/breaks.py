@@ -248,7 +248,7 @@ class _Sides:
         tau, places = self._track.tau[start:stop], self._track.displacements[start:stop]
         middle, mean = tau.mean(), places.mean(0)
         v = (tau - middle) @ (places - mean) / max(float(((tau - middle) ** 2).sum()), 1e-12)
-        turned = self._track.turned
+        turned = self._track.accumulated_rotation
         return mean - v * middle, v, (turned[stop - 1] - turned[start]) / max(float(tau[-1] - tau[0]), 1e-12)
 
     def guess(self, kind: Break, k: int) -> Parts:

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..motion import free_top, models, rotations
-from ..motion.history import NONE, History
+from ..motion import models, rotations, torque_free_rotation
+from ..motion.history import EMPTY, History
 from ..motion.pose_track import PoseTrack
 from . import band as bands
 from . import candidates as families
@@ -63,7 +63,7 @@ class Fit:
     rested: bool
     sigma_t: float
     sigma_r: float
-    history: History = NONE
+    history: History = EMPTY
     slips: tuple[float, ...] = ()
 
 
@@ -89,8 +89,8 @@ def fit(
         radius: Radius of the group, world units, > 0.
         weights: Confidence of each pose, >= 0; 0 excludes a pose. None for equal weights. [S]
         candidates: Names in `candidates.BY_NAME`, without breaks; None for `candidates.FAMILY` and all breaks.
-        inertia: Inertia of the group in the bind state, up to a factor (`free_top.inertia`), or None. If given and
-            not nearly that of a ball, the free top is a candidate. [3, 3]
+        inertia: Inertia of the group in the bind state, up to a factor (`torque_free_rotation.inertia`), or None. If
+            given and not nearly that of a ball, the free top is a candidate. [3, 3]
         least_noise: Lower bounds of the noise of displacements (per component, world units) and rotations (rad), for
             noise that the scatter about a smooth motion does not show.
         drift: Standard deviations of displacements and rotations due to a slow drift; they widen the band alone.
@@ -117,7 +117,7 @@ def fit(
         displacements[used] / radius,
         weights[used] / weights[used].mean(),
     )
-    if candidates is None and inertia is not None and free_top.tumbles(np.asarray(inertia, np.float64)):
+    if candidates is None and inertia is not None and torque_free_rotation.tumbles(np.asarray(inertia, np.float64)):
         family = (*family, replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64)))
     family = tuple(replace(candidate, window=track.window) for candidate in family)
     least = Noise(max(least_noise[0] / radius, noise.FLOOR), max(least_noise[1], noise.FLOOR))

@@ -21,7 +21,7 @@ def estimate(track: PoseTrack) -> Noise:
     It is too large for motions that are fast between poses and too small for noise that is correlated in time.
     """
     levels = []
-    for path in (track.displacements, track.turned):
+    for path in (track.displacements, track.accumulated_rotation):
         found = []
         for i in range(len(track) - 3):
             x = track.tau[i : i + 4] - track.tau[i]

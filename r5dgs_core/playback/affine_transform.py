@@ -48,7 +48,7 @@ def bend_of(residuals: Residuals, t: float, start: int, count: int) -> Bend | No
     return Bend(residuals.rows[part], offsets, turns, growths)
 
 
-def carry(splats: Splats, matrix: np.ndarray, factor: np.ndarray | None = None) -> Splats:
+def transform(splats: Splats, matrix: np.ndarray, factor: np.ndarray | None = None) -> Splats:
     """Transform Gaussians by an affine map.
 
     Rotation, translation, mirroring and uniform scale are exact. Under any other map the ellipsoids are still exact,
@@ -69,7 +69,7 @@ def carry(splats: Splats, matrix: np.ndarray, factor: np.ndarray | None = None) 
     means, quats, log_scales = (np.empty((len(splats.means), width), np.float32) for width in (3, 4, 3))
     posing.move_points(splats.means, linear, offset, means)
     map_shapes(linear, splats.quats, splats.log_scales, quats, log_scales)
-    sh = spherical_harmonics.carried(splats.sh, linear)
+    sh = spherical_harmonics.transform(splats.sh, linear)
     if factor is not None:
         sh = tints.tint_sh(sh, factor)
     return Splats(means, quats, log_scales, splats.opacity_logits, sh, splats.identities, splats.object_ids)
@@ -111,7 +111,7 @@ def place(
         _relight(scene, start, factor, turn, bend)
     if tint is not None:
         factor = np.asarray(tint, np.float64) if factor is None else factor * np.asarray(tint, np.float64)
-    return carry(splats, matrix, factor)
+    return transform(splats, matrix, factor)
 
 
 def bind_state(scene: Scene, rows: slice | np.ndarray) -> Splats:
@@ -138,7 +138,7 @@ def _bent(scene: Scene, start: int, splats: Splats, bend: Bend) -> Splats:
     sh = splats.sh
     if scene.harmonics_turn and sh.shape[1] > 1:
         sh = sh.copy()
-        sh[at] = spherical_harmonics.turned(sh[at], bend.turns)
+        sh[at] = spherical_harmonics.rotate(sh[at], bend.turns)
     return replace(splats, means=means, quats=quats, log_scales=log_scales, sh=sh)
 
 
@@ -187,7 +187,7 @@ def affine(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def is_similarity(linear: np.ndarray) -> bool:
     """Return True if a linear map is a rotation or mirror with uniform scale. [3, 3]"""
-    return _even(np.linalg.svd(linear, compute_uv=False))
+    return _is_uniform(np.linalg.svd(linear, compute_uv=False))
 
 
 def nearest_rotation(linear: np.ndarray) -> np.ndarray:
@@ -199,7 +199,7 @@ def nearest_rotation(linear: np.ndarray) -> np.ndarray:
     return rotations.nearest_rotmats(np.concatenate([linear[..., :1] * mirror[..., None, None], linear[..., 1:]], -1))
 
 
-def _even(singular: np.ndarray) -> bool:
+def _is_uniform(singular: np.ndarray) -> bool:
     return bool(singular[0] - singular[-1] <= SIMILARITY_TOLERANCE * singular[0])
 
 
@@ -212,7 +212,7 @@ def map_shapes(
 ) -> None:
     """Write the shapes of ellipsoids under any linear map, exactly, to the last two arguments, which are float32."""
     u, singular, vt = np.linalg.svd(linear)
-    if _even(singular) and np.linalg.det(linear) > 0:
+    if _is_uniform(singular) and np.linalg.det(linear) > 0:
         posing.turn_quats(quats, rotations.rotmats_to_quats(u @ vt), new_quats)
         np.add(log_scales, np.float32(np.log(singular.mean())), out=new_log_scales)
         return

@@ -75,7 +75,7 @@ class GroupMotion:
     def __init__(self, scene: Scene, source: str = "fitted"):
         self._times, self._t_max = scene.tracks.times, scene.t_max
         self._scene, self._source = scene, source
-        self._quats, self._displacements = knots(scene)
+        self._quats, self._displacements = knot_poses(scene)
         self._parts = parts_of(scene)
         if self._parts:
             self._displacements = self._displacements.copy()
@@ -111,7 +111,7 @@ class GroupMotion:
         if self._source == "fitted":
             for part, joint in self._parts:
                 quats[part.id], displacements[part.id] = joint.poses(t - self._t_max)
-            self._carry(quats, displacements)
+            self._compose_parts(quats, displacements)
         for g, leader, matrix in self._followers:
             displacements[g] = matrix @ displacements[leader]
         return quats, displacements.clip(-FARTHEST, FARTHEST)
@@ -120,7 +120,7 @@ class GroupMotion:
         times = self._times
         if t <= times[0]:
             quats, displacements = rotations.normalize(self._quats[:, 0]), self._displacements[:, 0].copy()
-            self._carry(quats, displacements)
+            self._compose_parts(quats, displacements)
             return quats, displacements
         k, h, u = cubic_curves.locate(times, t)
         q, d = (
@@ -128,10 +128,10 @@ class GroupMotion:
             for values, slopes in zip((self._quats, self._displacements), self._slopes, strict=True)
         )
         q = rotations.normalize(q)
-        self._carry(q, d)
+        self._compose_parts(q, d)
         return q, d
 
-    def _carry(self, quats: np.ndarray, displacements: np.ndarray) -> None:
+    def _compose_parts(self, quats: np.ndarray, displacements: np.ndarray) -> None:
         """Replace the motion of parts relative to their parents by that in the world, in place. [G, 4], [G, 3]"""
         for part, joint in self._parts:
             assert part.parent is not None
@@ -156,13 +156,13 @@ def parts_of(scene: Scene) -> list[tuple[MotionGroup, Joint]]:
 
 
 def local_knots(scene: Scene, group: MotionGroup) -> se3.Pose:
-    """Poses of a group, as from `knots`; for a part, its poses relative to its parent, about the joint's point.
+    """Poses of a group, as from `knot_poses`; for a part, its poses relative to its parent, about the joint's point.
 
     [S, 4], [S, 3]
     """
 
     def world(row: int) -> se3.Pose:
-        quats, displacements = knots(scene, slice(row, row + 1))
+        quats, displacements = knot_poses(scene, slice(row, row + 1))
         return quats[0], displacements[0]
 
     if group.parent is None or group.joint is None:
@@ -172,7 +172,7 @@ def local_knots(scene: Scene, group: MotionGroup) -> se3.Pose:
     return rotations.make_continuous(quats[::-1])[::-1], moves
 
 
-def knots(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+def knot_poses(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
     """Poses at the observed times, with sign-continuous quaternions that end at (1, 0, 0, 0).
 
     Args:
@@ -189,7 +189,7 @@ def knots(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.nda
     return np.moveaxis(quats, 0, 1), poses[..., 4:]
 
 
-def voters(scene: Scene, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def opaque_members(scene: Scene, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows that are opaque enough to represent a group, or all if none is, and their opacities. [n] each"""
     with np.errstate(over="ignore"):
         opacities = to_opacities(scene.gaussians.opacity_logits[rows])
@@ -199,7 +199,7 @@ def voters(scene: Scene, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def representative(scene: Scene, rows: np.ndarray) -> int:
     """Row of the opaque Gaussian nearest to the centroid of the given ones, at least one."""
-    rows, _ = voters(scene, rows)
+    rows, _ = opaque_members(scene, rows)
     points = scene.gaussians.means[rows].astype(np.float64)
     return int(rows[np.argmin(((points - points.mean(0)) ** 2).sum(-1))])
 
@@ -209,7 +209,7 @@ def _model_of(scene: Scene, group: MotionGroup, source: str) -> MotionModel:
     rows = np.flatnonzero(scene.gaussians.motion_ids == group.id)
     if group.role == "pinned" or group.follows is not None or len(rows) == 0:
         return STATIC
-    rows, weights = voters(scene, rows)
+    rows, weights = opaque_members(scene, rows)
     if source == "representative":
         rows, weights = (np.array([group.anchor_index]), np.ones(1)) if group.anchor_index >= 0 else (rows, weights)
     arms = scene.gaussians.means[rows].astype(np.float64) - group.pivot
@@ -224,7 +224,7 @@ def _model_of(scene: Scene, group: MotionGroup, source: str) -> MotionModel:
     if source in ("least_squares", "kabsch"):
         twist = _least_squares(arms, states, weights, twist, span)
     if source == "kabsch":
-        twist = _kabsch(arms, states, weights, twist, span, radius)
+        twist = _twist_of_registrations(arms, states, weights, twist, span, radius)
     return _world_twist(twist, radius)
 
 
@@ -251,13 +251,13 @@ def _least_squares(
     Source: velocity v + w x r, acceleration a + e x r + w x (v + w x r).
     """
     v_i, w_i, a_i, _ = np.split(states, 4, axis=-1)
-    v, w = _screw(arms, v_i, weights, guess[6:9], rigid_fit.UNDETERMINED_RAD / span)
+    v, w = _fit_velocity_field(arms, v_i, weights, guess[6:9], rigid_fit.UNDETERMINED_RAD / span)
     bent = a_i + rotations.cross(w_i, v_i) - rotations.cross(w, v + rotations.cross(w, arms))
-    a, e = _screw(arms, bent, weights, guess[9:], 2 * rigid_fit.UNDETERMINED_RAD / span**2)
+    a, e = _fit_velocity_field(arms, bent, weights, guess[9:], 2 * rigid_fit.UNDETERMINED_RAD / span**2)
     return np.concatenate([v, a, w, e])
 
 
-def _screw(
+def _fit_velocity_field(
     arms: np.ndarray, speeds: np.ndarray, weights: np.ndarray, guess: np.ndarray, doubt: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Robust fit of a field v + w x r to vectors at points r; returns v and w.
@@ -291,7 +291,7 @@ def _screw(
     return mean - rotations.cross(w, center), w
 
 
-def _kabsch(
+def _twist_of_registrations(
     arms: np.ndarray, states: np.ndarray, weights: np.ndarray, guess: np.ndarray, span: float, radius: float
 ) -> np.ndarray:
     """Twist nearest to the rigid registrations of the members at several times up to ``span``."""

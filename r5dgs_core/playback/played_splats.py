@@ -30,7 +30,7 @@ def at(player: Player, t: float, object_ids: Collection[int] | None = None) -> S
         turns = frame.group_quats[frame.motion_ids]
         if frame.turned_rows is not None and frame.turned_quats is not None:
             turns[frame.turned_rows] = frame.turned_quats
-        sh = spherical_harmonics.turned(sh, turns[rows])
+        sh = spherical_harmonics.rotate(sh, turns[rows])
     if frame.shading_factor is not None:
         sh = tints.tint_sh(sh, frame.shading_factor[rows, None])
     return Splats(

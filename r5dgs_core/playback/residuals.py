@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..motion import cubic_curves, point_dynamics, quaternion_columns, rk2_cache, rotations, twist_propagation
+from ..motion import cubic_curves, midpoint_path, point_dynamics, quaternion_columns, rotations, twist_propagation
 from ..scene.row_runs import runs
 from ..scene.scene import Scene
 from . import group_dynamics
@@ -126,8 +126,8 @@ class OwnMotion:
         return moves, quaternion_columns.multiply(turns, self._quats), turns
 
 
-class Literal:
-    """Literal form of Eq. 6 and 7 of the paper.
+class LiteralPaperMotion:
+    """LiteralPaperMotion form of Eq. 6 and 7 of the paper.
 
     x_i = y_i + (p_r - y_r) + (R - I) (x_i - x_r) with y the state at t_max, x the canonical one and r the group's
     representative, which moves by its own dynamics and TRACE's integrator. This is not rigid if the object rotated
@@ -149,7 +149,7 @@ class Literal:
         self._anchors = anchors[self._moving]
         v, w, a, e = np.split(scene.dynamics.rates[self._anchors].astype(np.float64), 4, axis=-1)
         step = point_dynamics.TRACE_STEP * point_dynamics.time_unit(float(scene.tracks.times[0]), scene.t_max)
-        self._path = rk2_cache.SteppedPath(np.zeros_like(v), v, w, a, e, step)
+        self._path = midpoint_path.MidpointPath(np.zeros_like(v), v, w, a, e, step)
         canonical = scene.dynamics.canonical_means.astype(np.float64)
         self._offsets = np.ones((len(canonical), 4))
         self._offsets[:, :3] = canonical - canonical[np.maximum(anchors, 0)[scene.gaussians.motion_ids]]

@@ -27,7 +27,7 @@ from ..motion import quaternion_columns, rotations
 from ..scene.scene import Scene
 from . import group_dynamics, posing
 from .modes import every, split
-from .residuals import Literal, OwnMotion, Residuals, unexplained
+from .residuals import LiteralPaperMotion, OwnMotion, Residuals, unexplained
 
 
 @dataclass(frozen=True)
@@ -117,8 +117,8 @@ class Player:
         return OwnMotion(self.scene, np.asarray(rows)) if len(rows) else None
 
     @functools.cached_property
-    def _literal(self) -> Literal:
-        return Literal(self.scene, self._variant == "anchored")
+    def _literal(self) -> LiteralPaperMotion:
+        return LiteralPaperMotion(self.scene, self._variant == "anchored")
 
     def group_poses(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Pose of every motion group in this mode, relative to the bind state.
@@ -153,9 +153,9 @@ class Player:
             means = poser.means(quats, displacements, center)
         moved = _Moved(means, poser.quats(quats), scene.gaussians.log_scales, poser.shading(quats))
         if not past:
-            self._bend(moved, t, quats, displacements, center)
+            self._apply_residuals(moved, t, quats, displacements, center)
         elif self._own is not None:
-            self._part(moved, t - scene.t_max, center)
+            self._apply_own_motion(moved, t - scene.t_max, center)
         return self._frame(t, moved, quats, displacements, center)
 
     def frame_at_poses(
@@ -200,7 +200,9 @@ class Player:
             turned_quats=moved.turns if self.scene.harmonics_turn else None,
         )
 
-    def _bend(self, moved: _Moved, t: float, quats: np.ndarray, displacements: np.ndarray, origin: np.ndarray) -> None:
+    def _apply_residuals(
+        self, moved: _Moved, t: float, quats: np.ndarray, displacements: np.ndarray, origin: np.ndarray
+    ) -> None:
         """Apply residuals of the observed time in the bind state, before the group motion."""
         found = self._residuals.at(t)
         if found is None:
@@ -219,7 +221,7 @@ class Player:
         moved.log_scales[rows] += growths.T
         self._poser.relight(moved.shading, rows, since)
 
-    def _part(self, moved: _Moved, tau: float, origin: np.ndarray) -> None:
+    def _apply_own_motion(self, moved: _Moved, tau: float, origin: np.ndarray) -> None:
         """Move Gaussians by their own dynamics past t_max."""
         assert self._own is not None
         means, quats, turns = self._own.at(tau, origin)

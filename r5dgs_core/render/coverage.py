@@ -43,7 +43,7 @@ def shares(
     size = (ranks, camera.height * camera.width)
     best, found = np.zeros(size, np.float32), np.full(size, -1, np.int32)
     groups = np.asarray(groups, np.int64)
-    gaussians, seen = scene_renderer.PosedGaussians(posed), cameras.moved(camera, -posed.origin)
+    gaussians, seen = scene_renderer.PosedGaussians(posed), cameras.translated(camera, -posed.origin)
     present = np.unique(groups[groups >= 0])
     for first in range(0, len(present), CHANNELS):
         chosen = present[first : first + CHANNELS]

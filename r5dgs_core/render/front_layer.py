@@ -50,7 +50,7 @@ def render(
     if not len(posed.means) or not np.isfinite(meshes).any():
         return layer
     colors = np.ascontiguousarray(scene_renderer.colors(posed, camera), np.float32)
-    gaussians, seen = scene_renderer.PosedGaussians(posed), cameras.moved(camera, -posed.origin)
+    gaussians, seen = scene_renderer.PosedGaussians(posed), cameras.translated(camera, -posed.origin)
     if without is not None:
         gaussians.opacities = np.where(without, np.float32(0), gaussians.opacities)
     rows = projection.padded_rows(len(gaussians.means))

@@ -52,7 +52,7 @@ def render_frame(
         background = behind(scene, camera)
     return rasterize(
         PosedGaussians(posed),
-        cameras.moved(camera, -posed.origin),
+        cameras.translated(camera, -posed.origin),
         None if features is None else np.asarray(features, np.float32),
         None if background is None else np.asarray(background, np.float32),
         colors=colors(posed, camera),

@@ -47,7 +47,7 @@ _BROKEN = (
 )
 
 
-def most_content(size: int) -> int:
+def max_content_bytes(size: int) -> int:
     """Largest allowed content, in bytes, of a file of a given size."""
     return ALLOWANCE + RATIO * size
 
@@ -140,7 +140,7 @@ class Archive:
             raise SceneFileError(f"{self.place}: expected each member once, found {twice[:60]!r} twice")
         if sum(info.compress_size for info in found) > size:
             raise SceneFileError(f"{self.place}: expected members that do not overlap, found overlapping ones")
-        declared, most = sum(info.file_size for info in found), most_content(size)
+        declared, most = sum(info.file_size for info in found), max_content_bytes(size)
         if declared > most:
             raise SceneFileError(
                 f"{self.place}: expected at most {most >> 20} MiB of content in a file of {size / 2**20:.1f} MiB, "

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NoReturn
 
 from .. import errors, findings
-from .lookup_table import Table
+from .lookup_table import LookupTable
 from .scene import EMBEDDINGS, IDENTITY_DIM, MotionGroup, SceneObject
 
 SH_BASES = (1, 4, 9, 16)
@@ -20,7 +20,7 @@ def check(
     objects: Sequence[SceneObject],
     groups: Sequence[MotionGroup],
     vocabulary: Sequence[str],
-    table: Table | None,
+    table: LookupTable | None,
     place: str,
     guard: findings.Guard = findings.STRICT,
 ) -> set[str]:
@@ -36,7 +36,7 @@ def check(
         Names of the arrays whose shapes fit.
     """
     count = _gaussians(shapes)
-    knots, strays = (_length(shapes, name, rank=1) for name in ("track_times", "residual_rows"))
+    knots, residual_rows = (_length(shapes, name, rank=1) for name in ("track_times", "residual_rows"))
     classes = _number(guard, lambda: sum(item.id >= 0 for item in objects))
     bases = _bases(shapes, count, place, guard)
     expected: dict[str, _Shape] = {
@@ -54,9 +54,9 @@ def check(
         "classifier_weight": (classes, IDENTITY_DIM),
         "classifier_bias": (classes,),
         "residual_rows": (_length(shapes, "residual_rows"),),
-        "residual_offsets": (strays, knots, 3),
-        "residual_quats": (strays, knots, 4),
-        "residual_log_scales": (strays, knots, 3),
+        "residual_offsets": (residual_rows, knots, 3),
+        "residual_quats": (residual_rows, knots, 4),
+        "residual_log_scales": (residual_rows, knots, 3),
         "dynamics": (count, 12),
         "canonical_means": (count, 3),
         "shading": (count, 3),
@@ -90,7 +90,7 @@ def check_embeddings(
     shapes: Mapping[str, tuple[int, ...]],
     objects: int | None,
     words: int | None,
-    table: Table | None,
+    table: LookupTable | None,
     place: str,
     guard: findings.Guard = findings.STRICT,
 ) -> set[str]:

@@ -159,7 +159,7 @@ def is_parallel(projection: np.ndarray) -> bool:
     return bool(abs(projection[3, 3]) > 0.5)
 
 
-def moved(camera: Camera, shift: np.ndarray) -> Camera:
+def translated(camera: Camera, shift: np.ndarray) -> Camera:
     """Camera translated by a world vector; the same object if the vector is zero. [3]"""
     if not np.any(shift):
         return camera

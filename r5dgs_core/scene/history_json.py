@@ -15,7 +15,7 @@ from .json_row import Row
 _RATES = ("velocity", "acceleration", "angular_velocity")
 
 
-def tree(history: History) -> dict[str, Any]:
+def to_json(history: History) -> dict[str, Any]:
     """Entries of a motion group; only those that are not empty."""
     found: dict[str, Any] = {}
     if history.events:

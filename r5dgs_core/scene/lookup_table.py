@@ -55,7 +55,7 @@ class EmbeddingSource:
 
 
 @dataclass(frozen=True)
-class Table:
+class LookupTable:
     """Metadata of a scene's embeddings.
 
     Attributes:
@@ -75,7 +75,7 @@ class Table:
     margin: float
     pooling: str
 
-    def select(self, rows: Sequence[int]) -> Table:
+    def select(self, rows: Sequence[int]) -> LookupTable:
         """Table restricted to the given rows, in their order."""
         return replace(
             self,

@@ -43,7 +43,7 @@ class Quality:
         return "error not measured; run 'r5dgs evaluate'"
 
 
-def of(scene: Scene, path: Path | None = None) -> Quality:
+def measure(scene: Scene, path: Path | None = None) -> Quality:
     """Collect the known errors of a scene.
 
     Args:

@@ -20,7 +20,7 @@ from ..motion.joint import Joint
 from ..motion.models import MotionModel
 from .cameras import Camera
 from .hull import Hull
-from .lookup_table import Table
+from .lookup_table import LookupTable
 
 ROLES = ("pinned", "body", "shadow")
 IDENTITY_DIM = 16  # size of an identity encoding (Gaussian Grouping)
@@ -109,7 +109,7 @@ class MotionGroup:
     rigid_rms: float = 0.0
     rigid_max: float = 0.0
     seen: tuple[float, float] | None = None
-    history: history.History = history.NONE
+    history: history.History = history.EMPTY
     parent: int | None = None
     joint: Joint | None = None
 
@@ -294,7 +294,7 @@ class Scene:
     embeddings: np.ndarray | None = None
     vocabulary: tuple[str, ...] = ()
     vocabulary_embeddings: np.ndarray | None = None
-    lookup: Table | None = None
+    lookup: LookupTable | None = None
     canonical_embeddings: np.ndarray | None = None
     view_embeddings: np.ndarray | None = None
     provenance: dict[str, Any] = field(default_factory=dict)

@@ -18,7 +18,7 @@ import numpy as np
 
 from .. import atomic_files, errors, findings, strict_json
 from . import array_shapes, format_features, scene_json, validation
-from .archive import Archive, Header, most_content
+from .archive import Archive, Header, max_content_bytes
 from .scene import DTYPES, EMBEDDINGS, Scene, grouped
 from .stored_embeddings import StoredEmbeddings
 
@@ -156,7 +156,7 @@ def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int
             _add(archive, f"{name}.npy", buffer.getvalue(), compression)
         content = sum(info.file_size for info in archive.infolist())
         packed = archive.getinfo(JSON_MEMBER).compress_size
-    return content <= most_content(stream.tell()) and strict_json.memory_of(text) <= most_content(packed)
+    return content <= max_content_bytes(stream.tell()) and strict_json.memory_of(text) <= max_content_bytes(packed)
 
 
 def _add(archive: zipfile.ZipFile, name: str, data: bytes, compression: int) -> None:
@@ -272,7 +272,7 @@ def _parse_json(archive: Archive, where: str) -> Any:
         raise errors.SceneFileError(
             f"{where}: expected at most {strict_json.MAX_BYTES >> 20} MiB, found {archive.size(JSON_MEMBER) >> 20} MiB"
         )
-    memory = min(strict_json.MAX_MEMORY, most_content(archive.compressed_size(JSON_MEMBER)))
+    memory = min(strict_json.MAX_MEMORY, max_content_bytes(archive.compressed_size(JSON_MEMBER)))
     remedy = "bake or copy the file again"
     return strict_json.parse(archive.read(JSON_MEMBER), where, errors.SceneFileError, remedy, memory=memory)
 

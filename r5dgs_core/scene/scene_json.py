@@ -14,7 +14,7 @@ from ..motion.models import MotionModel
 from . import history_json, joint_json
 from .cameras import Camera
 from .json_row import Row
-from .lookup_table import POOLINGS, EmbeddingSource, EncoderCard, Table
+from .lookup_table import POOLINGS, EmbeddingSource, EncoderCard, LookupTable
 from .scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 
 
@@ -68,7 +68,7 @@ def fields(top: Row) -> dict[str, Any]:
     }
 
 
-def table(top: Row) -> Table | None:
+def table(top: Row) -> LookupTable | None:
     """Metadata of the embeddings; None in files without it. Raises as `fields` does."""
     if top.lacks("lookup"):
         return None
@@ -76,7 +76,7 @@ def table(top: Row) -> Table | None:
     if found.data is findings.UNREAD:
         return findings.UNREAD
     encoder = Row(found.get("encoder", dict), found.place, found.guard)
-    return Table(
+    return LookupTable(
         encoder=EncoderCard(
             kind=encoder.get("kind", str),
             name=encoder.get("name", str),
@@ -193,7 +193,7 @@ def _group_tree(group: MotionGroup) -> dict[str, Any]:
         "rigid_rms": float(group.rigid_rms),
         "rigid_max": float(group.rigid_max),
         "seen": None if group.seen is None else [float(t) for t in group.seen],
-        **history_json.tree(group.history),
+        **history_json.to_json(group.history),
         **({} if group.joint is None else {"parent": group.parent, "joint": joint_json.tree(group.joint)}),
     }
 
@@ -208,7 +208,7 @@ def _camera_tree(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _table_tree(found: Table) -> dict[str, Any]:
+def _table_tree(found: LookupTable) -> dict[str, Any]:
     """JSON form of an embedding table; inverse of `table`."""
     card = found.encoder
     return {

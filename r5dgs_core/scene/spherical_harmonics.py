@@ -134,7 +134,7 @@ def change_of_basis(linear: np.ndarray, degree: int) -> np.ndarray:
     return np.linalg.pinv(basis(_DIRECTIONS, degree)) @ basis(back, degree)
 
 
-def carried(sh: np.ndarray, linear: np.ndarray) -> np.ndarray:
+def transform(sh: np.ndarray, linear: np.ndarray) -> np.ndarray:
     """Coefficients of Gaussians transformed by a linear map, see `change_of_basis`.
 
     Args:
@@ -154,7 +154,7 @@ def carried(sh: np.ndarray, linear: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(turned, 0, 1), sh.dtype)
 
 
-def turned(sh: np.ndarray, quats: np.ndarray) -> np.ndarray:
+def rotate(sh: np.ndarray, quats: np.ndarray) -> np.ndarray:
     """Rotate coefficients with their body: the result seen along d is ``sh`` seen along R^T d.
 
     Exact, because rotations do not mix bands. The change of basis is solved from more directions than there are

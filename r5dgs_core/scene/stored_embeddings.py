@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .lookup_table import Table
+from .lookup_table import LookupTable
 from .scene import Scene
 
 
@@ -31,7 +31,7 @@ class StoredEmbeddings:
     embeddings: np.ndarray
     vocabulary: tuple[str, ...]
     vocabulary_embeddings: np.ndarray
-    table: Table | None = None
+    table: LookupTable | None = None
     canonical_embeddings: np.ndarray | None = None
     view_embeddings: np.ndarray | None = None
 

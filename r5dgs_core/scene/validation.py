@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import errors, findings
 from . import array_shapes, cameras, hull_json, model_checks, part_checks
-from .lookup_table import Table
+from .lookup_table import LookupTable
 from .row_runs import runs
 from .scene import DTYPES, EMBEDDINGS, GROUPS, ROLES, MotionGroup, Scene
 
@@ -130,7 +130,7 @@ def _check_ids(scene: Scene, place: str, guard: findings.Guard) -> None:
 
 def check_embeddings(
     arrays: Mapping[str, np.ndarray | None],
-    table: Table | None,
+    table: LookupTable | None,
     place: str,
     guard: findings.Guard = findings.STRICT,
 ) -> None:

@@ -112,7 +112,7 @@ class Server:
             known, self._scenes, self._numbers, self._stage, self._players = self._scenes, {}, [], None, {}
             known = {stamp: scene for stamp, scene in known.items() if stamp in stamps}  # free memory before reading
             found = {stamp: known.get(stamp) or self._read(stamp) for stamp in stamps}
-            self._errors = [quality.of(scene, Path(stamp[0])) for stamp, scene in found.items()]
+            self._errors = [quality.measure(scene, Path(stamp[0])) for stamp, scene in found.items()]
             self._scenes = found
         self._numbers = [stamps.index(stamp) for stamp in named]
         scenes = [list(self._scenes.values())[number] for number in self._numbers]

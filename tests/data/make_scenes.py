@@ -15,7 +15,7 @@ import numpy as np
 
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.scene import scene_file
-from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, Table
+from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, LookupTable
 from r5dgs_core.scene.scene import Scene
 from tests.support.scenes import T_MAX, TIMES, make_scene
 
@@ -74,7 +74,7 @@ def words() -> Scene:
             view_embeddings=unit[:rows].astype(np.float32),
         ),
         vocabulary=("mug", "tasse à café"),
-        lookup=Table(
+        lookup=LookupTable(
             EncoderCard("clip", "tiny", "ab" * 32, 8, ("{}", "a photo of a {}"), 10.0),
             ("object",),
             views,

@@ -27,7 +27,7 @@ from r5dgs_core.playback import scene_info, scene_player
 from r5dgs_core.raster import rasterize
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import cameras, quality, scene_file, stored_embeddings
-from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, Table
+from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, LookupTable
 from r5dgs_core.scene.scene import Scene
 from r5dgs_core.search import embedding_search, object_search
 from r5dgs_core.train import checkpoint, run_folder
@@ -79,7 +79,7 @@ def rich_scene(seed: int = 0, **changes: Any) -> Scene:
         vectors = rng.normal(size=shape)
         return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
 
-    table = Table(
+    table = LookupTable(
         EncoderCard("clip", "tiny", "0" * 64, 4, ("{}", "a {}")),
         ("thing", "stuff"),
         tuple(
@@ -611,7 +611,7 @@ def notes_reader() -> Reader:
     def read(folder: Path) -> None:
         (folder / "scene.r5dgs").touch()
         (folder / "evaluation.json").touch()
-        assert quality.of(scene, folder / "scene.r5dgs").text()
+        assert quality.measure(scene, folder / "scene.r5dgs").text()
         encoder_base.read_json(folder / "config.json")
 
     return Reader(

@@ -1,6 +1,6 @@
 """Rigid motion past t_max: one module per kind of motion, and their evaluation at any time."""
 
-from .base import BLOCKS, Block, MotionKind, Rates, clocks
+from .base import BLOCKS, Block, MotionKind, Rates, time_factors
 from .evaluation import MotionStack, curve, evaluate, evaluate_all, evaluate_with_rates, kinks, steps_needed
 from .motion_model import FIELDS, RATES, SCALARS, VECTORS, MotionModel, Unit
 from .registry import KINDS, MENU_NUMBERS
@@ -22,7 +22,7 @@ __all__ = [
     "Rates",
     "MotionStack",
     "Unit",
-    "clocks",
+    "time_factors",
     "curve",
     "evaluate",
     "evaluate_all",

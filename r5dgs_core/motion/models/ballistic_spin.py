@@ -37,7 +37,7 @@ class BallisticSpin(MotionKind):
 
     def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:
         v, a, w, eps, u = rates[:5]
-        once, twice = rates.clocks(span)
+        once, twice = rates.time_factors(span)
         quats = rotations.rotvecs_to_quats(w * once + eps * twice)
         arm = rotations.rotate(quats, u + 0 * quats[..., 1:])
         return quats, v * once + a * twice + (u - arm)
@@ -45,8 +45,8 @@ class BallisticSpin(MotionKind):
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
         v, a, w, eps, u = rates[:5]
         quats, d = self.poses(rates, span)
-        once, twice = rates.clocks(span)
-        slope, slope2 = rates.clock_slopes(span)
+        once, twice = rates.time_factors(span)
+        slope, slope2 = rates.time_factor_rates(span)
         # R = exp(phi) has angular velocity V(phi) phi'.
         spins = se3.v_matrix_times(w * once + eps * twice, w * slope + eps * slope2)
         return quats, d, spins, v * slope + a * slope2 - rotations.cross(spins, rotations.rotate(quats, u + 0 * span))

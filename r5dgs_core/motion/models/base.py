@@ -78,13 +78,13 @@ class Rates(namedtuple("Rates", [unit.symbol for unit in FIELDS.values()], defau
         """Rates of a model. [3], [1]"""
         return cls(*(np.atleast_1d(getattr(model, name)) for name in FIELDS))
 
-    def clocks(self, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def time_factors(self, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Factors s1 of v and w and s2 of a and eps at times since t_max. [..., 1]"""
-        return clocks(self.frequency, span, self.damping)
+        return time_factors(self.frequency, span, self.damping)
 
-    def clock_slopes(self, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of `clocks` with respect to time."""
-        return clock_slopes(self.frequency, span, self.damping)
+    def time_factor_rates(self, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of `time_factors` with respect to time."""
+        return time_factor_rates(self.frequency, span, self.damping)
 
 
 class MotionKind:
@@ -197,7 +197,7 @@ class MotionKind:
     def starts(self, blocks: Sequence[str], track: PoseTrack, window: Window) -> list[first_guesses.Guess]:
         """First guesses of a candidate's blocks, most promising first; empty if it cannot apply."""
         if "pace" in blocks:
-            return first_guesses.swings(blocks, track, window, clocks)
+            return first_guesses.oscillation_guesses(blocks, track, window, time_factors)
         return [first_guesses.parabola(blocks, track)]
 
     def events(self, parts: Mapping[str, np.ndarray], window: Window) -> list[tuple[str, np.ndarray]]:
@@ -242,7 +242,7 @@ class MotionKind:
         )
 
 
-def clocks(frequency: float | np.ndarray, span: np.ndarray, damping: float | np.ndarray = 0.0) -> se3.Pose:
+def time_factors(frequency: float | np.ndarray, span: np.ndarray, damping: float | np.ndarray = 0.0) -> se3.Pose:
     """Factors of the rates and of their derivatives in a motion that may oscillate.
 
     Args:
@@ -266,10 +266,10 @@ def clocks(frequency: float | np.ndarray, span: np.ndarray, damping: float | np.
     return once, twice
 
 
-def clock_slopes(frequency: float | np.ndarray, span: np.ndarray, damping: float | np.ndarray) -> se3.Pose:
-    """Derivatives with respect to time of the factors of `clocks`; same arguments."""
+def time_factor_rates(frequency: float | np.ndarray, span: np.ndarray, damping: float | np.ndarray) -> se3.Pose:
+    """Derivatives with respect to time of the factors of `time_factors`; same arguments."""
     if not np.any(damping):
-        return np.cos(frequency * span), clocks(frequency, span)[0]
+        return np.cos(frequency * span), time_factors(frequency, span)[0]
     c = np.where(np.asarray(frequency) > 0, damping, 0.0)
     p, s, stiffness = _decaying(frequency, span, c)
     slope_s, slope_p = p - c * s, -c * p - np.asarray(frequency) ** 2 * s

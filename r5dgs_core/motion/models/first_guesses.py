@@ -11,7 +11,7 @@ from .. import robust_weights, rotations
 from ..pose_track import PoseTrack, Window
 
 Guess = dict[str, np.ndarray]
-Clocks = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+TimeFactors = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 _PACES = 25  # number of tried frequencies
 _PAIRED = 18  # the same for sums of two oscillations
 _DECAYS = (0.3, 1.0, 2.5, 4.0)  # tried decay rates, per span
@@ -76,13 +76,13 @@ class _Sweep:
     gain: float
 
 
-def _sweep(track: PoseTrack, path: np.ndarray, window: Window, clocks: Clocks, damped: bool) -> _Sweep:
+def _sweep(track: PoseTrack, path: np.ndarray, window: Window, time_factors: TimeFactors, damped: bool) -> _Sweep:
     """Fit a path at all frequencies in two rounds, the second with robust pose weights. path: [S, 3]"""
     grid = np.geomspace(window.low, window.high, _PACES)[1:-1]
     decays = np.array(_DECAYS if damped else [0.0])
     frequencies = np.r_[0.0, np.repeat(grid, len(decays))]
     rates_of_decay = np.r_[0.0, np.tile(decays, len(grid))]
-    factors = clocks(frequencies[:, None, None], track.tau[:, None], rates_of_decay[:, None, None])
+    factors = time_factors(frequencies[:, None, None], track.tau[:, None], rates_of_decay[:, None, None])
     columns = np.concatenate([np.ones_like(factors[0]), *factors], axis=-1)
 
     def fit(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -99,7 +99,9 @@ def _sweep(track: PoseTrack, path: np.ndarray, window: Window, clocks: Clocks, d
     return _Sweep(frequencies[1:], rates_of_decay[1:], rates[1:], misses[1:], gain)
 
 
-def swings(blocks: Sequence[str], track: PoseTrack, window: Window, clocks: Clocks) -> list[Guess]:
+def oscillation_guesses(
+    blocks: Sequence[str], track: PoseTrack, window: Window, time_factors: TimeFactors
+) -> list[Guess]:
     """Guesses of a motion with a free frequency, most promising first; empty if no oscillation is found.
 
     They are the local minima of the misfit of the displacements or rotations over frequency. An oscillation is found if
@@ -108,9 +110,9 @@ def swings(blocks: Sequence[str], track: PoseTrack, window: Window, clocks: Cloc
     if not window.may_swing:
         return []
     damped = "decay" in blocks
-    sweeps = {"path": _sweep(track, track.displacements, window, clocks, damped)}
+    sweeps = {"path": _sweep(track, track.displacements, window, time_factors, damped)}
     if "swing" in blocks:
-        sweeps["turn"] = _sweep(track, track.turned, window, clocks, damped)
+        sweeps["turn"] = _sweep(track, track.accumulated_rotation, window, time_factors, damped)
     if max(sweep.gain for sweep in sweeps.values()) <= _GAIN:
         return []
     sweep = sweeps.get("turn", sweeps["path"])
@@ -125,7 +127,13 @@ def swings(blocks: Sequence[str], track: PoseTrack, window: Window, clocks: Cloc
 def _swinging(blocks: Sequence[str], track: PoseTrack, window: Window, sweep: _Sweep, row: int) -> Guess:
     """Guess from the rates of a fit at one frequency: position, velocity, acceleration at t_max."""
     rates, frequency, decay = sweep.rates[row], float(sweep.frequencies[row]), float(sweep.decays[row])
-    guess = {"r": np.zeros(3), "e": rates[0], "v": rates[1], "a": rates[2], "pace": np.array([window.pace(frequency)])}
+    guess = {
+        "r": np.zeros(3),
+        "e": rates[0],
+        "v": rates[1],
+        "a": rates[2],
+        "pace": np.array([window.frequency_logit(frequency)]),
+    }
     guess["decay"] = np.log(np.array([max(decay, 1e-2)]))
     if "swing" in blocks:
         # q exp(-c tau) sin(W tau + f) has the rates (W cos f - c sin f) q and ((c^2 - W^2) sin f - 2 c W cos f) q.
@@ -139,7 +147,7 @@ def _swinging(blocks: Sequence[str], track: PoseTrack, window: Window, sweep: _S
     return guess
 
 
-def pairs(track: PoseTrack, window: Window, clocks: Clocks) -> list[Guess]:
+def two_oscillation_guesses(track: PoseTrack, window: Window, time_factors: TimeFactors) -> list[Guess]:
     """Guesses of a sum of two oscillations of positions and rotations, most promising first.
 
     Empty if no pair of frequencies fits significantly better than the best single frequency.
@@ -147,12 +155,12 @@ def pairs(track: PoseTrack, window: Window, clocks: Clocks) -> list[Guess]:
     if not window.may_swing or len(track) < 10:
         return []
     grid = np.geomspace(window.low, window.high, _PAIRED + 2)[1:-1]
-    once, twice = clocks(grid[:, None, None], track.tau[:, None], np.zeros(1))
+    once, twice = time_factors(grid[:, None, None], track.tau[:, None], np.zeros(1))
     columns = np.concatenate([once, twice], -1)  # [F, S, 2]
     i, j = np.triu_indices(_PAIRED, 2)
     ones = np.ones((len(i), len(track), 1))
     both = np.concatenate([ones, columns[i], columns[j]], -1)
-    path = np.concatenate([track.displacements, track.turned - track.turned[-1]], -1)
+    path = np.concatenate([track.displacements, track.accumulated_rotation - track.accumulated_rotation[-1]], -1)
     normal = both.swapaxes(1, 2) @ both
     normal += _RIDGE**2 * np.eye(5) * np.einsum("kii->k", normal)[:, None, None]
     fits = np.linalg.solve(normal, both.swapaxes(1, 2) @ path)
@@ -171,7 +179,7 @@ def pairs(track: PoseTrack, window: Window, clocks: Clocks) -> list[Guess]:
     for row in rows:
         e, v, a, v2, a2 = fits[row, :, :3]
         _, w, eps, w2, eps2 = fits[row, :, 3:]
-        paces = (np.array([window.pace(float(grid[k[row]]))]) for k in (i, j))
+        paces = (np.array([window.frequency_logit(float(grid[k[row]]))]) for k in (i, j))
         guess = dict(zip(("pace", "pace2"), paces, strict=True))
         found.append(guess | {"r": np.zeros(3), "e": e, "v": v, "a": a, "v2": v2, "a2": a2})
         found[-1] |= {"w": w, "eps": eps, "w2": w2, "eps2": eps2}

@@ -64,9 +64,9 @@ class Friction(MotionKind):
             way = within - 0.5 * within**2 / stop
             columns = np.stack([np.ones(len(track)), way - way[-1]], -1)
             place = first_guesses.least_squares(columns, track.displacements, track.weights)
-            spin = first_guesses.least_squares(columns, track.turned, track.weights)
+            spin = first_guesses.least_squares(columns, track.accumulated_rotation, track.weights)
             miss = ((columns @ place - track.displacements) ** 2).sum()
-            miss += ((columns @ spin - track.turned) ** 2).sum() if "w" in blocks else 0.0
+            miss += ((columns @ spin - track.accumulated_rotation) ** 2).sum() if "w" in blocks else 0.0
             guess = {"r": np.zeros(3), "e": place[0], "v": place[1], "w": spin[1]}
             found.append((float(miss), stop, guess | {"log_stop": np.log(np.array([stop]))}))
         return [guess for _, _, guess in sorted(found, key=lambda entry: entry[:2])[:2]]

@@ -23,13 +23,13 @@ class Translation(MotionKind):
     drawn_fits = (("velocity", "acceleration"),)
 
     def poses(self, rates: Rates, span: np.ndarray) -> se3.Pose:
-        once, twice = rates.clocks(span)
+        once, twice = rates.time_factors(span)
         d = rates.v * once + rates.a * twice
         return rotations.identity(*d.shape[:-1]), d
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
         quats, d = self.poses(rates, span)
-        slope, slope2 = rates.clock_slopes(span)
+        slope, slope2 = rates.time_factor_rates(span)
         return quats, d, np.zeros(d.shape), rates.v * slope + rates.a * slope2
 
     def spins(self, model: MotionModel) -> bool:

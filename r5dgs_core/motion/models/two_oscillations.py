@@ -9,7 +9,7 @@ import numpy as np
 from .. import rotations, se3
 from ..pose_track import PoseTrack, Window
 from . import first_guesses
-from .base import Block, Curve, MotionKind, MotionModel, Rates, clock_slopes, clocks
+from .base import Block, Curve, MotionKind, MotionModel, Rates, time_factor_rates, time_factors
 
 _SEEN = 0.9  # minimum number of observed periods
 
@@ -36,9 +36,9 @@ class TwoOscillations(MotionKind):
     frequency_blocks = ("pace", "pace2")
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
-        once, twice = clocks(rates.frequency, span)
-        once2, twice2 = clocks(rates.frequency2, span)
-        slope, slope2 = (clock_slopes(f, span, 0.0)[0] for f in (rates.frequency, rates.frequency2))
+        once, twice = time_factors(rates.frequency, span)
+        once2, twice2 = time_factors(rates.frequency2, span)
+        slope, slope2 = (time_factor_rates(f, span, 0.0)[0] for f in (rates.frequency, rates.frequency2))
         phi = rates.w * once + rates.eps * twice + rates.w2 * once2 + rates.eps2 * twice2
         d = rates.v * once + rates.a * twice + rates.v2 * once2 + rates.a2 * twice2
         rate = rates.w * slope + rates.eps * once + rates.w2 * slope2 + rates.eps2 * once2
@@ -55,7 +55,7 @@ class TwoOscillations(MotionKind):
         return all(float(window.frequency(parts[block])[0]) >= slowest for block in self.frequency_blocks)
 
     def starts(self, blocks: Sequence[str], track: PoseTrack, window: Window) -> list[first_guesses.Guess]:
-        return first_guesses.pairs(track, window, clocks)
+        return first_guesses.two_oscillation_guesses(track, window, time_factors)
 
     def moves(self, model: MotionModel) -> bool:
         return super().moves(model) or bool(model.second_velocity.any() or model.second_acceleration.any())

@@ -56,7 +56,7 @@ def pose_at_knot(gaussians: Gaussians, tracks: Tracks, knot: int, light: Tensor 
             return
         sh = torch.cat([gaussians.sh, gaussians.sh_rest], dim=1).double().numpy()
         vectors, turns = gaussians.shading.double().numpy(), poses.quats[ids].double().numpy()
-        sh = spherical_harmonics.turned(sh, turns)
+        sh = spherical_harmonics.rotate(sh, turns)
         # Unlit surfaces start dark; factors at rest are dropped, as training assumes 1.
         sh, vectors, _ = shading.rebind(sh, vectors, np.ones(len(sh)), turns, light.double().numpy())
         gaussians.sh.copy_(torch.from_numpy(sh[:, :1]))

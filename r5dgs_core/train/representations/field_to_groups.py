@@ -122,7 +122,7 @@ def _bind_state(
     """
     rows = points.rows
     bind = {name: tensor.numpy().copy() for name, tensor in gaussians.items()}
-    sh = spherical_harmonics.turned(
+    sh = spherical_harmonics.rotate(
         np.concatenate([bind["sh"], bind["sh_rest"]], axis=1).astype(np.float64)[rows], since
     )
     ones = np.ones(len(sh))

@@ -63,7 +63,7 @@ def rebind(
     """Return colours, shading vectors and factors at rest for a turned state; all rendered colours stay the same.
 
     Args:
-        sh: Harmonics, already in the frame of the new state (`spherical_harmonics.turned`). [N, K, 3]
+        sh: Harmonics, already in the frame of the new state (`spherical_harmonics.rotate`). [N, K, 3]
         shading: The vectors g. [N, 3]
         rest: The factors r. [N]
         quats: Rotation Q from the old state to the new one, unit wxyz, one for all or one for each. [4] or [N, 4]

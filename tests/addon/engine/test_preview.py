@@ -96,7 +96,7 @@ def test_preview_statistics_show_the_error_and_the_render_time(blender, loaded, 
     preview(blender)
     size = " x ".join(map(str, blender.data.images["R5DGS Preview"].size))
     assert re.fullmatch(rf"{size} in \d+ ms \(motion \d+, raster \d+\)", figures.speed())
-    assert figures.errors() == [quality.of(scene_file.read(scene_path), scene_path).text()]
+    assert figures.errors() == [quality.measure(scene_file.read(scene_path), scene_path).text()]
     state = blender.context.window_manager.r5dgs_figures
     figures.remember(
         blender.data.images["R5DGS Preview"],

@@ -230,7 +230,7 @@ def test_bags_are_as_precise_far_from_the_world_origin(tiny, baked):
     for offset in (np.zeros(3), shift):
         groups = tuple(dataclasses.replace(g, pivot=np.asarray(g.pivot) + offset) for g in baked.groups)
         scenes.append(dataclasses.replace(baked.with_arrays(means=(means + offset).astype(np.float32)), groups=groups))
-    moved = [dataclasses.replace(view, camera=cameras.moved(view.camera, shift)) for view in views]
+    moved = [dataclasses.replace(view, camera=cameras.translated(view.camera, shift)) for view in views]
     near, far = (render_segments.draw(scene, v, given) for scene, v in zip(scenes, (views, moved), strict=True))
     for here, there in zip(near, far, strict=True):
         assert abs(here.weights - there.weights).sum() < 1e-4 * here.weights.sum()

@@ -91,7 +91,7 @@ def test_cameras_named_by_position_are_the_same_at_any_distance(tiny, tmp_path):
 
 def test_points_of_a_reconstruction_move_with_the_cameras(tmp_path):
     orbit = [scenes.orbit_camera(angle, 16, 12) for angle in (0.1, 1.3, 2.5)]
-    far = {f"{i}.png": cameras.moved(camera, FAR) for i, camera in enumerate(orbit)}
+    far = {f"{i}.png": cameras.translated(camera, FAR) for i, camera in enumerate(orbit)}
     (tmp_path / "images").mkdir()
     for name in far:
         images.write_png(tmp_path / "images" / name, np.full((12, 16, 3), 0.5, np.float32))
@@ -163,7 +163,7 @@ def test_scenes_without_an_origin_are_measured_in_their_own_world(baked, tiny, t
     older = dataclasses.replace(
         baked.with_arrays(means=(baked.gaussians.means.astype(np.float64) + 0.2 * FAR).astype(np.float32)),
         groups=tuple(dataclasses.replace(group, pivot=group.pivot + 0.2 * FAR) for group in baked.groups),
-        cameras=tuple(cameras.moved(camera, 0.2 * FAR) for camera in baked.cameras),
+        cameras=tuple(cameras.translated(camera, 0.2 * FAR) for camera in baked.cameras),
         hulls=(),
     )
     path = scene_file.write(older, tmp_path / "older.r5dgs")

@@ -10,7 +10,7 @@ from r5dgs_core.editing.edited_scene import Piece
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import row_runs, scene_file, validation
-from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, Table
+from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, LookupTable
 from tests.support.scenes import make_scene
 
 TURN = rotations.quats_to_rotmats(rotations.normalize(np.array([0.3, -0.5, 0.7, 0.2])))
@@ -106,7 +106,7 @@ def rich_scene(**options):
             view_embeddings=units[:, None],
         ),
         vocabulary=("mug",),
-        lookup=Table(card, ("object",), views, limits, 0.1, "mean"),
+        lookup=LookupTable(card, ("object",), views, limits, 0.1, "mean"),
     )
 
 

@@ -27,7 +27,7 @@ from r5dgs_core.error_vs_time import (
 from r5dgs_core.error_vs_time import report as error_vs_time_report
 from r5dgs_core.evaluation import ground_truth_poses
 from r5dgs_core.motion import models, se3
-from r5dgs_core.motion.history import NONE, Band, History
+from r5dgs_core.motion.history import EMPTY, Band, History
 from r5dgs_core.motion_fit import candidates
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
@@ -201,7 +201,7 @@ def test_the_stored_band_is_compared_with_the_stored_motion(scene):
     rows, _ = pose_task.measure(off, truth, 1)
     count = sum(group.role == "body" for group in scene.groups)
     assert only(rows, error_kind="outside_band").error == pytest.approx(1 / count)
-    bare = dataclasses.replace(scene, groups=tuple(dataclasses.replace(g, history=NONE) for g in scene.groups))
+    bare = dataclasses.replace(scene, groups=tuple(dataclasses.replace(g, history=EMPTY) for g in scene.groups))
     rows, missing = pose_task.measure(bare, truth, 1)
     assert not pick(rows, error_kind="outside_band") and any("band" in line for line in missing)
 

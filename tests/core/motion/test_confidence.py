@@ -47,7 +47,7 @@ def test_it_is_the_spread_of_sampled_motions(model):
 
 def test_a_certain_velocity_grows_the_spread_with_the_square_of_time():
     model = with_covariance(models.MotionModel("translation", velocity=[1, 2, 3], acceleration=[0, 0, 1]))
-    known = confidence.without(model, {"velocity"})
+    known = confidence.with_exact_fields(model, {"velocity"})
     sigma = confidence.position_sigma(known, np.array([0.1, 0.2, 0.4]))
     np.testing.assert_allclose(sigma / sigma[0], [1, 4, 16], rtol=1e-5)
 
@@ -56,5 +56,5 @@ def test_exact_and_unknown_rates_have_no_spread():
     tau = np.linspace(0, 1, 5)
     assert not confidence.position_sigma(models.MotionModel("translation", velocity=[1, 0, 0]), tau).any()
     model = with_covariance(models.MotionModel("ballistic_spin", angular_velocity=[1, 0, 0]))
-    assert not confidence.position_sigma(confidence.without(model, set(RATES)), tau).any()
-    assert confidence.without(model, set()) is model
+    assert not confidence.position_sigma(confidence.with_exact_fields(model, set(RATES)), tau).any()
+    assert confidence.with_exact_fields(model, set()) is model

@@ -242,10 +242,12 @@ def test_a_damped_swing_decays_to_its_centre():
 def test_damped_clocks_approach_undamped_ones_and_each_other_smoothly():
     tau = np.array([[-1.3], [0.0], [0.3], [2.1]])
     for frequency in (1e-3, 1.0, 30.0):
-        for damped, plain in zip(models.clocks(frequency, tau, 1e-9), models.clocks(frequency, tau), strict=True):
+        for damped, plain in zip(
+            models.time_factors(frequency, tau, 1e-9), models.time_factors(frequency, tau), strict=True
+        ):
             np.testing.assert_allclose(damped, plain, atol=1e-7)
     # Both sides of the size at which a series replaces the closed form.
-    series, closed = (models.clocks(frequency, np.ones(1), 0.4e-3) for frequency in (0.9e-3, 1.0e-3))
+    series, closed = (models.time_factors(frequency, np.ones(1), 0.4e-3) for frequency in (0.9e-3, 1.0e-3))
     for low, high in zip(series, closed, strict=True):
         np.testing.assert_allclose(low, high, rtol=1e-6)
 
@@ -318,14 +320,14 @@ def test_a_ball_that_does_not_bounce_stays_on_the_floor_and_one_that_loses_nothi
 
 def test_the_clocks_run_steadily_without_a_frequency_to_the_bit_and_smoothly_towards_it():
     tau = np.array([[-2.0], [0.0], [0.3], [7.1]])
-    once, twice = models.clocks(0.0, tau)
+    once, twice = models.time_factors(0.0, tau)
     assert once.tolist() == tau.tolist()
     assert twice.tolist() == (0.5 * tau**2).tolist()
     for frequency in (1e-200, 1e-9, 1e-5):
-        for slow, still in zip(models.clocks(frequency, tau), (once, twice), strict=True):
+        for slow, still in zip(models.time_factors(frequency, tau), (once, twice), strict=True):
             np.testing.assert_allclose(slow, still, rtol=1e-9)
     for frequency in (0.01, 0.07, 0.5, 3.0):
-        once, twice = models.clocks(frequency, tau)
+        once, twice = models.time_factors(frequency, tau)
         np.testing.assert_allclose(once, np.sin(frequency * tau) / frequency, rtol=1e-12)
         np.testing.assert_allclose(twice, 2 * (np.sin(0.5 * frequency * tau) / frequency) ** 2, rtol=1e-12)
 

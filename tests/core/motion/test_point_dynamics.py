@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.motion import point_dynamics, rk2_cache, rotations, se3, twist_propagation
+from r5dgs_core.motion import midpoint_path, point_dynamics, rotations, se3, twist_propagation
 
 RNG = np.random.default_rng(0)
 STATE = RNG.normal(size=(5, 12)) * [1, 1, 1, 2, 2, 2, 1, 1, 1, 1, 1, 1]
@@ -143,12 +143,12 @@ def test_the_last_step_is_shortened_to_reach_the_time():
 
 
 def test_a_diverging_path_keeps_its_last_finite_position(monkeypatch):
-    monkeypatch.setattr(rk2_cache, "MAX_STEPS", 2000)
+    monkeypatch.setattr(midpoint_path, "MAX_STEPS", 2000)
     start = np.zeros((2, 3))
     v, w = np.array([[0.1, 0, 0], [0.1, 0, 0]]), np.array([[0, 0, 400.0], [0, 0, 0.5]])
-    path = rk2_cache.SteppedPath(start, v, w, 0 * v, np.array([[300.0, 0, 0], [0, 0, 0]]), 1 / 60)
+    path = midpoint_path.MidpointPath(start, v, w, 0 * v, np.array([[300.0, 0, 0], [0, 0, 0]]), 1 / 60)
     points, quats = path.at(1000.0)
     assert np.isfinite(points).all() and np.isfinite(quats).all()
-    alone, _ = rk2_cache.SteppedPath(start[1:], v[1:], w[1:], 0 * v[1:], 0 * v[1:], 1 / 60).at(1000.0)
+    alone, _ = midpoint_path.MidpointPath(start[1:], v[1:], w[1:], 0 * v[1:], 0 * v[1:], 1 / 60).at(1000.0)
     np.testing.assert_array_equal(alone[0], points[1])
-    np.testing.assert_array_equal(path.at(1e6)[0], path.at(rk2_cache.MAX_STEPS / 60)[0])
+    np.testing.assert_array_equal(path.at(1e6)[0], path.at(midpoint_path.MAX_STEPS / 60)[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from r5dgs_core.motion import point_dynamics, rk2_cache, rotations, se3, twist_propagation
+from r5dgs_core.motion import midpoint_path, point_dynamics, rotations, se3, twist_propagation
 
 RNG = np.random.default_rng(0)
 
@@ -73,7 +73,7 @@ def test_points_beyond_one_chunk_are_all_computed(monkeypatch):
 
 def test_kept_midpoint_steps_are_those_of_rk2_to_the_bit():
     v, w, a, e = RNG.normal(size=(4, 3, 3))
-    path = rk2_cache.SteppedPath(np.zeros((3, 3)), v, w, a, e, 1 / 60)
+    path = midpoint_path.MidpointPath(np.zeros((3, 3)), v, w, a, e, 1 / 60)
     for t in (0.21, 0.0, 0.01, 1 / 60, 0.5, 0.05):
         for one, other in zip(path.at(t), point_dynamics.rk2(np.zeros((3, 3)), v, w, a, e, t, 1 / 60), strict=True):
             np.testing.assert_array_equal(one, other)

@@ -46,13 +46,15 @@ def test_colours_turn_exactly_with_turned_mirrored_and_scaled_bodies(degree, mir
     sh, d = random_sh(degree), directions()
     before = d @ np.linalg.inv(linear).T
     before /= np.linalg.norm(before, axis=-1, keepdims=True)
-    seen = spherical_harmonics.to_rgb(spherical_harmonics.carried(sh, linear)[:, None], d)
+    seen = spherical_harmonics.to_rgb(spherical_harmonics.transform(sh, linear)[:, None], d)
     np.testing.assert_allclose(seen, spherical_harmonics.to_rgb(sh[:, None], before), atol=1e-10)
 
 
 def test_turning_harmonics_agrees_with_the_core():
     sh, quat = random_sh(3), rotations.rotmats_to_quats(TURN)
-    np.testing.assert_allclose(spherical_harmonics.carried(sh, TURN), spherical_harmonics.turned(sh, quat), atol=1e-12)
+    np.testing.assert_allclose(
+        spherical_harmonics.transform(sh, TURN), spherical_harmonics.rotate(sh, quat), atol=1e-12
+    )
 
 
 def test_no_other_coefficients_fit_a_stretched_body_better():
@@ -63,8 +65,8 @@ def test_no_other_coefficients_fit_a_stretched_body_better():
     def error(coefficients):
         return float(((spherical_harmonics.to_rgb(coefficients[:, None], d) - wanted) ** 2).mean())
 
-    ours = error(spherical_harmonics.carried(sh, linear))
-    assert ours < 0.5 * error(spherical_harmonics.carried(sh, affine_transform.nearest_rotation(linear)))
+    ours = error(spherical_harmonics.transform(sh, linear))
+    assert ours < 0.5 * error(spherical_harmonics.transform(sh, affine_transform.nearest_rotation(linear)))
     assert ours < 1.1 * error(np.linalg.lstsq(spherical_harmonics.basis(d, 3), wanted[0], rcond=None)[0][None])
 
 
@@ -74,7 +76,7 @@ STRETCHED = TURN @ np.diag([1.0, 3.0, 0.2]) @ TURN
 @pytest.mark.parametrize("linear", [2.5 * TURN, TURN @ np.diag([1.0, -1, 1]), STRETCHED, 1e-3 * STRETCHED])
 def test_covariances_are_mapped_exactly(linear):
     splats = affine_transform.bind_state(make_scene(n=60), slice(None))
-    moved = affine_transform.carry(splats, matrix_of(linear))
+    moved = affine_transform.transform(splats, matrix_of(linear))
     wanted = linear @ covariances(splats) @ linear.T
     np.testing.assert_allclose(covariances(moved), wanted, rtol=2e-5, atol=1e-5 * np.abs(wanted).max())
     np.testing.assert_allclose(np.linalg.norm(moved.quats, axis=-1), 1, atol=1e-6)
@@ -84,7 +86,7 @@ def test_covariances_are_mapped_exactly(linear):
 def test_a_transform_and_its_inverse_change_nothing():
     splats = affine_transform.bind_state(make_scene(n=60, sh_degree=3), slice(None))
     matrix = matrix_of(1.7 * TURN)
-    back = affine_transform.carry(affine_transform.carry(splats, matrix), np.linalg.inv(matrix))
+    back = affine_transform.transform(affine_transform.transform(splats, matrix), np.linalg.inv(matrix))
     for name in ("means", "log_scales", "sh"):
         np.testing.assert_allclose(getattr(back, name), getattr(splats, name), atol=2e-6, err_msg=name)
     np.testing.assert_allclose(np.abs((back.quats * splats.quats).sum(-1)), 1, atol=1e-6)
@@ -188,4 +190,4 @@ def test_a_map_that_flattens_space_is_refused():
     splats = affine_transform.bind_state(make_scene(n=10, objects=0, unassigned=0), slice(None))
     for bad in (matrix_of(np.diag([1.0, 0, 1])), np.full((4, 4), np.nan), np.eye(3)):
         with pytest.raises(ValueError):
-            affine_transform.carry(splats, bad)
+            affine_transform.transform(splats, bad)

@@ -66,7 +66,7 @@ def test_keys_at_the_knots_reproduce_playback(scene):
     """Blender's Bezier keys with handles at a third are cubic Hermite curves: `cubic_curves.evaluate` is their
     rule.
     """
-    quats, displacements = group_dynamics.knots(scene)
+    quats, displacements = group_dynamics.knot_poses(scene)
     quat_slopes, slopes = (cubic_curves.slopes(scene.tracks.times, values) for values in (quats, displacements))
     times = np.linspace(0, T_MAX, 131)
     for g in range(len(scene.groups)):

@@ -115,10 +115,10 @@ def test_cropped_and_resized_cameras_keep_their_rays(camera):
 def test_a_moved_camera_shows_a_moved_world(camera):
     shift, points = np.array([3.0, -1.0, 0.5]), camera.center + cameras.pixel_rays(camera)[::30, ::40].reshape(-1, 3)
     for found, expected in zip(
-        cameras.project(cameras.moved(camera, shift), points + shift), cameras.project(camera, points), strict=True
+        cameras.project(cameras.translated(camera, shift), points + shift), cameras.project(camera, points), strict=True
     ):
         np.testing.assert_allclose(found, expected, atol=1e-9)
-    assert cameras.moved(camera, np.zeros(3)) is camera
+    assert cameras.translated(camera, np.zeros(3)) is camera
 
 
 def changed(matrix, at, value):

@@ -7,7 +7,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.motion import rotations
-from r5dgs_core.motion.history import NONE, Band, Event, History, PoseErrors, Segment
+from r5dgs_core.motion.history import EMPTY, Band, Event, History, PoseErrors, Segment
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.scene import scene_file
 from tests.support import scenes
@@ -57,7 +57,7 @@ def test_a_band_alone_needs_no_newer_release(tmp_path):
     path = scene_file.write(with_history(History(band=BAND)), tmp_path / "band.r5dgs")
     assert tree_of(path)["format_version"] == 1
     assert scene_file.read(path).groups[1].history.band == BAND
-    plain = scene_file.write(with_history(NONE), tmp_path / "plain.r5dgs")
+    plain = scene_file.write(with_history(EMPTY), tmp_path / "plain.r5dgs")
     assert not {"events", "segments", "band"} & set(tree_of(plain)["groups"][1])
 
 
@@ -70,7 +70,7 @@ def test_a_band_alone_needs_no_newer_release(tmp_path):
     ],
 )
 def test_a_motion_that_older_releases_would_misread_is_a_required_feature(model, tmp_path):
-    path = scene_file.write(with_history(NONE, model=model), tmp_path / "new.r5dgs")
+    path = scene_file.write(with_history(EMPTY, model=model), tmp_path / "new.r5dgs")
     assert [(row["name"], row["required"]) for row in tree_of(path)["features"]] == [("motions", True)]
     assert scene_file.read(path).groups[1].model == model
 
@@ -112,7 +112,7 @@ def test_the_warning_names_the_last_event():
     assert HIT.text() == "set off at 0.31, not predictable past 1.10 (hit at 0.55)"
     trusted = dataclasses.replace(HIT, band=dataclasses.replace(BAND, predictable_until=None))
     assert trusted.warning() == "" and trusted.text() == "set off at 0.31, hit at 0.55"
-    assert NONE.text() == ""
+    assert EMPTY.text() == ""
 
 
 def test_a_similarity_of_the_world_scales_widths_and_turns_rates():

@@ -33,7 +33,7 @@ def write(place, content, later=10.0):
 
 
 def test_unmeasured_quality_names_the_evaluate_command(scene, path):
-    found = quality.of(scene, path)
+    found = quality.measure(scene, path)
     assert (found.psnr_observed, found.psnr_later, found.rigid_rms, found.bending) == (None, None, None, 0)
     assert "r5dgs evaluate" in found.text()
 
@@ -41,7 +41,7 @@ def test_unmeasured_quality_names_the_evaluate_command(scene, path):
 @pytest.mark.parametrize("name", ["scene.evaluation.json", "evaluation.json"])
 def test_an_evaluation_beside_the_file_is_found(scene, path, name):
     write(path.with_name(name), evaluation(scene))
-    found = quality.of(scene, path)
+    found = quality.measure(scene, path)
     assert (found.psnr_observed, found.psnr_later) == (31.25, 28.5)
     assert "31.2 dB" in found.text() and "28.5 dB past" in found.text()
 
@@ -58,14 +58,14 @@ def test_an_evaluation_beside_the_file_is_found(scene, path, name):
 )
 def test_an_evaluation_of_another_scene_is_ignored(scene, path, content):
     write(path.with_name("evaluation.json"), evaluation(scene, **content))
-    assert quality.of(scene, path).psnr_observed is None
+    assert quality.measure(scene, path).psnr_observed is None
 
 
 def test_an_evaluation_of_an_older_file_is_ignored(scene, path):
     write(path.with_name("evaluation.json"), evaluation(scene), later=-100.0)
-    assert quality.of(scene, path).psnr_observed is None
+    assert quality.measure(scene, path).psnr_observed is None
     path.with_name("evaluation.json").write_text("no JSON")
-    assert quality.of(scene, path).psnr_observed is None
+    assert quality.measure(scene, path).psnr_observed is None
 
 
 def test_the_rigid_motions_error_is_weighted_by_gaussians_and_a_share_of_the_size(scene):
@@ -73,6 +73,6 @@ def test_the_rigid_motions_error_is_weighted_by_gaussians_and_a_share_of_the_siz
     groups[1] = dataclasses.replace(groups[1], rigid_rms=0.3, rigid_max=0.5)
     bent = dataclasses.replace(scene, groups=tuple(groups))
     share = np.mean(scene.gaussians.motion_ids == 1)
-    found = quality.of(bent)
+    found = quality.measure(bent)
     assert found.rigid_rms == pytest.approx(0.3 * np.sqrt(share) / scene.extent)
     assert "%" in found.text() and "picture error not measured" in found.text()

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from r5dgs_core import errors
 from r5dgs_core.playback import scene_info
 from r5dgs_core.scene import scene_file, scene_json
-from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, Table
+from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, LookupTable
 from r5dgs_core.scene.stored_embeddings import StoredEmbeddings
 from r5dgs_core.search import embedding_search, object_search
 from tests.support.scenes import make_scene
@@ -35,7 +35,7 @@ def table_of(rows, thresholds, *, margin=2.0, pooling="mean", views=None):
     rows = np.asarray(rows, float)
     own = [((EmbeddingSource("said", t),) if t is not None else ()) for t in thresholds] if views is None else views[0]
     stored = rows[:, None] if views is None else views[1]
-    table = Table(CARD, ("object",), tuple(own), tuple(thresholds), margin, pooling)
+    table = LookupTable(CARD, ("object",), tuple(own), tuple(thresholds), margin, pooling)
     ids = tuple(range(1, len(rows) + 1))
     return StoredEmbeddings(ids, rows, ("sphere",), np.eye(4)[:1], table, np.eye(4)[3:], stored)
 
@@ -165,7 +165,7 @@ def rich():
         for empty in bare
     )
     card = dataclasses.replace(CARD, kind="clip", scale=12.5)
-    table = Table(card, ("object",), views, tuple(None if e else 0.25 for e in bare), 0.1, "mean")
+    table = LookupTable(card, ("object",), views, tuple(None if e else 0.25 for e in bare), 0.1, "mean")
     mean = vectors.mean(1)
     norms = np.linalg.norm(mean, axis=-1, keepdims=True)
     return dataclasses.replace(

@@ -10,7 +10,7 @@ State = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # points, rotatio
 MAX_STEPS = 20000  # maximum number of cached steps; motion stops after the last
 
 
-class SteppedPath:
+class MidpointPath:
     """`point_dynamics.rk2` of the same points at many times, with bit-identical results.
 
     A point whose position is no longer finite stays at its last finite position. All points stop after `MAX_STEPS`.

@@ -22,7 +22,7 @@ LINE = 1e-3  # minimum ratio of the smallest to the largest moment; collinear bo
 _GAP = 1e-9  # minimum relative gap between moments; Euler's solution divides by their differences
 _SAMPLES = 256  # per period; the Fourier series converges like exp(-n), more slowly near a separatrix
 _TINY = 1e-300
-_LEAST_M1 = 1e-20  # keeps spins off the separatrix, where the period is infinite
+_MIN_M1 = 1e-20  # keeps spins off the separatrix, where the period is infinite
 
 
 def inertia(points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
@@ -51,7 +51,7 @@ def tumbles(body: np.ndarray) -> bool:
     return bool(LINE * moments[2] < moments[0] < (1 - DISTINCT) * moments[2])
 
 
-def turns(body: np.ndarray, w: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rotations_and_spins(body: np.ndarray, w: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotations and angular velocities of a free body.
 
     Args:
@@ -122,7 +122,7 @@ class _Path:
 
     def spins(self, u: np.ndarray) -> np.ndarray:
         """Angular velocities about the principal axes. [B, S] -> [B, S, 3]"""
-        sn, cn, dn = elliptic(u, self.m1[..., None])
+        sn, cn, dn = jacobi_elliptic(u, self.m1[..., None])
         return np.stack([cn, sn, dn], -1) * self.peaks[..., None, :]
 
     def precession(self, spins: np.ndarray) -> np.ndarray:
@@ -153,7 +153,7 @@ class _Path:
     @functools.cached_property
     def _waves(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mean precession rate [B, 1]; amplitudes and frequencies in u of the Fourier series of its integral."""
-        quarter = complete(self.m1)
+        quarter = elliptic_k(self.m1)
         grid = 2 * quarter[..., None] * np.arange(_SAMPLES) / _SAMPLES  # one period of the squared spins
         waves = np.fft.rfft(self.precession(self.spins(grid)), axis=-1) / _SAMPLES
         numbers = np.arange(1, _SAMPLES // 2)
@@ -198,14 +198,14 @@ def _solve(body: np.ndarray, w: np.ndarray) -> _Path:
     rate = np.sqrt(high * gap23 / (i1 * i2 * i3))
     m = np.where(high > 0, low * gap12 / np.maximum(high * gap23, _TINY), 0.0)
     m1 = np.abs(circling) * gap13 / np.maximum(high * gap23, _TINY)
-    m1 = np.where(high > 0, np.clip(np.where(m < 0.5, 1 - m, m1), _LEAST_M1, 1.0), 1.0)
+    m1 = np.where(high > 0, np.clip(np.where(m < 0.5, 1 - m, m1), _MIN_M1, 1.0), 1.0)
     amplitude = np.arctan2(side * order * spins[..., 1] * np.sqrt(i2 * gap23), spins[..., 0] * np.sqrt(i1 * gap13))
     squares = (moments * peaks) ** 2
     pole = np.where(squares[..., 2] > np.minimum(squares[..., 0], squares[..., 1]), 0, 2)
-    return _Path(axes, moments, peaks, rate, incomplete(amplitude, m1), m1, pole)
+    return _Path(axes, moments, peaks, rate, elliptic_f(amplitude, m1), m1, pole)
 
 
-def _means(m1: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+def _arithmetic_geometric_means(m1: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
     """Arithmetic and geometric means a, b and half differences c of the AGM iteration from 1 and sqrt(1 - m)."""
     a, b = [np.ones_like(m1)], [np.sqrt(m1)]
     c = [np.sqrt(np.maximum(1 - m1, 0.0))]
@@ -216,14 +216,14 @@ def _means(m1: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray], list[np.
     return a, b, c
 
 
-def complete(m1: np.ndarray) -> np.ndarray:
+def elliptic_k(m1: np.ndarray) -> np.ndarray:
     """Complete elliptic integral K, a quarter period of sn, for parameters m = 1 - m1. [...]"""
-    return 0.5 * np.pi / _means(np.asarray(m1, np.float64))[0][-1]
+    return 0.5 * np.pi / _arithmetic_geometric_means(np.asarray(m1, np.float64))[0][-1]
 
 
-def incomplete(amplitude: np.ndarray, m1: np.ndarray) -> np.ndarray:
+def elliptic_f(amplitude: np.ndarray, m1: np.ndarray) -> np.ndarray:
     """Incomplete elliptic integral F: u with sn u = sin(amplitude), cn u = cos(amplitude). Any angle. [...]"""
-    a, b, _ = _means(np.asarray(m1, np.float64))
+    a, b, _ = _arithmetic_geometric_means(np.asarray(m1, np.float64))
     phi = np.asarray(amplitude, np.float64)
     for x, y in zip(a[:-1], b[:-1], strict=True):
         turned = np.round(phi / np.pi)
@@ -231,9 +231,9 @@ def incomplete(amplitude: np.ndarray, m1: np.ndarray) -> np.ndarray:
     return phi / (2.0 ** (len(a) - 1) * a[-1])
 
 
-def elliptic(u: np.ndarray, m1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def jacobi_elliptic(u: np.ndarray, m1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Jacobi's sn, cn, dn of u for parameters m = 1 - m1, broadcast. [...] each"""
-    a, _, c = _means(np.asarray(m1, np.float64))
+    a, _, c = _arithmetic_geometric_means(np.asarray(m1, np.float64))
     phi = 2.0 ** (len(a) - 1) * a[-1] * u
     for x, z in zip(a[:0:-1], c[:0:-1], strict=True):
         phi = 0.5 * (phi + np.arcsin(np.clip(z / x * np.sin(phi), -1, 1)))
