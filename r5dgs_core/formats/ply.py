@@ -8,7 +8,7 @@ encoding) and obj_id. Other columns and elements are skipped.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -47,7 +47,14 @@ _LONGEST_NUMBER = 400  # characters, including the separator
 _MAX_DIGITS = 18  # digits of a row count
 
 
-def write(splats: Splats, path: str | Path, *, plain: bool = False, origin: np.ndarray | None = None) -> Path:
+def write(
+    splats: Splats,
+    path: str | Path,
+    *,
+    plain: bool = False,
+    origin: np.ndarray | None = None,
+    comments: Sequence[str] = (),
+) -> Path:
     """Write a binary little-endian PLY, atomically.
 
     Args:
@@ -55,6 +62,7 @@ def write(splats: Splats, path: str | Path, *, plain: bool = False, origin: np.n
         path: Target file.
         plain: Omit identities and ids, for viewers that reject unknown columns.
         origin: Point of the world that the centres are relative to, stored in a header comment; zero if None. [3]
+        comments: Further comments of the header, ASCII.
 
     Returns:
         The path written.
@@ -68,6 +76,7 @@ def write(splats: Splats, path: str | Path, *, plain: bool = False, origin: np.n
     header = ["ply", "format binary_little_endian 1.0", "comment SplatRenderMode: default"]
     if origin is not None and np.any(origin):
         header.append("comment origin " + " ".join(repr(float(value)) for value in origin))
+    header += [f"comment {text}" for text in comments]
     header += [f"element vertex {len(data)}", *(f"property {kinds[kind]} {name}" for name, kind, _ in columns)]
     try:
         with atomic_files.replacing(path) as stream:
@@ -82,7 +91,19 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     """Write the Gaussians at each time, in the world of the scene file. Implements `registry.Format.write`."""
     player = Player(scene)
     for t, target in zip(options.times, FORMAT.paths(path, options), strict=True):
-        yield write(played_splats.at(player, t, options.object_ids), target, origin=scene.origin)
+        splats = played_splats.at(player, t, options.object_ids)
+        yield write(splats, target, origin=scene.origin, comments=_bands(scene, t, options.object_ids))
+
+
+def _bands(scene: Scene, t: float, object_ids: Collection[int] | None) -> list[str]:
+    """Return a comment for each motion group with a confidence band past t_max: object id, half width, half angle."""
+    shown = [g for g in scene.groups if g.role == "body" and (object_ids is None or g.object_id in object_ids)]
+    found = [(g.object_id, g.history.band) for g in shown if t > scene.t_max and g.history.band is not None]
+    times = np.array([t])
+    return [
+        f"band {object_id} {band.level:g} {band.widths(times)[0]:.6g} {band.angles(times)[0]:.6g}"
+        for object_id, band in found
+    ]
 
 
 FORMAT = registry.Format(

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.formats import ply
+from r5dgs_core.formats import ply, registry
+from r5dgs_core.motion.history import Band, History
 from r5dgs_core.scene.splats import Splats
 from tests.support.scenes import make_scene
 
@@ -189,3 +190,17 @@ def test_ids_that_are_no_whole_numbers_of_32_bits_are_refused(tmp_path, value):
     path.write_bytes(header("ascii", [*COLUMNS, ("obj_id", "float")], 1) + (" ".join(row) + "\n").encode())
     with pytest.raises(errors.SceneFileError, match="obj_id"):
         ply.read(path)
+
+
+@pytest.mark.parametrize(("after", "object_ids", "expected"), [(0, None, 0), (1, None, 1), (1, frozenset(), 0)])
+def test_predicted_frames_state_the_confidence_band(tmp_path, after, object_ids, expected):
+    scene = make_scene()
+    body = next(k for k, group in enumerate(scene.groups) if group.role == "body")
+    groups = [dataclasses.replace(group, history=History()) for group in scene.groups]
+    band = Band((scene.t_max, scene.t_max + 2), (0.1, 0.3), (0.5, 0.7))
+    groups[body] = dataclasses.replace(groups[body], history=History(band=band))
+    scene = dataclasses.replace(scene, groups=tuple(groups))
+    options = registry.Options(times=(scene.t_max + after,), object_ids=object_ids)
+    (path,) = ply.export(scene, tmp_path / "a.ply", options)
+    lines = [line for line in path.read_bytes().split(b"end_header")[0].decode().splitlines() if "band" in line]
+    assert lines == expected * [f"comment band {groups[body].object_id} 0.95 0.2 0.6"]
