@@ -60,13 +60,13 @@ def version(scene: Scene) -> int:
     return 2 if _used(scene) else 1
 
 
-def dump(scene: Scene) -> dict[str, Any]:
+def to_json(scene: Scene) -> dict[str, Any]:
     """Features of a scene and their entries in ``scene.json``; empty if version 1 suffices."""
     used = _used(scene)
     if not used:
         return {}
     origin = {"origin": scene.origin.tolist()} if ORIGIN in used else {}
-    hulls = {"hulls": hull_json.dump(scene)} if HULLS in used else {}
+    hulls = {"hulls": hull_json.to_json(scene)} if HULLS in used else {}
     return {"features": [asdict(feature) for feature in used], **origin, **hulls}
 
 

@@ -44,7 +44,7 @@ def _parameters(segment: Segment) -> dict[str, Any]:
 
 
 def read(row: Row) -> History:
-    """Inverse of `tree`, from a motion group. Raises `SceneFileError` naming place and key."""
+    """Inverse of `to_json`, from a motion group. Raises `SceneFileError` naming place and key."""
     return History(
         events=() if row.lacks("events") else row.each("events", _event),
         segments=() if row.lacks("segments") else row.each("segments", _segment),

@@ -16,7 +16,7 @@ from .scene import Scene
 MAX_VERTICES = 64
 
 
-def dump(scene: Scene) -> list[dict[str, Any]]:
+def to_json(scene: Scene) -> list[dict[str, Any]]:
     """Return the entries of ``hulls``; the vertices are rounded to float32."""
     return [
         {

@@ -12,7 +12,7 @@ from ..motion.models import MotionModel
 from .json_row import Row
 
 
-def tree(joint: Joint) -> dict[str, Any]:
+def to_json(joint: Joint) -> dict[str, Any]:
     """JSON form of a joint."""
     return {
         "kind": joint.kind,

@@ -144,7 +144,7 @@ def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int
             "format": FORMAT,
             "format_version": format_features.version(scene),
             "arrays": [name for name in DTYPES if name in arrays],
-            **format_features.dump(scene),
+            **format_features.to_json(scene),
         }
         text = scene_json.dump(scene, head)
         _add(archive, JSON_MEMBER, text, compression)

@@ -194,7 +194,7 @@ def _group_tree(group: MotionGroup) -> dict[str, Any]:
         "rigid_max": float(group.rigid_max),
         "seen": None if group.seen is None else [float(t) for t in group.seen],
         **history_json.to_json(group.history),
-        **({} if group.joint is None else {"parent": group.parent, "joint": joint_json.tree(group.joint)}),
+        **({} if group.joint is None else {"parent": group.parent, "joint": joint_json.to_json(group.joint)}),
     }
 
 
