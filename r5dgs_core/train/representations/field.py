@@ -123,7 +123,7 @@ class FieldRepresentation(Representation):
             colors = colors.index_copy(0, rows, spherical_harmonics.to_rgb(both, seen))
         if self._config.train.shading:
             seen_light = shading.seen_light(moved.quats, self.light)
-            factor = shading.factors(1, params["shading"][rows], seen_light, self.light)
+            factor = shading.unclamped_factors(1, params["shading"][rows], seen_light, self.light)
             colors = shading.shade_rows(colors, rows, factor)
         return fused_posing.activate(means, quats, log_scales, params["opacity_logits"], colors)
 

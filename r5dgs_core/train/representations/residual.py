@@ -50,7 +50,7 @@ def relight(
         Colours that include the members' shading [N, 3], and shading vectors that are zero for the members [N, 3].
     """
     seen_light = shading.seen_light(change.quats, (light @ rotmats)[groups])
-    factor = shading.factors(1, vectors[change.rows], seen_light, light)
+    factor = shading.unclamped_factors(1, vectors[change.rows], seen_light, light)
     return shading.shade_rows(colors, change.rows, factor), vectors.index_fill(0, change.rows, 0.0)
 
 

@@ -4,6 +4,8 @@ With shading vectors g, light l and a factor r at rest, the colour is c max(0, r
 since the first state; training has r = 1. From a state turned by Q, with b = r + (Q^T l - l) . g, the same colours are
 given by c b, Q g / b and 1. If b is small or negative, as on surfaces that face away from the light, they are given by
 c s, Q g / s and b / s with a small s: dark now, but lit as in training after turning back.
+
+`scene.diffuse_shading` clamps the same factors when a scene is played.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ def seen_light(quats: Array, light: Array) -> Array:
     return rotations.rotate(rotations.conjugate(quats), light)
 
 
-def factors(rest: float | Array, shading: Array, seen: Array, light: Array) -> Array:
+def unclamped_factors(rest: float | Array, shading: Array, seen: Array, light: Array) -> Array:
     """Return r + (R^T l - l) . g, before clamping at 0; numpy or torch.
 
     Args:
@@ -72,7 +74,7 @@ def rebind(
     Returns:
         Harmonics [N, K, 3], vectors [N, 3] and factors at rest [N] of the new state.
     """
-    factor = factors(rest, shading, seen_light(quats, light), light)
+    factor = unclamped_factors(rest, shading, seen_light(quats, light), light)
     scale = np.maximum(factor, MIN_FACTOR)
     colored = sh * scale[:, None, None]
     # The offset of one half scales too: dc_to_rgb(dc') = scale * dc_to_rgb(dc).

@@ -5,7 +5,7 @@ import pytest
 
 from r5dgs_core.motion import cubic_curves, models, rotations
 from r5dgs_core.playback import group_dynamics, modes, scene_player
-from r5dgs_core.scene import cameras, diffuse_shading, row_runs, validation
+from r5dgs_core.scene import cameras, row_runs, validation
 from tests.support.scenes import T_MAX, make_scene
 
 AFTER = np.nextafter(T_MAX, 1.0)
@@ -137,17 +137,6 @@ def test_shading_follows_the_light_in_the_objects_frame(scene):
     dark = scene.with_arrays(shading=scene.shading.vectors * 1e4)
     assert scene_player.Player(dark).frame(1.1).shading_factor.min() == 0
     assert scene_player.Player(make_scene(shading=False)).frame(1.1).shading_factor is None
-
-
-def test_one_turn_lights_gaussians_as_the_same_turn_for_each(scene):
-    turns = rotations.quats_to_rotmats(rotations.normalize(np.random.default_rng(4).normal(size=(30, 4))))
-    rest, vectors, light = diffuse_shading.rest_factors(scene)[:30], scene.shading.vectors[:30], scene.shading.light
-    wanted = [max(r + (turn.T @ light - light) @ v, 0) for r, v, turn in zip(rest, vectors, turns, strict=True)]
-    changes = diffuse_shading.light_change(light, turns)
-    np.testing.assert_allclose(diffuse_shading.factors(rest, vectors, changes), wanted, atol=1e-6)
-    for k in range(30):
-        one = diffuse_shading.factors(rest[k : k + 1], vectors[k : k + 1], changes[k])
-        assert one == pytest.approx(wanted[k], abs=1e-6)
 
 
 @pytest.mark.parametrize("t", [0.2, T_MAX, 1.1])
