@@ -32,12 +32,12 @@ def _jump(mode: str) -> float:
 
 
 def _random_access(mode: str) -> float:
-    """Number of values that differ between frames played in shuffled and in increasing order."""
+    """Number of values that differ between frames of one player in shuffled order and frames of a new player each."""
     times = [*np.linspace(0, 3, 19).tolist(), 0.3, 3.0 if mode == "rigid_paper" else HORIZON]
     forward = [scene_player.Player(every_motion(singles=True), mode).frame(t) for t in times]
-    scene, count = every_motion(singles=True), 0.0
+    player, count = scene_player.Player(every_motion(singles=True), mode), 0.0
     for i in np.random.default_rng(8).permutation(len(times)):
-        frame = scene_player.Player(scene, mode).frame(times[i])
+        frame = player.frame(times[i])
         count += different(frame.means, forward[i].means) + different(frame.quats, forward[i].quats)
     return count
 
