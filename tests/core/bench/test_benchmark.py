@@ -185,7 +185,7 @@ def test_a_record_stores_the_machines_of_training_and_measurement(made):
 
 def test_results_measured_elsewhere_keep_their_machine(made, monkeypatch):
     plan, _, _, result = made
-    monkeypatch.setattr(run_folder, "machine", lambda: {"processor": "another"})
+    monkeypatch.setattr(benchmark, "machine", lambda: {"processor": "another"})
     (found,) = benchmark.run_bench(plan, progress_kind="none")["results"]
     assert found["machine"] == result["results"][0]["machine"]
 
