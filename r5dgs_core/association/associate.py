@@ -27,7 +27,7 @@ from . import assignment, clustering, leave_one_out, segment_stack, supergaussia
 GAIN = 0.5  # minimum mean gain per changed pixel, relative to the usual IoU, for many images
 FEW = 4  # number of images at which the minimum gain is doubled, because little evidence can agree by chance
 SHOWN = 0.03  # minimum share of the images that show an object, clamped to 2 to 4 images
-MAX_GAUSSIANS = 60_000  # number of Gaussians above which neighbours are first grouped into patches
+MAX_WITHOUT_PATCHES = 60_000  # number of Gaussians above which neighbours are first grouped into patches
 CERTAIN = 0.25  # minimum share of object pixels assigned with certainty; below it, all incoming ids are kept
 DOUBTFUL = 0.55  # minimum margin of a certain assignment, see `assignment.Assignment.margins`
 
@@ -98,7 +98,7 @@ def associate(
     neighbours: np.ndarray | None = None,
     *,
     paths: np.ndarray | None = None,
-    most: int = MAX_GAUSSIANS,
+    most: int = MAX_WITHOUT_PATCHES,
 ) -> Association:
     """Find the objects that segments of many images show, and number the segments by object.
 

@@ -152,9 +152,8 @@ def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -
     # Only a free top needs the inertia, so it is computed only if that model is a candidate.
     shape = None
     if names is None or names == (candidates.FREE_TOP.name,):
-        shape = torque_free_rotation.inertia(scene.gaussians.means[rows] - group.pivot, weights) + _MIN_MOMENT * np.eye(
-            3
-        )
+        shape = torque_free_rotation.inertia(scene.gaussians.means[rows] - group.pivot, weights)
+        shape = shape + _MIN_MOMENT * np.eye(3)
     seen = (scene.tracks.times >= first - _SAME) & (scene.tracks.times <= last + _SAME)
     return model_selection.fit(
         scene.tracks.times,

@@ -14,13 +14,13 @@ from typing import Any
 
 from .. import input_paths
 from ..errors import CheckpointError
+from ..scene.model_checks import MAX_TIME
 
 KINDS = ("3dgs", "gaussian_grouping", "deformable_3dgs", "trace", "freegave")
 TITLES: dict[str, str] = dict(
     zip(KINDS, ("3D Gaussian Splatting", "Gaussian Grouping", "Deformable-3DGS", "TRACE", "FreeGave"), strict=True)
 )
 _MAX_BYTES = 1 << 20  # limit on reading cfg_args
-_MAX_TIME = 1e12
 _KNOWN = f"known are the run folders of {', '.join(TITLES.values())}"
 
 
@@ -59,7 +59,7 @@ class RunFolder:
             CheckpointError: ``cfg_args`` does not contain it.
         """
         value = self.config.get("max_time")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _MAX_TIME:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_TIME:
             found = f"{value!r:.60}" if "max_time" in self.config else "nothing"
             raise CheckpointError(
                 f"{self.folder / 'cfg_args'}: 'max_time': expected the last time of the deformation, found {found}; "

@@ -19,7 +19,7 @@ from . import break_fits
 from . import candidates as families
 from .candidates import Candidate, FittedCandidate, Noise
 
-MIN_AFTER = 2  # poses after a break
+MIN_POSES_AFTER = 2  # minimum number of poses after a break
 _BLOCKS = {
     "v": Block(3),
     "w": Block(3),
@@ -120,7 +120,7 @@ class BreakCandidate(Candidate):
 
     @property
     def poses_with_choices(self) -> int:
-        return self.gap + MIN_AFTER
+        return self.gap + MIN_POSES_AFTER
 
     def _block(self, name: str) -> Block:
         return _BLOCKS[name] if name in _BLOCKS else super()._block(name)
@@ -187,7 +187,7 @@ def search(track: PoseTrack, noise: Noise, hopeless: float = np.inf, first_gap: 
         hopeless: See `candidates.solve`.
         first_gap: Minimum number of poses before a break.
     """
-    gaps = np.arange(first_gap, len(track) - MIN_AFTER + 1)
+    gaps = np.arange(first_gap, len(track) - MIN_POSES_AFTER + 1)
     if len(gaps) == 0 or len(track) < 5:
         return []
     sides, low, high = _Sides(track, gaps), track.tau[gaps - 1], track.tau[gaps]

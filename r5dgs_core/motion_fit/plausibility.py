@@ -32,9 +32,8 @@ def runs_away(solution: FittedCandidate, track: PoseTrack) -> bool:
         return False
     ends, tau = ends[starts], track.tau
     ways = track.displacements[ends] - track.displacements[starts]
-    seen = (ways**2).sum(-1) + 2 / 3 * (
-        (track.accumulated_rotation[ends] - track.accumulated_rotation[starts]) ** 2
-    ).sum(-1)
+    turns = track.accumulated_rotation[ends] - track.accumulated_rotation[starts]
+    seen = (ways**2).sum(-1) + 2 / 3 * (turns**2).sum(-1)
     most = float(np.max(np.sqrt(seen) * _AHEAD / (tau[ends] - tau[starts])))
     quats, d = solution.candidate.path(solution.theta, np.linspace(0.0, _AHEAD, 9))
     angle = float(rotations.angle_between(quats[1:], quats[:-1]).sum())

@@ -29,10 +29,10 @@ _POOR = 3.0  # residuals' variance, relative to the noise, above which a track m
 _HOPELESS_LOSS = 200.0  # excess of the loss of a candidate above which it is not refitted
 _HOPELESS = 30.0  # score excess of plain parts above which a track is not cut
 _CUTS = 4  # number of breaks at which such a track is cut on trial
-_MIN_SIDE = 4  # minimum number of poses of its parts
+_MIN_SIDE_POSES = 4  # minimum number of poses on each side of such a break
 _FEW_BLOCKS = {"v", "w"}  # blocks of laws for two or three poses
 _WELL = 1.5  # loss of a part, relative to that of noise, below which it is not searched again
-_MIN_PART = 7  # minimum number of poses after a break to search them for a separate law
+_MIN_PART_POSES = 7  # minimum number of poses after a break to search them for a separate law
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def _with_parts(whole: Selected, family: tuple[Candidate, ...], up: np.ndarray |
     for rows in (slice(0, first.gap), slice(first.gap, None)):
         track = whole.track.rows(rows)
         loss, free = float(whole.chosen.losses[rows].sum()), 6 * len(track) - first.law.parameters
-        if len(track) < _MIN_PART or loss < _WELL * min(whole.noise_level.level, 1.0) * free:
+        if len(track) < _MIN_PART_POSES or loss < _WELL * min(whole.noise_level.level, 1.0) * free:
             continue
         own = tuple(replace(candidate, window=track.window) for candidate in family)
         part = select(track, own, whole.noise, try_breaks=len(track) >= _FEW, up=up)
@@ -210,10 +210,10 @@ def _cut(
     """
     track, found = whole.track, []
     for solution in sorted(broken, key=lambda s: s.loss)[:_CUTS]:
-        gap = solution.candidate.poses_with_choices - breaks.MIN_AFTER
+        gap = solution.candidate.poses_with_choices - breaks.MIN_POSES_AFTER
         rows = (slice(0, gap), slice(gap, None))
         sides = [track.rows(row) for row in rows]
-        if min(map(len, sides)) < _MIN_SIDE or any(gap == other[1] for other in found):
+        if min(map(len, sides)) < _MIN_SIDE_POSES or any(gap == other[1] for other in found):
             continue
         plain = [_plain(side, whole.noise) for side in sides]
         found.append((sum(s.loss + s.parameters for s in plain), gap, solution, sides, plain))

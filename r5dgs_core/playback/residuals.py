@@ -127,7 +127,7 @@ class OwnMotion:
 
 
 class LiteralPaperMotion:
-    """LiteralPaperMotion form of Eq. 6 and 7 of the paper.
+    """Literal form of Eq. 6 and 7 of the paper.
 
     x_i = y_i + (p_r - y_r) + (R - I) (x_i - x_r) with y the state at t_max, x the canonical one and r the group's
     representative, which moves by its own dynamics and TRACE's integrator. This is not rigid if the object rotated

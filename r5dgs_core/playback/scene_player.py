@@ -144,7 +144,7 @@ class Player:
         Returns:
             The frame. Without an origin, Gaussians that did not move equal the bind state exactly.
         """
-        scene, poser, center = self.scene, self._poser, _checked(origin)
+        scene, poser, center = self.scene, self._poser, _checked_origin(origin)
         quats, displacements = self.group_poses(t)
         past = t > scene.t_max
         if past and self._base == "rigid_paper":
@@ -173,7 +173,7 @@ class Player:
             t: Time stored in the frame.
             origin: As for `frame`.
         """
-        poser, center = self._poser, _checked(origin)
+        poser, center = self._poser, _checked_origin(origin)
         means = poser.means(group_quats, group_displacements, center)
         log_scales = self.scene.gaussians.log_scales
         moved = _Moved(means, poser.quats(group_quats), log_scales, poser.shading(group_quats))
@@ -249,7 +249,7 @@ class _Moved:
         self.rows, self.turns = rows, since.T
 
 
-def _checked(origin: np.ndarray | None) -> np.ndarray:
+def _checked_origin(origin: np.ndarray | None) -> np.ndarray:
     """Copy an origin as float64, zeros if None. Raises ValueError unless it is three finite numbers. [3]"""
     center = np.zeros(3) if origin is None else np.array(origin, np.float64)
     if center.shape != (3,) or not np.isfinite(center).all():

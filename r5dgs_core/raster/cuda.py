@@ -291,7 +291,7 @@ class CudaBackend(TorchBackend):
         return like.device.type == "cuda" and like.dtype == torch.float32
 
     def why_unavailable(self, like: torch.Tensor) -> str | None:
-        """See `why_unavailable`."""
+        """See `Backend.why_unavailable`."""
         return why_unavailable(like.device, like.dtype)
 
     def rasterize_splats(

@@ -52,9 +52,8 @@ class Drag(MotionKind):
             columns = np.stack([ones, way, tau], -1) if "terminal" in blocks else turn
             place = first_guesses.least_squares(columns, track.displacements, track.weights)
             spin = first_guesses.least_squares(turn, track.accumulated_rotation, track.weights)
-            miss = ((columns @ place - track.displacements) ** 2).sum() + (
-                (turn @ spin - track.accumulated_rotation) ** 2
-            ).sum()
+            miss = ((columns @ place - track.displacements) ** 2).sum()
+            miss += ((turn @ spin - track.accumulated_rotation) ** 2).sum()
             guess = {"r": np.zeros(3), "e": place[0], "v": place[1], "w": spin[1], "terminal": place[-1]}
             found.append((float(miss), c, guess | {"log_c": np.log(np.array([c]))}))
         return [guess for _, _, guess in sorted(found, key=lambda entry: entry[:2])[:2]]

@@ -1,4 +1,7 @@
-"""Registry of the kinds of motion by name. Each is imported when it is first looked up."""
+"""Registry of the kinds of motion by name.
+
+Each is imported when it is first looked up, because its module imports `motion_model`, which looks up kinds.
+"""
 
 from __future__ import annotations
 

@@ -214,8 +214,8 @@ def _pull(
         return np.zeros(len(labels), np.int64), np.zeros(len(labels), np.float32)
     known_moving = np.append(moving_classes, np.zeros(count - len(moving_classes), bool))
     known_moving[0] = False
-    counts = np.where(companion_classes > 0, known_moving[companion_classes], known_moving[labels])
-    return companion_classes.astype(np.int64), (MOTION_WEIGHT * counts).astype(np.float32)
+    has_vote = np.where(companion_classes > 0, known_moving[companion_classes], known_moving[labels])
+    return companion_classes.astype(np.int64), (MOTION_WEIGHT * has_vote).astype(np.float32)
 
 
 def _decide(

@@ -239,7 +239,7 @@ def test_a_damped_swing_decays_to_its_centre():
         np.testing.assert_allclose(bend, -2 * spring.damping * rate - pull * (here - centre), atol=1e-4)
 
 
-def test_damped_clocks_approach_undamped_ones_and_each_other_smoothly():
+def test_damped_time_factors_approach_undamped_ones_and_each_other_smoothly():
     tau = np.array([[-1.3], [0.0], [0.3], [2.1]])
     for frequency in (1e-3, 1.0, 30.0):
         for damped, plain in zip(
@@ -318,7 +318,7 @@ def test_a_ball_that_does_not_bounce_stays_on_the_floor_and_one_that_loses_nothi
     assert high.max() > later[0] + 0.1 and high.min() > later[0] - 1e-6
 
 
-def test_the_clocks_run_steadily_without_a_frequency_to_the_bit_and_smoothly_towards_it():
+def test_the_time_factors_are_steady_without_a_frequency_to_the_bit_and_smooth_towards_it():
     tau = np.array([[-2.0], [0.0], [0.3], [7.1]])
     once, twice = models.time_factors(0.0, tau)
     assert once.tolist() == tau.tolist()
