@@ -7,7 +7,7 @@ from typing import Any
 
 from ..errors import DatasetError
 from ..playback import residuals
-from ..train import checkpoint_content, held_out_psnr, train_views
+from ..train import checkpoint_content, train_views, view_psnr
 from ..train.identity import label_cleanup
 from . import image_evidence
 from .draft import Context, Draft
@@ -47,11 +47,11 @@ def _on_training_views(draft: Draft, context: Context) -> dict[str, Any]:
     dataset, tensors = context.dataset, context.tensors
     behind = train_views.behind(dataset, context.config)
     try:
-        baked = held_out_psnr.training_psnr(dataset, behind, image_evidence.make_renderer(draft.scene))
+        baked = view_psnr.training_psnr(dataset, behind, image_evidence.make_renderer(draft.scene))
         if checkpoint_content.TRAIN_PSNR in tensors:
             before = float(tensors[checkpoint_content.TRAIN_PSNR])
         else:
-            before = held_out_psnr.training_psnr(
+            before = view_psnr.training_psnr(
                 dataset, behind, image_evidence.make_renderer(draft.trained or draft.scene)
             )
     except DatasetError:  # `simplify_motion` has logged it

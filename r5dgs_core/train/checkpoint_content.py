@@ -17,7 +17,7 @@ RESIDUAL_GAINS = "residual.gains"  # name of a tensor that may contain nan (unkn
 FROZEN = "held"  # name of a tensor: mask of the Gaussians whose centres are frozen
 DISCOVERED_MASKS = "discovery.masks"  # name of a tensor: packed masks of the training views
 DISCOVERED_LABELS = "discovery.labels"  # name of a tensor: labels that were found after the run instead of masks
-TRAIN_PSNR = "train_psnr"  # name of a tensor: `held_out_psnr.training_psnr` of a finished run, dB
+TRAIN_PSNR = "train_psnr"  # name of a tensor: `view_psnr.training_psnr` of a finished run, dB
 TENSORS = (*(f"gaussians.{name}" for name in (*PARAMETERS, "motion_ids")), "object_ids", "background", "generator")
 
 _WHOLE = (torch.int64, torch.int32)

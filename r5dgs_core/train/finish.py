@@ -11,7 +11,7 @@ import torch
 
 from ..config import training_needs
 from ..scene.splats import to_opacities
-from . import checkpoint_content, held_out_psnr
+from . import checkpoint_content, view_psnr
 from .identity import identity_training, label_cleanup, label_votes
 from .representations.fused_posing import PosedSplats
 from .train_views import TrainView
@@ -80,7 +80,7 @@ def final_tensors(trainer: Trainer, progress: Progress) -> dict[str, torch.Tenso
         progress({"event": "prepare", "text": f"no masks: {count} moving part{'s' * (count != 1)} found"})
         extra |= {"labels": labels, "object_ids": torch.arange(count + 1), checkpoint_content.DISCOVERED_LABELS: labels}
     with torch.no_grad():
-        shown = held_out_psnr.training_psnr(
+        shown = view_psnr.training_psnr(
             trainer.dataset,
             trainer.behind,
             lambda view: trainer.render(trainer.normalization.camera(view.camera), view.t).numpy(),

@@ -22,7 +22,7 @@ from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted, TrainingError
 from ..render import warm_up
 from ..time_left import Phase, TimedProgress
-from . import checkpoint, checkpoint_content, finish, held_out_psnr, interrupt, learning_curves, run_folder, step_log
+from . import checkpoint, checkpoint_content, finish, interrupt, learning_curves, run_folder, step_log, view_psnr
 from .identity import packed_masks
 from .representations.representation import TRACKS
 from .trainer import Trainer
@@ -111,7 +111,7 @@ class _Session:
     began_cpu: float | None
     resume_command: str
     progress: TimedProgress
-    held_out: held_out_psnr.HeldOutPsnr | None
+    held_out: view_psnr.HeldOutPsnr | None
     curves: learning_curves.LearningCurves
 
 
@@ -253,12 +253,12 @@ def take_step(trainer: Trainer, decision: int | None, progress: Progress) -> Non
         residual_trial.decide(trainer, progress)
 
 
-def _held_out_psnr(trainer: Trainer) -> held_out_psnr.HeldOutPsnr | None:
+def _held_out_psnr(trainer: Trainer) -> view_psnr.HeldOutPsnr | None:
     """Return the measurement on held-out views; None if there are none or ``train.probe_every`` is 0."""
     section = trainer.config.train
     if section.probe_every == 0 or not trainer.dataset.val:
         return None
-    return held_out_psnr.HeldOutPsnr(trainer, section.probe_views)
+    return view_psnr.HeldOutPsnr(trainer, section.probe_views)
 
 
 def _complete(session: _Session) -> None:

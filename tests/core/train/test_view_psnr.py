@@ -8,7 +8,7 @@ import torch
 
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.evaluation import evaluate
-from r5dgs_core.train import checkpoint, held_out_psnr, run, run_folder
+from r5dgs_core.train import checkpoint, run, run_folder, view_psnr
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
@@ -44,7 +44,7 @@ def test_the_measurement_agrees_with_the_evaluation(tiny, trained, baked):
     dataset = datasets.read(tiny.root)
     trainer = Trainer(dataset, trained.config)
     trainer.restore(checkpoint.load(trained.folder))
-    measurement = held_out_psnr.HeldOutPsnr(trainer, 5)
+    measurement = view_psnr.HeldOutPsnr(trainer, 5)
     assert len(measurement) == len(dataset.val) == 2
     result = evaluate.evaluate(baked, dataset)
     assert measurement.measure() == pytest.approx(result["splits"]["val"]["rigid"]["psnr"], abs=0.1)
@@ -52,7 +52,7 @@ def test_the_measurement_agrees_with_the_evaluation(tiny, trained, baked):
 
 def test_the_number_of_measured_views_is_limited(tiny):
     trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings())
-    assert len(held_out_psnr.HeldOutPsnr(trainer, 1)) == 1
+    assert len(view_psnr.HeldOutPsnr(trainer, 1)) == 1
 
 
 def test_without_held_out_views_nothing_is_measured(tmp_path):
@@ -66,5 +66,5 @@ def test_without_held_out_views_nothing_is_measured(tmp_path):
 def test_the_psnr_of_a_constant_error_is_exact(levels):
     target = np.zeros((4, 5, 3), np.uint8)
     image = np.full((4, 5, 3), levels / 255, np.float32)
-    assert held_out_psnr.psnr_8_bit(image, target) == pytest.approx(20 * np.log10(255 / levels))
-    assert held_out_psnr.psnr_8_bit(target.astype(np.float32), target) == 99
+    assert view_psnr.psnr_8_bit(image, target) == pytest.approx(20 * np.log10(255 / levels))
+    assert view_psnr.psnr_8_bit(target.astype(np.float32), target) == 99

@@ -22,7 +22,7 @@ TRAINING_VIEWS = 150  # maximum number of compared training views
 
 
 class HeldOutPsnr:
-    """Views of the split ``val``, spread evenly, in the trainer's coordinates.
+    """PSNR on views of the split ``val``, spread evenly.
 
     Args:
         trainer: The run; its ``dataset`` provides the views.
