@@ -13,6 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from ..config.config import Config
+from ..model import track_state
 from ..motion import rotations
 from ..scene.scene import Dynamics, MotionGroup, Residuals
 from ..train.normalization import Normalization
@@ -145,9 +146,16 @@ def residual_need(tensors: Mapping[str, Tensor], names: Mapping[int, str], confi
     gains, ids = tensors[residual.GAINS].numpy(), tensors["object_ids"].numpy()
     kept = [] if field is None else field.bodies
     largest = float(np.nanmax(gains)) if np.isfinite(gains).any() else 0.0
-    bent = ", ".join(f"{names.get(int(ids[b]), f'object {ids[b]}')} ({gains[b - 1]:+.1f})" for b in kept)
-    rigid = f"{len(gains) - len(kept)} of {len(gains)} objects are rigid"
+    labels = [names.get(int(object_id), f"object {object_id}") for object_id in ids]
+    bodies = (
+        np.bincount(tensors[track_state.OWNERS].numpy()) if track_state.OWNERS in tensors else np.ones(len(ids), int)
+    )
+    divided = [b for b in range(1, len(bodies)) if bodies[b] > 1]
+    bent = ", ".join(f"{labels[b]} ({gains[b - 1]:+.1f})" for b in kept)
+    parts = ", ".join(f"{labels[b]} ({bodies[b]})" for b in divided)
+    rigid = f"{len(gains) - len(kept) - len(divided)} of {len(gains)} objects are rigid"
     if kept and not there and config.needs.residuals != "off":
         bent += ", too little to be stored"
-    reason = "gain by bending, dB: " + (f"{bent}; {rigid}" if bent else rigid)
+    found = (bent, f"divided into parts: {parts}" if parts else "", rigid)
+    reason = "gain by bending, dB: " + "; ".join(text for text in found if text)
     return Need("residuals", largest, threshold, there, reason, there)

@@ -263,6 +263,16 @@ def test_the_table_marks_deformation_too_small_to_store():
         assert "ball (+0.7)" in reason and ("too little to be stored" in reason) != there
 
 
+def test_the_table_names_objects_that_are_divided_into_parts():
+    tensors = {"residual.gains": torch.tensor([-1.0, 3.0, 0.1]), "object_ids": torch.tensor([0, 1, 2, 3])}
+    names, settings = {2: "arm"}, config.load(None)
+    before = point_motion.residual_need(tensors, names, settings, there=False).reason
+    assert before.endswith("3 of 3 objects are rigid")
+    tensors["tracks.owners"] = torch.tensor([0, 1, 2, 3, 2])
+    after = point_motion.residual_need(tensors, names, settings, there=False).reason
+    assert after.endswith("divided into parts: arm (2); 2 of 3 objects are rigid")
+
+
 SETTINGS = ("train.iterations=300", "residual.trial_steps=400", "identity.iterations=0")
 
 
