@@ -7,13 +7,13 @@ Notation: R Gaussians with states x_s at the knots s, last knot T. Their group m
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from torch import Tensor
 
 from ..config.config import Config
-from ..model import track_state
 from ..motion import rotations
 from ..scene.scene import Dynamics, MotionGroup, Residuals
 from ..train.normalization import Normalization
@@ -38,7 +38,9 @@ def apply(draft: Draft, context: Context) -> Draft:
         )
     bent = draft.bent
     if registry.by_name(context.state.representation).moves:
-        bent = residual_need(context.tensors, context.dataset.object_names, context.config, bends is not None)
+        bodies = Counter(group.object_id for group in draft.observed.motion.groups if group.role == "body")
+        names = context.dataset.object_names
+        bent = residual_need(context.tensors, names, bodies, context.config, bends is not None)
     if not bent.on or context.wanted.residuals == "off":
         bends = None
     groups = scene.groups if bends is None else with_rigid_errors(scene.groups, scene.gaussians.motion_ids, bends)
@@ -128,12 +130,15 @@ def with_rigid_errors(groups: Sequence[MotionGroup], motion_ids: np.ndarray, res
     return result
 
 
-def residual_need(tensors: Mapping[str, Tensor], names: Mapping[int, str], config: Config, there: bool) -> Need:
+def residual_need(
+    tensors: Mapping[str, Tensor], names: Mapping[int, str], bodies: Mapping[int, int], config: Config, there: bool
+) -> Need:
     """Return the row "residuals" of the needs table; its value is the largest gain, dB.
 
     Args:
         tensors: Tensors of the checkpoint.
         names: Names of the objects by id.
+        bodies: Number of bodies by object id.
         config: The run's configuration.
         there: True if the scene has residuals.
     """
@@ -146,13 +151,10 @@ def residual_need(tensors: Mapping[str, Tensor], names: Mapping[int, str], confi
     gains, ids = tensors[residual.GAINS].numpy(), tensors["object_ids"].numpy()
     kept = [] if field is None else field.bodies
     largest = float(np.nanmax(gains)) if np.isfinite(gains).any() else 0.0
-    labels = [names.get(int(object_id), f"object {object_id}") for object_id in ids]
-    bodies = (
-        np.bincount(tensors[track_state.OWNERS].numpy()) if track_state.OWNERS in tensors else np.ones(len(ids), int)
-    )
-    divided = [b for b in range(1, len(bodies)) if bodies[b] > 1]
-    bent = ", ".join(f"{labels[b]} ({gains[b - 1]:+.1f})" for b in kept)
-    parts = ", ".join(f"{labels[b]} ({bodies[b]})" for b in divided)
+    labels = {int(i): names.get(int(i), f"object {i}") for i in ids}
+    divided = [i for i in labels if bodies.get(i, 1) > 1]
+    bent = ", ".join(f"{labels[int(ids[b])]} ({gains[b - 1]:+.1f})" for b in kept)
+    parts = ", ".join(f"{labels[i]} ({bodies[i]})" for i in divided)
     rigid = f"{len(gains) - len(kept) - len(divided)} of {len(gains)} objects are rigid"
     if kept and not there and config.needs.residuals != "off":
         bent += ", too little to be stored"

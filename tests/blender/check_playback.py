@@ -74,7 +74,7 @@ def set_time(collection, t: float) -> None:
 def position_error(collection, scene, modules, t: float) -> float:
     """Largest distance between a point as Blender evaluates it and playback, as a fraction of the scene's size."""
     set_time(collection, t)
-    expected = modules["scene_player"].frame(scene, t).means.astype(np.float64)
+    expected = modules["scene_player"].Player(scene).frame(t).means.astype(np.float64)
     world = modules["cameras"].WORLD_TO_BLENDER[scene.world_convention]
     depsgraph = bpy.context.evaluated_depsgraph_get()
     worst, seen = 0.0, 0

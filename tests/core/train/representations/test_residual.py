@@ -250,7 +250,7 @@ def test_nothing_is_tried_with_a_single_observed_time(tiny, tmp_path):
     trainer = advance(Trainer(datasets.read(tmp_path / "still"), settings), 30)
     tensors = trainer.state().tensors
     assert trainer.motion.name == "still" and not any(name.startswith("residual.") for name in tensors)
-    row = point_motion.residual_need(tensors, {}, settings, there=False)
+    row = point_motion.residual_need(tensors, {}, {}, settings, there=False)
     assert (row.value, row.on) == (0.0, False) and "none was tried" in row.reason
 
 
@@ -259,17 +259,16 @@ def test_the_table_marks_deformation_too_small_to_store():
     tensors = residual.tensors_of(field_on(means, ids, weights).only([2]))
     tensors |= {"residual.gains": torch.tensor([-1.0, 0.7]), "object_ids": torch.tensor([0, 1, 2])}
     for there in (True, False):
-        reason = point_motion.residual_need(tensors, {2: "ball"}, config.load(None), there).reason
+        reason = point_motion.residual_need(tensors, {2: "ball"}, {}, config.load(None), there).reason
         assert "ball (+0.7)" in reason and ("too little to be stored" in reason) != there
 
 
 def test_the_table_names_objects_that_are_divided_into_parts():
     tensors = {"residual.gains": torch.tensor([-1.0, 3.0, 0.1]), "object_ids": torch.tensor([0, 1, 2, 3])}
     names, settings = {2: "arm"}, config.load(None)
-    before = point_motion.residual_need(tensors, names, settings, there=False).reason
+    before = point_motion.residual_need(tensors, names, {1: 1, 2: 1, 3: 1}, settings, there=False).reason
     assert before.endswith("3 of 3 objects are rigid")
-    tensors["tracks.owners"] = torch.tensor([0, 1, 2, 3, 2])
-    after = point_motion.residual_need(tensors, names, settings, there=False).reason
+    after = point_motion.residual_need(tensors, names, {1: 1, 2: 2, 3: 1}, settings, there=False).reason
     assert after.endswith("divided into parts: arm (2); 2 of 3 objects are rigid")
 
 
