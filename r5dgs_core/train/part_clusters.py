@@ -17,7 +17,7 @@ from ..model import track_state
 from ..motion import rotations
 from . import motion_clusters
 
-TOLERANCE = 0.02  # residual allowed in the search for parts, relative to the size of the body
+TOLERANCES = (0.02, 0.01, 0.005)  # residuals allowed in the search for parts, relative to the size of the body
 MIN_SHARE = 0.08  # minimum share of a part in the members
 MIN_MEMBERS = 8  # minimum number of members of a part
 NEIGHBOURS = 8  # members over which residuals are averaged before a member joins a part
@@ -43,8 +43,11 @@ def find(paths: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> np
         return None
     middle = np.median(paths[:, 0], axis=0)
     size = float(np.quantile(np.linalg.norm(paths[:, 0] - middle, axis=1), 0.9))
-    labels = motion_clusters.find(paths[:, 1:], weights, TOLERANCE * size, fewest, rng)
-    if labels.max() < 1:
+    for tolerance in TOLERANCES:  # residuals blur the border of parts that turn little against each other
+        labels = motion_clusters.find(paths[:, 1:], weights, tolerance * size, fewest, rng)
+        if labels.max() > 0:
+            break
+    else:
         return None
     labels = _refined(paths, weights, labels)
     while labels.max() > 1:

@@ -9,14 +9,14 @@ from r5dgs_core.train import checkpoint_content, part_clusters
 KNOTS = np.linspace(0.0, 1.0, 9)
 
 
-def arm_paths(rng, count=120, noise=0.002, bend=1.4):
+def arm_paths(rng, count=120, noise=0.002, bend=1.4, turn=0.6):
     """Paths of the points of two links, canonical positions first, and the link of each point."""
     links = np.repeat([0, 1], [count, count // 2])
     points = rng.uniform([0, -0.1, -0.1], [1, 0.1, 0.1], (len(links), 3))
     points[links == 1, 0] = 1 + 0.7 * points[links == 1, 0]
     paths = [points]
     for t in KNOTS:
-        upper = rotations.rotvecs_to_quats(np.array([0.0, 0.6 * t, 0.0]))
+        upper = rotations.rotvecs_to_quats(np.array([0.0, turn * t, 0.0]))
         own = rotations.rotvecs_to_quats(np.array([0.0, -bend * t, 0.0]))
         elbow = np.array([1.0, 0.0, 0.0])
         bent = np.where(links[:, None] == 1, elbow + rotations.rotate(own[None], points - elbow), points)
@@ -31,6 +31,13 @@ def test_the_links_of_an_arm_are_found():
     assert labels is not None and labels.max() == 1
     assert (labels == links).mean() > 0.93  # near the joint both motions are alike
     assert part_clusters.distance(paths, np.ones(len(paths)), labels) < 0.02
+
+
+def test_links_that_hardly_bend_are_found():
+    rng = np.random.default_rng(0)
+    paths, links = arm_paths(rng, bend=0.2, turn=0.0)
+    labels = part_clusters.find(paths, np.ones(len(paths)), rng)
+    assert labels is not None and (labels == links).mean() > 0.9
 
 
 def test_a_rigid_body_and_too_few_points_have_no_parts():
