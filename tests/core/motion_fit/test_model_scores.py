@@ -3,10 +3,11 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
-from r5dgs_core.motion import models
+from r5dgs_core.motion import models, rotations
 from r5dgs_core.motion.pose_track import PoseTrack
-from r5dgs_core.motion_fit import candidates, model_scores
+from r5dgs_core.motion_fit import candidates, model_scores, slips
 from tests.support import problems
 
 TRUTH = models.MotionModel("translation", velocity=[0.8, -0.5, 0.3])
@@ -70,3 +71,114 @@ def test_exact_poses_that_leave_a_direction_undetermined_give_a_finite_variance(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert np.isfinite(model_scores.covariance_factor(solution, track, noise, least))
+
+
+def with_residuals(residuals, name="translation", weights=None):
+    """Solution of a law with given residuals [S, 6]."""
+    law = candidates.BY_NAME[name]
+    weights = np.ones(len(residuals)) if weights is None else weights
+    size = law.parameters
+    return candidates.FittedCandidate(law, np.zeros(size), np.eye(size), np.asarray(residuals, float), weights)
+
+
+def cauchy_loss(residuals):
+    return 24 * np.log(1 + (residuals**2).sum(1) / 24).sum()
+
+
+def correlated(rng, rho, shape):
+    """Noise of unit variance whose neighbours along the first axis have the correlation rho."""
+    noise = rng.normal(size=shape)
+    for i in range(1, len(noise)):
+        noise[i] = rho * noise[i - 1] + np.sqrt(1 - rho**2) * noise[i]
+    return noise
+
+
+def test_the_score_adds_the_scaled_loss_the_parameters_and_the_choices():
+    residuals = np.random.default_rng(0).normal(size=(10, 6))
+    level = model_scores.NoiseLevel(count=10, level=2.0, inflation=3.0)
+    smooth = with_residuals(residuals)
+    expected = cauchy_loss(residuals) / (2 * 3) + 9 * np.log(6 * 10 / 3)
+    assert level.score(smooth) == pytest.approx(expected)
+    slip = slips.Slip("slip", "translation", ("v", "b"), start=2, stop=5, low=-0.9, high=-0.5)
+    slipped = dataclasses.replace(smooth, candidate=slip)
+    assert level.score(slipped) == pytest.approx(expected + 3 * np.log(6 * 10 / 3) + 2 * 2 * np.log(10))
+
+
+def test_the_noise_level_is_the_least_loss_per_free_number():
+    rng = np.random.default_rng(1)
+    coarse, fine = 2 * rng.normal(size=(20, 6)), 0.7 * rng.normal(size=(20, 6))
+    solutions = [with_residuals(coarse, "static"), with_residuals(fine)]
+    expected = cauchy_loss(fine) / (6 * 20 - 9)
+    assert model_scores.NoiseLevel.of(solutions).level == pytest.approx(expected)
+    assert model_scores.NoiseLevel.of(solutions, least=3.0).level == 3.0
+    parts = model_scores.NoiseLevel.of_parts(solutions, 0.0)
+    assert parts.count == 40
+    assert parts.level == pytest.approx((cauchy_loss(coarse) + cauchy_loss(fine)) / (6 * 40 - 6 - 9))
+
+
+def test_the_noise_is_as_correlated_as_that_of_the_candidate_with_the_best_score():
+    signs = np.where(np.arange(20) % 2, 1.0, -1.0)[:, None] * np.ones(6)
+    # Six more parameters cost 6 log 120 = 29; in units of the least noise level, 0.1, the loss falls by 55.
+    simple, better = with_residuals(np.full((20, 6), 0.37), "static"), with_residuals(0.3 * signs, "translation + spin")
+    assert model_scores.NoiseLevel.of([simple, better]).inflation == pytest.approx(1.0)
+    # Here it falls by 4 only.
+    simple = with_residuals(np.full((20, 6), 0.306), "static")
+    assert model_scores.NoiseLevel.of([simple, better]).inflation > 5
+
+
+@pytest.mark.parametrize("rho", [0.3, 0.6])
+def test_the_inflation_is_the_factor_on_the_variance_of_a_mean_of_correlated_noise(rho):
+    count = 500
+    noise = correlated(np.random.default_rng(2), rho, (count, 6))
+    lags = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    expected = (rho**lags).sum() / count
+    assert model_scores.NoiseLevel.of([with_residuals(noise)]).inflation == pytest.approx(expected, rel=0.1)
+
+
+def test_the_inflation_allows_for_the_correlation_that_a_fit_removes():
+    rho, count = 0.4, 15
+    line = np.stack([np.ones(count), np.arange(count)], -1)
+    rng, parts = np.random.default_rng(3), []
+    for _ in range(100):
+        noise = correlated(rng, rho, (count, 6))
+        parts.append(with_residuals(noise - line @ np.linalg.lstsq(line, noise, rcond=None)[0], "translation + spin"))
+    products = sum((s.residuals[1:] * s.residuals[:-1]).sum() for s in parts)
+    biased = products / sum((s.residuals**2).sum() for s in parts)
+    inflation = model_scores.NoiseLevel.of_parts(parts, 0.0).inflation
+    assert abs((inflation - 1) / (inflation + 1) - rho) < 0.5 * abs(biased - rho)
+
+
+def test_the_covariance_factor_averages_generalized_least_squares_over_the_correlation():
+    rng, count = np.random.default_rng(4), 12
+    times = np.sort(rng.uniform(-1, 0, count))
+    times -= times[-1]
+    d = times[:, None] * TRUTH.velocity + SIGMA * correlated(rng, 0.5, (count, 3))
+    quats = rotations.rotvecs_to_quats(1e-6 * rng.normal(size=(count, 3)))
+    track = PoseTrack(times, quats, d, rng.uniform(0.5, 1.5, count))
+    noise = candidates.Noise(SIGMA, 1e-6)
+    law = candidates.BY_NAME["translation"]
+    solution = candidates.solve(law, track, noise)
+    assert solution is not None
+
+    # Small rotations make the model linear: rotation = r, displacement = e + v t, in units of the noise.
+    rotvecs = 2 * quats[:, 1:]
+    observed = np.concatenate([rotvecs / 1e-6, d / SIGMA], 1).T.ravel()
+    line = np.stack([np.ones(count), times], -1)
+    columns = block_diag(*[np.ones((count, 1))] * 3, *[line] * 3)
+    squares = (solution.residuals**2).sum(1)
+    scale = np.tile(1 / np.sqrt(track.weights / (1 + squares / candidates.SOFTNESS)), 6)
+    steps = np.abs(np.subtract.outer(times, times)) / np.median(np.diff(times))
+    likelihoods, variances = [], []
+    for rho in model_scores._RHOS:
+        covariance = np.kron(np.eye(6), rho**steps) * np.outer(scale, scale)
+        inverse = np.linalg.inv(covariance)
+        normal = columns.T @ inverse @ columns
+        rest = observed - columns @ np.linalg.solve(normal, columns.T @ inverse @ observed)
+        loss, free = rest @ inverse @ rest, 6 * count - 9
+        logs = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(normal)[1] + free * np.log(loss)
+        likelihoods.append(-0.5 * logs)
+        variances.append(loss / free * (1 + rho) / (1 - rho))
+    shares = np.exp(np.array(likelihoods) - max(likelihoods))
+    least = model_scores.NoiseLevel(count, 1e-6, 1.0)
+    found = model_scores.covariance_factor(solution, track, noise, least)
+    assert found == pytest.approx(shares @ variances / shares.sum(), rel=1e-4)

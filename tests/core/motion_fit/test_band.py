@@ -1,0 +1,138 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from r5dgs_core.motion import models, rotations
+from r5dgs_core.motion.history import Band
+from r5dgs_core.motion.pose_track import PoseTrack
+from r5dgs_core.motion_fit import band, breaks, candidates, fitted_motion, search, slips
+from r5dgs_core.motion_fit.model_scores import NoiseLevel
+
+AHEAD = np.linspace(0, 1, 5)
+FIXED = 1e12  # entry of the normal matrix of a known parameter
+
+
+def solved(law, theta, normal=None, residuals=None):
+    """Solution of a law with given parameters, known exactly unless ``normal`` is given."""
+    normal = FIXED * np.eye(len(theta)) if normal is None else normal
+    residuals = np.zeros((7, 6)) if residuals is None else residuals
+    return candidates.FittedCandidate(law, theta, normal, residuals, np.ones(len(residuals)))
+
+
+def moving(v=(0, 0, 0), w=(0, 0, 0), residuals=None):
+    law = candidates.BY_NAME["translation + spin"]
+    parts = {"r": np.zeros(3), "e": np.zeros(3), "v": np.array(v, float), "w": np.array(w, float)}
+    return solved(law, law.pack(parts), residuals=residuals)
+
+
+LAWS = {
+    "ballistic + spin": candidates.BY_NAME["ballistic + spin"],
+    "bounces": candidates.BY_NAME["bounces"],
+    "impact": breaks.BreakCandidate("impact", "ballistic_spin", ("v", "w", "dv", "dw", "c"), low=-0.3, high=-0.2),
+    "slip": slips.Slip("spin, slipped", "ballistic_spin", ("w", "b"), start=5, stop=7, low=-0.3),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_variance_is_that_of_paths_with_sampled_parameters(name):
+    rng, law, factor = np.random.default_rng(0), LAWS[name], 4.0
+    size = law.parameters
+    theta, root = 0.5 * rng.normal(size=size), 0.003 * rng.normal(size=(size, size))
+    place, turn = band._variance(solved(law, theta, np.linalg.inv(root @ root.T)), factor, AHEAD)
+    sampled = theta + math.sqrt(factor) * rng.normal(size=(4000, size)) @ root.T
+    quats, d = law.law.poses(law.law_parameters(sampled), AHEAD)
+    true_quats, true = law.law.path(law.law_parameters(theta), AHEAD)
+    angles = rotations.angle_between(quats, true_quats)
+    np.testing.assert_allclose(place, ((d - true) ** 2).sum(-1).mean(0), rtol=0.1)
+    np.testing.assert_allclose(turn, (angles**2).mean(0), rtol=0.1)
+
+
+def test_the_variance_of_an_unknown_rotation_is_that_of_half_a_turn():
+    law = candidates.BY_NAME["spin"]
+    _, turn = band._variance(solved(law, np.zeros(law.parameters), 1e-6 * np.eye(law.parameters)), 1.0, AHEAD)
+    np.testing.assert_allclose(turn, math.pi**2)
+
+
+@pytest.mark.parametrize("gap", [0.0, 2.0, 10.0])
+def test_another_candidate_spreads_the_band_by_its_squared_distance_and_evidence(gap):
+    level = NoiseLevel(count=7, level=0.5, inflation=2.0)
+    worse = np.zeros((7, 6))
+    worse[0, 0] = math.sqrt(24 * np.expm1(gap / 24))  # Cauchy loss of `gap`
+    chosen, other = moving(w=(0, 0, 0.5)), moving(v=(1, -2, 0), w=(0, 0, 1.3), residuals=worse)
+    assert level.score(other) - level.score(chosen) == pytest.approx(gap)
+    place, turn = band._spread(chosen, [other, chosen], level, AHEAD)
+    share = math.exp(-gap / 4) / (1 + math.exp(-gap / 4))
+    np.testing.assert_allclose(place, share * 5 * AHEAD**2, atol=1e-12)
+    np.testing.assert_allclose(turn, share * (0.8 * AHEAD) ** 2, atol=1e-12)
+
+
+def test_a_candidate_without_evidence_does_not_spread_the_band():
+    level, worse = NoiseLevel(7, 1.0, 1.0), np.full((7, 6), 3.0)
+    chosen, other = moving(), moving(v=(1, 0, 0), residuals=worse)
+    np.testing.assert_array_equal(band._spread(chosen, [chosen, other], level, AHEAD), 0)
+
+
+def selected(noise=(0.0, 0.0), level=1.0, chosen=None):
+    """Selection of a known motion, of too few poses for a backtest."""
+    chosen = chosen or moving(v=(1, 0, 0))
+    tau = np.linspace(-1, 0, 7)
+    track = PoseTrack(tau, *chosen.candidate.path(chosen.theta, tau), np.ones(7))
+    return search.Selected(chosen, (chosen,), NoiseLevel(7, level, 1.0), track, candidates.Noise(*noise), -1.0)
+
+
+def relative(widths):
+    """Squared half widths of the position and of the rotation, relative to those of unit variances."""
+    return (np.array(widths.half_width) / 1.4) ** 2, (np.array(widths.half_angle) / 1.4) ** 2
+
+
+@pytest.mark.parametrize("slipped", [False, True])
+def test_the_noise_of_the_last_pose_fades_like_its_offset_in_the_prediction(slipped):
+    chosen = moving(v=(1, 0, 0))
+    if slipped:
+        law = slips.Slip("translation, slipped", "translation", ("v", "b"), start=5, stop=7, low=-0.3)
+        chosen = solved(law, np.r_[np.zeros(6), 1, 0, 0, 0.5, 0, 0])
+    off = np.r_[0, 0, 0, 0.1, 0, 0, chosen.theta[6:]]
+    moved = solved(chosen.candidate, off)
+    offsets = []
+    for solution in (chosen, moved):
+        model = fitted_motion.to_model(solution, 1.0, 1.0, 1.0)
+        offsets.append(models.evaluate(model, np.linspace(0, 1, band.MAX_KNOTS))[1])
+    left = 1 - np.linalg.norm(offsets[1] - offsets[0], axis=-1) / 0.1  # share of the offset not yet left
+    widths = band.confidence_band(selected((0.02, 0.03), 2.0, chosen), 1.0, candidates.Noise(0, 0))
+    place, turn = relative(widths)
+    np.testing.assert_allclose(turn, 2 * 3 * 0.03**2 * left**2, atol=1e-10)
+    np.testing.assert_allclose(place, 2 * 3 * (0.02**2 + 2 / 3 * 0.03**2) * left**2, atol=1e-10)
+
+
+def test_a_drift_at_a_constant_rate_grows_from_the_middle_of_the_window():
+    drift = band.drift_noise(candidates.Noise(0.001, 0.1), candidates.Noise(0.02, 0.01))
+    rate = np.array([math.sqrt(12) * 0.02, 5 * 0.1])  # over the span
+    np.testing.assert_allclose((drift.place, drift.turn), rate)
+    uniform = np.linspace(-0.5, 0.5, 100001) * rate[0]
+    assert uniform.std() == pytest.approx(0.02, rel=1e-4)
+    widths = band.confidence_band(selected(), 1.0, drift)
+    away = 0.5 + widths.tau
+    place, turn = relative(widths)
+    np.testing.assert_allclose(turn, 3 * (rate[1] * away) ** 2, atol=1e-10)
+    np.testing.assert_allclose(place, 3 * (rate[0] ** 2 + 2 / 3 * rate[1] ** 2) * away**2, atol=1e-10)
+
+
+def test_a_prediction_is_trusted_until_its_half_width_is_seven_tenths_of_the_radius():
+    times, radius = (2.0, 2.5, 3.0), 0.2
+    found = band.trusted(Band(times, (0.02, 0.12, 0.18), (0.0, 0.0, 0.0)), radius)
+    assert np.interp(found.predictable_until, times, found.half_width) == pytest.approx(0.7 * radius)
+    assert band.trusted(Band(times, (0.02, 0.12, 0.13), (0.0, 0.0, 0.0)), radius).predictable_until is None
+    assert band.trusted(Band(times, (0.15, 0.16, 0.18), (0.0, 0.0, 0.0)), radius).predictable_until == 2.0
+
+
+def test_a_band_scales_with_the_radius_and_the_span():
+    tau = np.array([0.0, 0.5, 1.0])
+    widths = band.Widths(tau, np.array([0.1, 0.2, 0.9]), np.array([0.1, 1.0, 4.0]), 0.75)
+    scaled = widths.scaled(t_max=2.0, radius=0.3, span=4.0)
+    np.testing.assert_allclose(scaled.times, [2, 4, 6])
+    np.testing.assert_allclose(scaled.half_width, [0.03, 0.06, 0.27])
+    np.testing.assert_allclose(scaled.half_angle, [0.1, 1.0, math.pi])
+    assert scaled.predictable_until == 5.0
+    assert dataclasses.replace(widths, trusted=None).scaled(2.0, 0.3, 4.0).predictable_until is None
