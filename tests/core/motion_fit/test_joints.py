@@ -25,6 +25,9 @@ def test_exact_joints_are_found_exactly(kind):
     found = joint_fit.find(TIMES, upper, lower)
     assert found is not None and found.joint.kind == kind
     assert found.place_error < 1e-9 and found.turn_error < 1e-7
+    count = len(TIMES)
+    parameters = {"hinge": count + 4, "ball": 3 * count + 3, "slider": count + 2}[kind]
+    assert found.cost == pytest.approx((parameters - 6 * count) * np.log(6 * count), rel=1e-3)
     if kind == "ball":
         assert found.joint.axis is None and found.joint.limits is None
         np.testing.assert_allclose(found.joint.point, arms.POINT, atol=1e-9)
@@ -107,6 +110,44 @@ def test_a_joint_stops_at_a_limit_at_which_it_turned_around():
     back = joints.Joint("hinge", arms.POINT, found.joint.axis, (-0.5, 0.9), model)
     at = joint_fit._stop_time(back, np.array([0.1, -0.5, 0.9, 0.3]), 0.75)
     assert at == pytest.approx(0.57 / 2, abs=0.01)
+
+
+@pytest.mark.parametrize("kind", ["hinge", "slider"])
+@pytest.mark.parametrize(("speed", "passed"), [(-2.0, (0.5 + 0.05 * 1.4) / 2), (3.0, (0.9 + 0.05 * 1.4) / 3)])
+def test_a_limit_may_be_passed_by_a_twentieth_of_the_range(kind, speed, passed):
+    axis = np.array([0.0, 0.6, 0.8])
+    rates = {"angular_velocity": speed * axis} if kind == "hinge" else {"velocity": speed * axis}
+    model = models.MotionModel("ballistic_spin", **rates)
+    joint = joints.Joint(kind, arms.POINT, axis, (-0.5, 0.9), model)
+    step = 3.0 * 0.75 / 2047
+    both = np.array([0.1, -0.5, 0.9, 0.0])
+    assert joint_fit._stop_time(joint, both, 0.75) == pytest.approx(passed, abs=1.01 * step)
+    # The joint left one end at the first time or turned around at the other one only.
+    toward = 0.9 if speed > 0 else -0.5
+    assert joint_fit._stop_time(joint, np.array([toward, 0.1, -0.2, 0.0]), 0.75) is None
+    assert joint_fit._stop_time(joint, np.array([0.1, 0.4 - toward, -0.2, 0.0]), 0.75) is None
+
+
+@pytest.mark.parametrize("cut", [0, 3])
+def test_the_centre_of_rotations_solves_the_weighted_equations(cut):
+    rng = np.random.default_rng(6)
+    quats = rotations.rotvecs_to_quats(rng.normal(size=(13, 3)))
+    weights = np.r_[np.zeros(cut), rng.uniform(0.5, 1.5, 13 - cut)]
+    center = np.array([0.3, -0.2, 0.5])
+    moves = center - rotations.rotate(quats, center) + 0.01 * rng.normal(size=(13, 3))
+    moves[:cut] += 5.0
+    arms_of = np.eye(3) - rotations.quats_to_rotmats(quats)
+    normal = np.einsum("s,sxi,sxj->ij", weights, arms_of, arms_of)
+    expected = np.linalg.solve(normal, np.einsum("s,sxi,sx->i", weights, arms_of, moves))
+    np.testing.assert_allclose(joint_fit._pivot(quats, moves, weights), expected, atol=1e-10)
+    np.testing.assert_allclose(expected, center, atol=0.02)
+
+
+def test_the_centre_of_rotations_about_one_axis_is_the_nearest_to_the_reference():
+    axis, center = np.array([0.0, 0.0, 1.0]), np.array([0.3, -0.2, 0.5])
+    quats = rotations.rotvecs_to_quats(np.linspace(-1, 0, 9)[:, None] * axis)
+    moves = center - rotations.rotate(quats, center)
+    np.testing.assert_allclose(joint_fit._pivot(quats, moves, np.ones(9)), [0.3, -0.2, 0.0], atol=1e-10)
 
 
 def test_a_part_is_as_uncertain_as_its_parent_and_its_own_motion():

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.motion_fit import model_selection, shared_gravity
@@ -108,3 +109,42 @@ def test_a_direction_that_is_none_is_refused():
     for up in (np.zeros(3), np.array([1.0, np.nan, 0]), np.ones(2)):
         with pytest.raises(ValueError, match="up"):
             shared_gravity.share_acceleration([], [], up)
+
+
+def pulled(*along_x):
+    """Accelerations along x with unit covariance."""
+    return {i: (np.array([x, 0.0, 0.0]), np.eye(3)) for i, x in enumerate(along_x)}
+
+
+@pytest.mark.parametrize(
+    ("accelerations", "expected"),
+    [
+        ((0, 3, 20, 21), [2, 3]),  # of two pairs, the tighter one
+        ((20, 21, 0, 3), [0, 1]),
+        ((0, 1, 20, 24, 22), [2, 3, 4]),  # of two sets, the larger one
+        ((0, 4, 8), [0, 1]),  # all neighbours agree, but not in pairs
+        ((0, 10, 20), [0]),
+        ((), []),
+    ],
+)
+def test_the_largest_and_tightest_set_of_agreeing_bodies_shares(accelerations, expected):
+    assert shared_gravity._largest_agreeing(pulled(*accelerations)) == expected
+
+
+def test_bodies_agree_within_the_99_percent_quantile_of_their_difference():
+    limit = np.sqrt(2 * chi2.ppf(0.99, 3))
+    assert len(shared_gravity._largest_agreeing(pulled(0, 0.999 * limit))) == 2
+    assert len(shared_gravity._largest_agreeing(pulled(0, 1.001 * limit))) == 1
+
+
+@pytest.mark.parametrize("basis", [np.eye(3), np.array([[0.6], [0.0], [0.8]])], ids=["all directions", "vertical"])
+def test_the_mean_acceleration_is_that_of_generalized_least_squares(basis):
+    rng = np.random.default_rng(6)
+    roots, accelerations = rng.normal(size=(4, 3, 3)), rng.normal(size=(4, 3))
+    found = [(a, root @ root.T) for a, root in zip(accelerations, roots, strict=True)]
+    mean, covariance = shared_gravity._mean(found, basis)
+    whitened = np.concatenate([np.linalg.solve(root, basis) for root in roots])
+    values = np.concatenate([np.linalg.solve(root, a) for root, a in zip(roots, accelerations, strict=True)])
+    np.testing.assert_allclose(mean, basis @ np.linalg.lstsq(whitened, values, rcond=None)[0], atol=1e-10)
+    inverse = np.linalg.pinv(whitened)
+    np.testing.assert_allclose(covariance, basis @ inverse @ inverse.T @ basis.T, atol=1e-10)
