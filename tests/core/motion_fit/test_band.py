@@ -60,7 +60,7 @@ def test_another_candidate_spreads_the_band_by_its_squared_distance_and_evidence
     level = NoiseLevel(count=7, level=0.5, inflation=2.0)
     worse = np.zeros((7, 6))
     worse[0, 0] = math.sqrt(24 * np.expm1(gap / 24))  # Cauchy loss of `gap`
-    chosen, other = moving(w=(0, 0, 0.5)), moving(v=(1, -2, 0), w=(0, 0, 1.3), residuals=worse)
+    chosen, other = moving((2, 1, 3), (0, 0, 0.5)), moving((3, -1, 3), (0, 0, 1.3), residuals=worse)
     assert level.score(other) - level.score(chosen) == pytest.approx(gap)
     place, turn = band._spread(chosen, [other, chosen], level, AHEAD)
     share = math.exp(-gap / 4) / (1 + math.exp(-gap / 4))
@@ -104,6 +104,24 @@ def test_the_noise_of_the_last_pose_fades_like_its_offset_in_the_prediction(slip
     place, turn = relative(widths)
     np.testing.assert_allclose(turn, 2 * 3 * 0.03**2 * left**2, atol=1e-10)
     np.testing.assert_allclose(place, 2 * 3 * (0.02**2 + 2 / 3 * 0.03**2) * left**2, atol=1e-10)
+
+
+def test_a_band_adds_the_variances_of_all_causes():
+    law = candidates.BY_NAME["translation + spin"]
+    parts = {"r": np.zeros(3), "e": np.zeros(3), "v": np.array([1.0, 0, 0]), "w": np.array([0, 0, 0.5])}
+    root = 0.05 * np.random.default_rng(1).normal(size=(12, 12))
+    chosen = solved(law, law.pack(parts), np.linalg.inv(root @ root.T))
+    other = moving(v=(1.2, 0.1, 0), w=(0, 0, 0.6))
+    one, drift = selected((0.02, 0.03), 1.0, chosen), candidates.Noise(0.04, 0.05)
+    both = dataclasses.replace(one, solutions=(chosen, other))
+    widths = band.confidence_band(both, 2.0, drift)
+    own = np.array(band._variance(chosen, 2.0, widths.tau))
+    spread = np.array(band._spread(chosen, [chosen, other], one.noise_level, widths.tau))
+    exact = moving(v=(1, 0, 0), w=(0, 0, 0.5))
+    rest = np.array(relative(band.confidence_band(selected((0.02, 0.03), 1.0, exact), 2.0, drift)))
+    place, turn = relative(widths)
+    np.testing.assert_allclose(turn, own[1] + spread[1] + rest[1], atol=1e-9)
+    np.testing.assert_allclose(place, own[0] + spread[0] + 2 / 3 * (own[1] + spread[1]) + rest[0], atol=1e-9)
 
 
 def test_a_drift_at_a_constant_rate_grows_from_the_middle_of_the_window():

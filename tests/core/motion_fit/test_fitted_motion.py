@@ -83,3 +83,31 @@ def test_the_time_of_a_break_has_the_error_of_its_parameter(logit):
     assert event.time == pytest.approx(T_MAX + SPAN * (low + (high - low) * share))
     sigma = math.sqrt(factor * np.linalg.inv(solution.normal)[-1, -1])
     assert event.sigma == pytest.approx(SPAN * (high - low) * share * (1 - share) * sigma, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["impact in flight", "land", "throw"])
+def test_segments_hold_the_rates_at_their_ends(name):
+    broken = breaks.BREAKS[name]
+    law = breaks.BreakCandidate(name, "ballistic_spin", (*broken.blocks, "c"), low=-0.4, high=-0.3)
+    rng, size = np.random.default_rng(4), law.parameters
+    theta = rng.normal(size=size)
+    theta[3:-1] *= 2
+    solution = solved(law, theta, 0.1 * rng.normal(size=(size, size)))
+    found = fitted_motion.events(solution, 1.0, T_MAX, SPAN)
+    segments = fitted_motion.segments([solution] * 2, found, T_MAX - SPAN, T_MAX, RADIUS, SPAN)
+    assert [(x.start, x.stop) for x in segments] == [(T_MAX - SPAN, found[0].time), (found[0].time, T_MAX)]
+    for segment in segments:
+        # Parabolas through poses shortly before the end, and the turn between them about the constant axis.
+        tau = (segment.stop - T_MAX) / SPAN - np.array([0.02, 0.01, 1e-9])
+        quats, d = law.path(theta, tau)
+        fit = np.polynomial.Polynomial
+        curves = [fit.fit(SPAN * tau, RADIUS * d[:, axis], 2) for axis in range(3)]
+        velocity, acceleration = ([curve.deriv(k)(SPAN * tau[-1]) for curve in curves] for k in (1, 2))
+        turn = rotations.quats_to_rotvecs(rotations.multiply(quats[1], rotations.conjugate(quats[0])))
+        expected = {"velocity": velocity, "acceleration": acceleration, "angular_velocity": turn / (0.01 * SPAN)}
+        if segment.kind == "static":
+            assert max(np.abs(value).max() for value in expected.values()) < 1e-6
+        for rate, value in expected.items():
+            np.testing.assert_allclose(segment.parameters[rate], value, atol=0.01, err_msg=rate)
+    rests = [segment.kind == "static" for segment in segments]
+    assert rests == [broken.rests_before, broken.rests_after]
