@@ -43,6 +43,8 @@ def environment(bpy: str, folder: Path, torch: bool) -> Path:
     if not done.exists() or done.read_text() != " ".join(wanted):
         subprocess.run([python_of(MODULES[bpy]), "-m", "venv", str(place)], check=True)
         subprocess.run([str(python), "-m", "pip", "install", "-q", *wanted], check=True)
+        if torch:  # optional in torch; its LLVM crashes beside Blender's
+            subprocess.run([str(python), "-m", "pip", "uninstall", "-q", "-y", "triton"], check=True)
         done.write_text(" ".join(wanted))
     return python
 

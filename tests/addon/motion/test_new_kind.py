@@ -12,7 +12,7 @@ import sys
 
 import bpy
 
-root, scene_path, number = sys.argv[1:]
+root, scene_path, number = sys.argv[-3:]
 spec = importlib.util.spec_from_file_location("r5dgs", root + "/__init__.py", submodule_search_locations=[root])
 extension = importlib.util.module_from_spec(spec)
 sys.modules["r5dgs"] = extension
@@ -36,9 +36,13 @@ extension.unregister()
 """
 
 
-def test_the_kind_of_the_page_is_edited_and_saved_in_blender(tmp_path):
+def test_the_kind_of_the_page_is_edited_and_saved_in_blender(blender, tmp_path):
     scene_file.write(scenes.make_scene(), tmp_path / "scene.r5dgs")
     arguments = new_kind.add(tmp_path / "r5dgs"), tmp_path / "scene.r5dgs", new_kind.NUMBER
-    command = [sys.executable, "-c", USE, *map(str, arguments)]
+    if blender.app.binary_path:
+        options = ("-b", "--factory-startup", "--python-exit-code", "1", "--python-expr", USE, "--")
+        command = [blender.app.binary_path, *options, *map(str, arguments)]
+    else:
+        command = [sys.executable, "-c", USE, *map(str, arguments)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
