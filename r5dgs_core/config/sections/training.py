@@ -124,7 +124,7 @@ class RatesSection:
     shading: float = 1e-2
     light: float = 1e-2
     translations: float = 3e-3
-    rotvecs: float = 6e-3
+    rotvecs: float = 2e-2
     slope: float = 1e-2
     field: float = 8e-4
     trd: float = 8e-4
