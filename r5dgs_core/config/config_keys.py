@@ -35,8 +35,8 @@ _KEYS_BY_UNIT = {
     """,
     "learning rate": """
         rates.means rates.log_scales rates.sh rates.sh_rest rates.opacity_logits rates.quats rates.shading rates.light
-        rates.translations rates.rotvecs rates.rotvecs_entering rates.slope rates.field rates.trd rates.residual
-        rates.background identity.rate identity.classifier_rate
+        rates.translations rates.rotvecs rates.slope rates.field rates.trd rates.residual rates.background
+        identity.rate identity.classifier_rate
     """,
     "factor": "rates.decay rates.decay_networks rates.decay_floor_appearance densify_mcmc.noise",
     "weight": """

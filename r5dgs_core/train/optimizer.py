@@ -39,10 +39,7 @@ class LearningRates:
         name = name.partition(".")[0]
         if name == "shading" and not self._config.train.shading:
             return 0.0
-        iterations = self._config.train.iterations
-        if name == "rotvecs" and base > 0 and iteration < self._config.curriculum.steps(iterations)[1]:
-            return max(base, rates.rotvecs_entering)  # bodies must not lag behind their rotation
-        progress = iteration / iterations
+        progress = iteration / self._config.train.iterations
         begin = self._config.residual.start if name == "residual" else rates.decay_from  # residuals start late
         if progress <= begin or name not in GEOMETRY + APPEARANCE + NETWORKS:
             return base

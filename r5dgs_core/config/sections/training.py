@@ -103,7 +103,6 @@ class RatesSection:
         light: Direction of the light that the shading assumes.
         translations: Translations of the object tracks.
         rotvecs: Rotations of the object tracks, rad.
-        rotvecs_entering: The same while times enter training, if it is higher; not used if ``rotvecs`` is 0.
         slope: Shift of a shadow along the plane per unit that its object rises.
         field: Weights of the deformation field.
         trd: Weights of the TRD network.
@@ -126,7 +125,6 @@ class RatesSection:
     light: float = 1e-2
     translations: float = 3e-3
     rotvecs: float = 6e-3
-    rotvecs_entering: float = 2e-2
     slope: float = 1e-2
     field: float = 8e-4
     trd: float = 8e-4
