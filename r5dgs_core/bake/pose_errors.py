@@ -114,10 +114,12 @@ def measure(scene: Scene, dataset: datasets.Dataset, config: Config, groups: Col
     misfits = []
     for knot in range(len(scene.tracks.times)) if groups else ():
         views = [view for view, k in zip(dataset.train, knots, strict=True) if k == knot]
-        shown = sampling.spread(views, VIEWS)
-        for number, view in enumerate(shown):
-            center = view.camera.center  # float32 is most precise near the camera
-            posed = [posed_scene.pose_frame(scene, player.frame(view.t, center)) for player in players]
+        posed_at: dict[float, list[PosedScene]] = {}  # by time
+        for number, view in enumerate(sampling.spread(views, VIEWS)):
+            if view.t not in posed_at:
+                center = view.camera.center  # float32 is most precise near the cameras
+                posed_at[view.t] = [posed_scene.pose_frame(scene, player.frame(view.t, center)) for player in players]
+            posed = posed_at[view.t]
             truth, ids = datasets.load_image(view, behind), datasets.load_mask(view) if masked else None
             if ids is None or number == 0:
                 picture = scene_renderer.render_frame(scene, posed[0], view.camera)

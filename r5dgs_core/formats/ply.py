@@ -97,8 +97,10 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
 
 def _bands(scene: Scene, t: float, object_ids: Collection[int] | None) -> list[str]:
     """Return a comment for each motion group with a confidence band past t_max: object id, half width, half angle."""
+    if t <= scene.t_max:
+        return []
     shown = [g for g in scene.groups if g.role == "body" and (object_ids is None or g.object_id in object_ids)]
-    found = [(g.object_id, g.history.band) for g in shown if t > scene.t_max and g.history.band is not None]
+    found = [(g.object_id, g.history.band) for g in shown if g.history.band is not None]
     times = np.array([t])
     return [
         f"band {object_id} {band.level:g} {band.widths(times)[0]:.6g} {band.angles(times)[0]:.6g}"

@@ -108,7 +108,9 @@ def place(
     splats, factor = bind_state(scene, rows), shading_factors(scene, rows, turn)
     if bend is not None:
         splats = _bent(scene, start, splats, bend)
-        _relight(scene, start, factor, turn, bend)
+        if factor is not None:
+            turns = turn @ rotations.quats_to_rotmats(bend.turns)
+            factor[bend.rows - start] = shading_factors(scene, bend.rows, turns)
     if tint is not None:
         factor = np.asarray(tint, np.float64) if factor is None else factor * np.asarray(tint, np.float64)
     return transform(splats, matrix, factor)
@@ -140,17 +142,6 @@ def _bent(scene: Scene, start: int, splats: Splats, bend: Bend) -> Splats:
         sh = sh.copy()
         sh[at] = spherical_harmonics.rotate(sh[at], bend.turns)
     return replace(splats, means=means, quats=quats, log_scales=log_scales, sh=sh)
-
-
-def _relight(scene: Scene, start: int, factor: np.ndarray | None, turn: np.ndarray, bend: Bend) -> None:
-    """Write the shading factors of deviating Gaussians, which ``turn`` then rotates. factor [n, 1], turn [3, 3]"""
-    if factor is None or scene.shading is None:
-        return
-    light = np.asarray(scene.shading.light, np.float64)
-    turns = turn @ rotations.quats_to_rotmats(bend.turns)
-    change = diffuse_shading.light_change(light, turns).astype(np.float32)
-    rest = diffuse_shading.rest_factors(scene)[bend.rows]
-    factor[bend.rows - start, 0] = diffuse_shading.factors(rest, scene.shading.vectors[bend.rows], change)
 
 
 def join(parts: Sequence[Splats]) -> Splats:
@@ -222,8 +213,8 @@ def map_shapes(
     new_quats[:], new_log_scales[:] = rotations.rotmats_to_quats(u), np.log(np.maximum(singular, 1e-30))
 
 
-def shading_factors(scene: Scene, rows: slice, rotation: np.ndarray) -> np.ndarray | None:
-    """Colour factors of rows rotated since the bind state, or None without shading. [3, 3] -> [n, 1]"""
+def shading_factors(scene: Scene, rows: slice | np.ndarray, rotation: np.ndarray) -> np.ndarray | None:
+    """Colour factors of rows rotated since the bind state, or None without shading. [3, 3] or [n, 3, 3] -> [n, 1]"""
     if scene.shading is None:
         return None
     light = np.asarray(scene.shading.light, np.float64)

@@ -47,7 +47,8 @@ def blocked(tmp_path: Path) -> Path:
 def run_toy(tmp_path, script=TOY, **environment):
     (tmp_path / "toy.py").write_text(script)
     os.utime(tmp_path / "toy.py", (0, 0))
-    kept = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "TMPDIR")}
+    dropped = "HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "NUMBA_DISABLE_JIT", "TMPDIR"
+    kept = {k: v for k, v in os.environ.items() if k not in dropped}
     root = str(Path(__file__).resolve().parents[3])
     return subprocess.run(
         [sys.executable, "toy.py"],
