@@ -58,6 +58,7 @@ ALLOWED = {
     "data": {"motion", "scene", "color"},
     "raster": {"motion", "scene"},
     "search": {"scene"},
+    "capture": {"motion"},
     "config": {"data"},
     "playback": {"motion", "scene", "color"},
     "formats": {"motion", "scene", "playback"},

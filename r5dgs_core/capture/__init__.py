@@ -1,0 +1,1 @@
+"""Real captures: calibrations, lenses, and what `r5dgs prepare` makes of videos."""

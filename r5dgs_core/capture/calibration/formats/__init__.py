@@ -1,0 +1,1 @@
+"""Calibration formats: one module each, with `detect` and `read`, listed in `registry`."""
