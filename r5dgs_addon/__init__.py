@@ -5,7 +5,16 @@ from .clean_up import criteria, overlay
 from .engine import engine, live_preview, mesh_merge, render_notes, render_stats
 from .language import prompt_state
 from .motion import event_markers, exact_mode, extrapolate, motion_fields, pivot
-from .scene import click_select, evaluated_points, hidden_points, object_names, object_tint, properties, relink
+from .scene import (
+    captured_images,
+    click_select,
+    evaluated_points,
+    hidden_points,
+    object_names,
+    object_tint,
+    properties,
+    relink,
+)
 from .splats import viewport_splats
 from .ui import manual
 from .worker import jobs
@@ -15,6 +24,7 @@ MODULES = (
     object_tint,
     object_names,
     hidden_points,
+    captured_images,
     prompt_state,
     motion_fields,
     extrapolate,

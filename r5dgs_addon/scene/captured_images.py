@@ -1,7 +1,9 @@
-"""Captured images of a data set as backgrounds of the captured cameras.
+"""Captured images of a data set as backgrounds of the captured cameras, which follow the frame.
 
-The data set is a folder with `transforms_*.json` files, whose frames name their camera, or with images named like the
-cameras: ``CAMERA.png``, or a folder ``CAMERA`` of images in the order of time.
+Each camera has one image in Blender, which stores the times and paths of all images of this camera. A frame change
+handler replaces its path; that costs nothing until a view through the camera is drawn. The data set is a folder with
+`transforms_*.json` files, whose frames name their camera, or with images named like the cameras: ``CAMERA.png``, or a
+folder ``CAMERA`` of images in the order of time.
 """
 
 import json
@@ -9,16 +11,20 @@ import math
 from pathlib import Path
 
 import bpy
+from bpy.app.handlers import persistent
 
 from ...r5dgs_core import errors
-from . import captured_cameras, timeline
+from . import captured_cameras, loaded_scenes, object_names, timeline
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
 OPACITY = 0.5
+TIMES = "r5dgs_captured_images"  # custom property of an image: list of times and paths, as JSON
 
 
 def show(collection: bpy.types.Collection, folder: str, frame: float) -> int:
-    """Show in each captured camera its image nearest to a frame, in place of images shown before.
+    """Give each captured camera its images as background, and show the one nearest to a frame.
+
+    Captured images shown before are replaced; other background images are kept.
 
     Args:
         collection: Loaded scene.
@@ -31,7 +37,7 @@ def show(collection: bpy.types.Collection, folder: str, frame: float) -> int:
     Raises:
         ConfigError: There is no such folder, or no image of any camera in it.
     """
-    home = Path(bpy.path.abspath(folder))
+    home = Path(bpy.path.abspath(folder)).resolve()
     if not home.is_dir():
         raise errors.ConfigError(f"{home}: expected the folder of the data set, found none; choose another")
     cameras = captured_cameras.all_of(collection)
@@ -43,13 +49,14 @@ def show(collection: bpy.types.Collection, folder: str, frame: float) -> int:
         found = named.get(name) or _named_by_path(home, name, times.t_start, times.t_max)
         if not found:
             continue
-        _, path = min(found, key=lambda one: (abs(one[0] - t), one[1]))
-        data = camera.data
-        data.background_images.clear()
-        background = data.background_images.new()
-        background.image = bpy.data.images.load(str(path), check_existing=True)
+        _remove(camera.data)
+        image = bpy.data.images.load(str(_nearest(found, t)))
+        image.name = object_names.fit(f"{camera.name} captured")
+        image[TIMES] = json.dumps([(at, str(path)) for at, path in found])
+        background = camera.data.background_images.new()
+        background.image = image
         background.alpha, background.display_depth, background.frame_method = OPACITY, "FRONT", "FIT"
-        data.show_background_images = True
+        camera.data.show_background_images = True
         shown += 1
     if not shown:
         raise errors.ConfigError(
@@ -57,6 +64,45 @@ def show(collection: bpy.types.Collection, folder: str, frame: float) -> int:
             "the folder that the scene was trained on"
         )
     return shown
+
+
+def follow(collection: bpy.types.Collection, frame: float) -> None:
+    """Show the image nearest to a frame in each camera with captured images."""
+    t = timeline.of_collection(collection).time(frame)
+    for camera in captured_cameras.all_of(collection):
+        for background in _backgrounds(camera.data):
+            image = background.image
+            path = str(_nearest(json.loads(image[TIMES]), t))
+            if image.library is None and bpy.path.abspath(image.filepath) != path:
+                image.filepath = path
+
+
+@persistent
+def _follow_frame(scene, *_):
+    if bpy.app.is_job_running("RENDER"):
+        return  # a view may be drawing the image while this runs in the thread of the render
+    for collection in loaded_scenes.scene_collections():
+        follow(collection, scene.frame_current_final)
+
+
+def _nearest(images: list, t: float) -> str | Path:
+    """Path of the image nearest to a time; of two equally near ones, the first by name."""
+    return min(images, key=lambda one: (abs(one[0] - t), one[1]))[1]
+
+
+def _backgrounds(data: bpy.types.Camera) -> list[bpy.types.CameraBackgroundImage]:
+    """Backgrounds of a camera that show captured images."""
+    return [one for one in data.background_images if one.image is not None and TIMES in one.image]
+
+
+def _remove(data: bpy.types.Camera) -> None:
+    """Remove the captured images of a camera."""
+    for background in _backgrounds(data):
+        image = background.image
+        background.image = None  # removing the background alone does not decrement the users of the image
+        data.background_images.remove(background)
+        if not image.users:
+            bpy.data.images.remove(image)
 
 
 def _named_in_files(folder: Path) -> dict[str, list[tuple[float, Path]]]:
@@ -98,3 +144,14 @@ def _named_by_path(folder: Path, name: str, first: float, last: float) -> list[t
             step = (last - first) / max(len(files) - 1, 1)
             return [(first + number * step, path) for number, path in enumerate(files)]
     return []
+
+
+def register():
+    """Register the handler."""
+    bpy.app.handlers.frame_change_post.append(_follow_frame)
+
+
+def unregister():
+    """Undo `register`."""
+    if _follow_frame in bpy.app.handlers.frame_change_post:
+        bpy.app.handlers.frame_change_post.remove(_follow_frame)

@@ -3,9 +3,10 @@
     xvfb-run -a -s "-screen 0 1280x1000x24 +extension GLX" blender --factory-startup --window-geometry 0 0 1280 1000 \\
         --python tests/blender/check_sidebar.py -- SCENE.r5dgs OUT [PANEL]
 
-Prints the height in pixels at a UI scale of 1 with a loaded scene and an active object, and with the panel PANEL open
-beside those that are open by default. Exits with 1 if, without PANEL, a screen of 1000 pixels is too small. Saves a
-picture of the window in OUT.
+Prints the height in pixels at a UI scale of 1 with a loaded scene: without a selection, with an object or a point cloud
+active, and with several objects selected. With the panel PANEL open beside those that are open by default, it prints
+the height for an active object only. Exits with 1 if, without PANEL, a screen of 1000 pixels is too small. Saves
+pictures of the window in OUT.
 """
 
 import contextlib
@@ -63,21 +64,42 @@ def panels() -> list[type]:
     return [one for one in found if getattr(one, "bl_region_type", "") == "UI"]
 
 
+def selections(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]:
+    """Selections of a loaded scene by their names; the first object of each becomes active."""
+    named = [one for one in collection.all_objects if one.r5dgs.object_id > 0]
+    anchors, clouds = ([one for one in named if one.r5dgs.role == role] for role in ("ANCHOR", "CLOUD"))
+    return {
+        "no selection": [],
+        "object": anchors[:1],
+        "point cloud": clouds[:1],
+        "several objects": anchors,
+        "object past t_max": anchors[:1],
+    }
+
+
 def checks(path: Path, out: Path, opened: str) -> Iterator[float]:
-    """Measure with a scene and an active object."""
+    """Measure with a scene and several selections."""
     if opened:
         open_by_default(opened)
     with w.inside():
         bpy.ops.r5dgs.load_scene(filepath=str(path))
     collection = next(one for one in bpy.data.collections if one.r5dgs.is_scene)
-    anchor = next(one for one in collection.all_objects if one.r5dgs.role == "ANCHOR" and one.r5dgs.object_id > 0)
-    anchor.select_set(True)
-    bpy.context.view_layer.objects.active = anchor
-    found, scrolls, room = yield from height()
     out.mkdir(parents=True, exist_ok=True)
-    subprocess.run(["import", "-window", "root", str(out / f"sidebar {opened}.png")], check=True)
-    print(f"sidebar{f' with {opened} open' if opened else ''}: {'' if scrolls else 'at most '}{found:.0f} of {room} px")
-    assert opened or not scrolls, f"the sidebar does not fit the {room} px that a screen of {SCREEN} px leaves for it"
+    too_high = []
+    for name, chosen in selections(collection).items():
+        if opened and name != "object":
+            continue
+        for obj in bpy.context.view_layer.objects:
+            obj.select_set(obj in chosen)
+        bpy.context.view_layer.objects.active = chosen[0] if chosen else None
+        if "t_max" in name:
+            bpy.context.scene.frame_set(bpy.context.scene.frame_end)
+        found, scrolls, room = yield from height()
+        subprocess.run(["import", "-window", "root", str(out / f"{name}{' ' * bool(opened)}{opened}.png")], check=True)
+        with_panel = f", {opened} open" if opened else ""
+        print(f"{name}{with_panel}: {'' if scrolls else 'at most '}{found:.0f} of {room} px", flush=True)
+        too_high += [name] if scrolls else []
+    assert opened or not too_high, f"the sidebar does not fit a screen of {SCREEN} px: {', '.join(too_high)}"
 
 
 if __name__ == "__main__":

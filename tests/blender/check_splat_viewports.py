@@ -18,7 +18,7 @@ from mathutils import Matrix, Vector
 
 sys.path.insert(0, str(Path(__file__).parent))
 from check_splats import MIN_DB, psnr, redraw, screenshot, shown_region  # noqa: E402
-from window import area_of, inside, main_window, region_of, run, service  # noqa: E402
+from window import area_of, hover, inside, main_window, press, region_of, run, service  # noqa: E402
 
 out = Path()
 
@@ -258,17 +258,19 @@ def check_undo_of_loading(before: np.ndarray):
 
 
 def check_camera_images(before: np.ndarray):
-    """A captured image is visible over the splats in the view through its camera, and only there."""
-    space, area = area_of("VIEW_3D").spaces[0], area_of("VIEW_3D")
+    """A captured image is visible over the splats in the view through its camera, and only there; it follows keys."""
+    space, scene = area_of("VIEW_3D").spaces[0], main_window().scene
     loaded = next(one for one in bpy.data.collections if one.r5dgs.is_scene)
-    camera = service("scene.captured_cameras").all_of(loaded)[0]
+    camera, frame = service("scene.captured_cameras").all_of(loaded)[0], scene.frame_current
     folder = out / "images"
-    folder.mkdir(exist_ok=True)
-    image = bpy.data.images.new("red", 8, 8)
-    image.pixels.foreach_set(np.tile(np.float32([1, 0, 0, 1]), 64))
-    image.filepath_raw, image.file_format = str(folder / f"{camera['r5dgs_captured']['name']}.png"), "PNG"
-    image.save()
-    bpy.data.images.remove(image)
+    for number, color in enumerate(((1, 0, 0, 1), (0, 0, 1, 1))):
+        image = bpy.data.images.new("plain", 8, 8)
+        image.pixels.foreach_set(np.tile(np.float32(color), 64))
+        path = folder / camera["r5dgs_captured"]["name"] / f"{number}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        image.filepath_raw, image.file_format = str(path), "PNG"
+        image.save()
+        bpy.data.images.remove(image)
     with inside():
         bpy.ops.ed.undo_push(message="Before")
         bpy.ops.r5dgs.use_captured_camera(camera=camera.name)
@@ -278,14 +280,19 @@ def check_camera_images(before: np.ndarray):
         bpy.ops.r5dgs.show_captured_images(directory=str(folder))
     space.overlay.show_overlays = True
     yield 0.5
-    found = seen("captured_image")
-    red = (found[..., 0] - found[..., 1]) - (through[..., 0] - through[..., 1])
-    print(f"captured image: {(red > 0.2).mean():.0%} of the pixels", flush=True)
-    assert 0.2 < (red > 0.2).mean() < 1
+    for key, (first, second) in (("shift+Left", (0, 2)), ("shift+Right", (2, 0))):  # first and last frame
+        yield from hover(region_of(area_of("VIEW_3D")))
+        yield from press(key)
+        yield 0.5
+        found = seen(f"captured_image_{key}")
+        share = (found[..., first] - found[..., second] > 0.3).mean()
+        print(f"captured image after {key}, frame {scene.frame_current}: {share:.0%} of the pixels", flush=True)
+        assert 0.1 < share < 1
+    scene.frame_set(frame)
     space.overlay.show_overlays = False
     yield 0.5
     compare("without overlays", seen("without_image"), through)
-    area.spaces[0].region_3d.view_perspective = "PERSP"
+    space.region_3d.view_perspective = "PERSP"
     with inside():
         bpy.ops.ed.undo_push(message="After")
     yield 0.5

@@ -95,11 +95,17 @@ def click() -> Iterator[float]:
 
 def drag(region: bpy.types.Region, *path: tuple[float, float]) -> Iterator[float]:
     """Drag with the left button along pixels of a region."""
-    yield from hover(region, *path[0])
+    yield from drag_across(*((region, place) for place in path))
+
+
+def drag_across(*path: tuple[bpy.types.Region, tuple[float, float]]) -> Iterator[float]:
+    """Drag with the left button along pixels of several regions."""
+    (region, place), *others = path
+    yield from hover(region, *place)
     _xdotool("mousedown", 1)
     yield KEY_S
-    for corner in path[1:]:
-        yield from hover(region, *corner)
+    for region, place in others:
+        yield from hover(region, *place)
     _xdotool("mouseup", 1)
     yield KEY_S
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,9 +72,9 @@ def png(path, value):
 
 
 def shown(home):
-    """Names of the background images by camera."""
+    """File names of the background images by camera."""
     return {
-        camera.name: [one.image.name for one in camera.data.background_images]
+        camera.name: [Path(one.image.filepath).name for one in camera.data.background_images]
         for camera in home.objects
         if camera.data.show_background_images
     }
@@ -93,8 +94,43 @@ def test_images_of_the_current_time_are_backgrounds_of_their_cameras(blender, ca
     assert blender.ops.r5dgs.show_captured_images(directory=str(folder)) == {"FINISHED"}
     assert shown(home) == {"away": ["r_1.png"], "upright": ["r_2.png"]}
     motions.go_to(blender, collection, 0.0)
-    assert blender.ops.r5dgs.show_captured_images(directory=str(folder)) == {"FINISHED"}
     assert shown(home) == {"away": ["r_0.png"], "upright": ["r_2.png"]}
+
+
+def test_images_follow_the_frame_after_undo_and_in_a_reopened_file(blender, captured, tmp_path):
+    collection = motions.load(blender, scene_file.write(captured, tmp_path / "scene.r5dgs"))
+    folder, name = tmp_path / "data", collection.name
+    for number in range(3):
+        png(folder / "away" / f"{number:04d}.png", number)
+    blender.ops.ed.undo_push(message="loaded")
+    assert blender.ops.r5dgs.show_captured_images(directory=str(folder)) == {"FINISHED"}
+    blender.ops.ed.undo_push(message="shown")
+
+    def image_at(t):
+        collection = blender.data.collections[name]
+        motions.go_to(blender, collection, t)
+        return shown(collection.children["Cameras"])
+
+    assert image_at(scenes.T_MAX) == {"away": ["0002.png"]}
+    blender.ops.ed.undo()
+    assert image_at(0.0) == {}
+    blender.ops.ed.redo()
+    assert image_at(0.0) == {"away": ["0000.png"]}
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    blender.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
+    assert image_at(0.5 * scenes.T_MAX) == {"away": ["0001.png"]}
+
+
+def test_showing_images_again_keeps_other_backgrounds_and_leaves_no_images(blender, captured, tmp_path):
+    collection = motions.load(blender, scene_file.write(captured, tmp_path / "scene.r5dgs"))
+    png(tmp_path / "data" / "upright.png", 1)
+    png(tmp_path / "own.png", 2)
+    camera = collection.children["Cameras"].objects["upright"]
+    camera.data.background_images.new().image = blender.data.images.load(str(tmp_path / "own.png"))
+    for _ in range(2):
+        blender.ops.r5dgs.show_captured_images(directory=str(tmp_path / "data"))
+        assert shown(collection.children["Cameras"]) == {"upright": ["own.png", "upright.png"]}
+    assert {image.name for image in blender.data.images if image.source == "FILE"} == {"own.png", "upright captured"}
 
 
 def test_images_are_found_by_the_names_of_files_and_folders(blender, captured, tmp_path):
