@@ -12,7 +12,7 @@ from typing import Any
 
 from .. import errors, findings, strict_json
 from ..scene import cameras
-from . import colmap_model, images, transforms
+from . import colmap_model, file_kinds, images, transforms
 from .colmap_model import Registered
 from .layouts.raw_dataset import RawDataset
 from .transforms import Entry
@@ -86,7 +86,7 @@ def _check_registered(
 ) -> None:
     """Raise DatasetError if too many images have no pose, or if there are videos among them."""
     placed = {frame.name for frame in frames} | {image.name for image in registered}
-    kinds = (*images.SUFFIXES, *images.UNREADABLE_SUFFIXES, *images.VIDEO_SUFFIXES)
+    kinds = (*images.SUFFIXES, *images.UNREADABLE_SUFFIXES, *file_kinds.VIDEOS)
     present = {
         path.relative_to(root / IMAGES).as_posix()
         for path in (root / IMAGES).rglob("*")
@@ -94,7 +94,7 @@ def _check_registered(
     }
     missing = sorted(present - placed)
     for name in missing:
-        if name.lower().endswith(images.VIDEO_SUFFIXES):
+        if name.lower().endswith(file_kinds.VIDEOS):
             with guard():
                 raise images.unreadable_kind(root / IMAGES / name)
     if len(present) - len(missing) >= min_registered * len(present):

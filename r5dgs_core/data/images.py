@@ -13,14 +13,15 @@ import OpenImageIO as oiio
 
 from .. import atomic_files, errors
 from ..color import srgb
+from . import file_kinds
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".tif", ".tiff")
+SUFFIXES = file_kinds.IMAGES
 COMPRESSION_LEVEL = 6
 # Limits for sizes declared in headers, checked before decoding; a PNG of one colour has about 1000 pixels per byte.
 _MAX_PIXELS, _MAX_CHANNELS = 1 << 28, 64
 _PIXELS, _PIXELS_PER_BYTE = 1 << 24, 4096
-VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
-UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".gif", ".bmp", ".psd")
+UNREADABLE_SUFFIXES = file_kinds.UNREADABLE
+JPEG_QUALITY = 95
 
 
 def unreadable_kind(path: Path, place: str = "") -> errors.DatasetError:
@@ -33,8 +34,8 @@ def unreadable_kind(path: Path, place: str = "") -> errors.DatasetError:
     kind = path.suffix.lower()
     found = f"{path.name}, of the unreadable kind {kind.removeprefix('.') or 'without suffix'}"
     remedy = "convert it to PNG or JPEG"
-    if kind in VIDEO_SUFFIXES:
-        remedy = f"extract its frames, for example with 'ffmpeg -i {path.name} %04d.png'"
+    if kind in file_kinds.VIDEOS:
+        remedy = "make a data set of the videos with 'r5dgs prepare FOLDER --out DATA'"
     return errors.DatasetError(f"{place or path}: expected an image, found {found}. Remedy: {remedy}", code="D11")
 
 
@@ -116,7 +117,20 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
         pixels = to_uint8(pixels)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: expected uint8, uint16 or floats, got {pixels.dtype}")
-    path = Path(path)
+    _write(Path(path), pixels, {"oiio:UnassociatedAlpha": 1, "png:compressionLevel": COMPRESSION_LEVEL})
+
+
+def write_jpeg(path: Path, pixels: np.ndarray) -> None:
+    """Write a JPEG of quality `JPEG_QUALITY` with full colour resolution, atomically.
+
+    Args:
+        path: File to write; its folder is created if missing.
+        pixels: sRGB, uint8. [H, W, 3]
+    """
+    _write(Path(path), pixels, {"Compression": f"jpeg:{JPEG_QUALITY}", "jpeg:subsampling": "4:4:4"})
+
+
+def _write(path: Path, pixels: np.ndarray, attributes: dict[str, int | str]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -124,8 +138,8 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     height, width, channels = pixels.shape
     kind = oiio.UINT8 if pixels.dtype == np.uint8 else oiio.UINT16
     spec = oiio.ImageSpec(width, height, channels, kind)
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    spec.attribute("png:compressionLevel", COMPRESSION_LEVEL)
+    for name, value in attributes.items():
+        spec.attribute(name, value)
     try:
         with atomic_files.replacing_by_name(path) as temporary:
             target = oiio.ImageOutput.create(str(temporary))

@@ -300,7 +300,7 @@ def test_images_missing_in_times_json_need_no_pose(flat):
     assert len(datasets.read(root).train) > 0
 
 
-@pytest.mark.parametrize("suffix, remedy", [(".heic", "convert it to PNG"), (".MP4", "ffmpeg")])
+@pytest.mark.parametrize("suffix, remedy", [(".heic", "convert it to PNG"), (".MP4", "r5dgs prepare")])
 def test_files_of_unreadable_kinds_are_named_as_such(rig, suffix, remedy):
     root, _ = rig
     for k in range(9):

@@ -1,0 +1,183 @@
+"""The command ``r5dgs prepare``: make a data set of videos or frames of calibrated cameras."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ... import errors, terminal
+from .. import options
+
+if TYPE_CHECKING:
+    from ...findings import Finding
+    from ...prepare.prepare import Plan
+
+NAME = "prepare"
+SHORT = "make a data set of videos or frames of calibrated cameras"
+LONG = (
+    "Make a data set of videos or folders of frames, one per camera: choose frames, compare clocks, undistort, make\n"
+    "masks, and check the capture. Run the same command again to continue an interrupted one."
+)
+EXAMPLE = "VIDEOS --calibration calibration.toml --out DATA"
+PAGE = "user/your_data.md"
+SYNC = ("auto", "audio", "motion", "none")
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    p.add_argument("source", type=Path, help="folder with a video or a folder of frames per camera, or one video")
+    p.add_argument("--out", type=Path, required=True, metavar="DATA", help="data set folder to write")
+    calibration = "file or folder of the cameras' calibration (default: found in the source)"
+    p.add_argument("--calibration", type=Path, metavar="FILE", help=calibration)
+    start = "first time, in seconds from the first time at which all cameras record (default: 0)"
+    p.add_argument("--start", type=options.not_negative, default=0.0, metavar="S", help=start)
+    p.add_argument("--end", type=options.positive, metavar="S", help="last time in seconds (default: the last frame)")
+    p.add_argument("--every", type=options.at_least(1), default=1, metavar="N", help="use every N-th frame")
+    p.add_argument("--fps", type=options.positive, metavar="HZ", help="use at most this number of frames per second")
+    size = "height of the images in pixels (default: up to 960, if training then fits half of the memory)"
+    p.add_argument("--size", type=options.at_least(16), metavar="LINES", help=size)
+    p.add_argument("--lossless", action="store_true", help="write PNG instead of JPEG of quality 95")
+    rate = "recorded frames per second, for folders of frames and for videos with wrong times"
+    p.add_argument("--rate", type=options.positive, metavar="HZ", help=rate)
+    sync = "source of the offsets between clocks: audio, motion, none or auto (default)"
+    p.add_argument("--sync", choices=SYNC, default="auto", help=sync)
+    offset = "known offset of a camera's clock in milliseconds, which is added to its times; may be repeated"
+    p.add_argument("--offset", action="append", default=[], metavar="CAMERA=MS", help=offset)
+    _add_hold_out(p)
+    masks = "masks: a folder with a mask per frame (CAMERA/FRAME.png), sam2, sam3 or none (default)"
+    p.add_argument("--masks", default="none", metavar="FOLDER|sam2|none", help=masks)
+    p.add_argument("--model", type=Path, metavar="DIR", help="folder of the weights of sam2 or sam3")
+    p.add_argument("--words", metavar="WORDS", help='objects that sam3 looks for, as "mug, red apple"')
+    p.add_argument("--overwrite", action="store_true", help="replace a data set that was prepared with other settings")
+    options.add_progress(p)
+
+
+def _add_hold_out(p: argparse.ArgumentParser) -> None:
+    camera = "keep the frames of this camera for evaluation; may be repeated"
+    p.add_argument("--hold-out-camera", action="append", default=[], metavar="CAMERA", help=camera)
+    every = "keep every N-th time for evaluation"
+    p.add_argument("--hold-out-every", type=options.at_least(2), metavar="N", help=every)
+    after = "keep the frames after this time for evaluation, in seconds from the first frame"
+    p.add_argument("--hold-out-after", type=options.positive, metavar="S", help=after)
+    horizon = "seconds that the scene goes on after its last observed time (default: a quarter of the clip)"
+    p.add_argument("--horizon", type=options.not_negative, metavar="S", help=horizon)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the command."""
+    window = {"start": args.start, "end": args.end, "every": args.every, "fps": args.fps}
+    hold_out = {
+        "cameras": tuple(args.hold_out_camera),
+        "every": args.hold_out_every,
+        "after": args.hold_out_after,
+        "horizon": args.horizon,
+    }
+    run_prepare(
+        args.source,
+        args.out,
+        window=window,
+        hold_out=hold_out,
+        progress_kind=args.progress,
+        calibration=args.calibration,
+        lines=args.size,
+        lossless=args.lossless,
+        sync=args.sync,
+        offsets=_offsets(args.offset),
+        rate=args.rate,
+        overwrite=args.overwrite,
+    )
+
+
+def run_prepare(
+    source: Path,
+    out: Path,
+    *,
+    window: dict[str, Any] | None = None,
+    hold_out: dict[str, Any] | None = None,
+    progress_kind: str = "none",
+    **fields: Any,
+) -> Plan:
+    """Make a data set and check it.
+
+    Args:
+        source: Folder of videos or frames, or one video.
+        out: Folder of the data set.
+        window: Fields of `prepare.frame_choice.Window`.
+        hold_out: Fields of `prepare.data_splits.HoldOut`.
+        progress_kind: Form of progress output (`progress.make`).
+        **fields: Further fields of `prepare.prepare.Request`.
+
+    Raises:
+        ConfigError, DatasetError, BackendError: An input cannot be used.
+        Interrupted: Ctrl-C; finished images are kept.
+    """
+    window = window or {}
+    if window.get("end") is not None and window["end"] <= window.get("start", 0.0):
+        raise errors.UsageError(f"--end {window['end']:g}: expected a time after --start {window.get('start', 0.0):g}")
+    from ...prepare import data_splits, frame_choice, prepare
+    from ...progress import make
+
+    request = prepare.Request(
+        source,
+        out,
+        window=frame_choice.Window(**window),
+        hold_out=data_splits.HoldOut(**(hold_out or {})),
+        **fields,
+    )
+    with make(progress_kind) as progress:
+        try:
+            plan = prepare.prepare(request, progress)
+        except KeyboardInterrupt as stop:
+            raise errors.Interrupted(
+                f"stopped; finished images are kept in {out}, run the same command again to continue"
+            ) from stop
+        if progress_kind == "json":
+            progress({"event": "prepared", "path": str(out)})
+    if progress_kind == "auto":
+        terminal.print_lines(summary(plan))
+    return plan
+
+
+def summary(plan: Plan) -> list[str]:
+    """Return the lines that describe a prepared data set and the next command."""
+    lines = []
+    for number, camera in enumerate(plan.cameras):
+        source, offset = camera.source, plan.offsets[number]
+        clock = ""
+        if offset.sigma is not None and len(plan.cameras) > 1:
+            clock = f", clock {1e3 * offset.seconds:+.1f} ms"
+            clock += f" (± {1e3 * offset.sigma:.1f} ms, from {offset.method})" if offset.sigma else ""
+        lines.append(
+            f"{source.name}: {len(plan.choice.indices[number])} of {len(source.times)} frames, "
+            f"{source.width}x{source.height} at {1 / source.interval:.4g} per second{clock}"
+        )
+        lines += [f"  {note}" for note in source.notes]
+    lines += list(plan.notes)
+    size, timeline = plan.size, plan.timeline
+    shown = plan.rectifiers[0]
+    lines.append(
+        f"images of {shown.width}x{shown.height}: training needs about {size.training_bytes / 2**30:.1f} GB of the "
+        f"{size.machine_bytes / 2**30:.1f} GB of this machine"
+    )
+    seconds = timeline.t_max * timeline.seconds_per_unit
+    lines.append(f"{seconds:.2f} s are observed; t_max is {timeline.t_max:.3g}")
+    data = shlex.quote(str(plan.request.out))
+    lines.append(f"written: {plan.request.out}. Next: r5dgs check {data}, then r5dgs train {data} --out RUN")
+    return lines
+
+
+def _offsets(given: Sequence[str]) -> dict[str, float]:
+    """Convert arguments CAMERA=MS to seconds by camera."""
+    found = {}
+    for text in given:
+        name, mark, value = text.rpartition("=")
+        try:
+            found[name] = float(value) / 1e3
+        except ValueError:
+            mark = ""
+        if not mark or not name:
+            raise errors.UsageError(f"--offset {text}: expected a camera and milliseconds, such as cam0=12.5")
+    return found

@@ -1,0 +1,1 @@
+"""`r5dgs prepare`: turns videos or frames of calibrated cameras into a data set."""

@@ -1,0 +1,121 @@
+"""Common clock of the cameras: known offsets, sound, or motion.
+
+A measured offset is used only if it is significant. Cameras that record in step have offset 0, and a measurement would
+only add its error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .. import errors
+from ..capture.calibration.calibration import CalibratedCamera, Calibration
+from . import audio_offsets, motion_offsets, motion_tracks
+from .camera_source import TABLE, CameraSource
+from .clock import Offset
+
+METHODS = ("auto", "audio", "motion", "none")
+SIGNIFICANT = 3.0  # least offset, in standard deviations
+GAIN = 0.05  # least reduction of the loss by offsets from motion
+UNSURE = 0.5  # largest standard deviation of a usable offset, frame intervals
+
+
+def offsets(
+    sources: Sequence[CameraSource],
+    calibration: Calibration,
+    cameras: Sequence[CalibratedCamera],
+    method: str,
+    given: Mapping[str, float],
+    progress: Callable[[dict[str, Any]], None],
+) -> tuple[list[Offset], list[str]]:
+    """Return the offset of each camera's clock, and remarks for the user.
+
+    Args:
+        sources: The cameras.
+        calibration: The calibration.
+        cameras: Their calibrated cameras, for the size of their frames.
+        method: One of `METHODS`.
+        given: Known offsets in seconds by name; other cameras then have offset 0.
+        progress: Called with progress events.
+
+    Raises:
+        ConfigError: A given name does not exist, or the method cannot be used.
+    """
+    names = [source.name for source in sources]
+    unknown = [name for name in given if name not in names]
+    if unknown:
+        raise errors.ConfigError(f"--offset {unknown[0]}: expected one of {', '.join(names)}")
+    none = [Offset(0.0, None, "none") for _ in sources]
+    if given:
+        return [Offset(given.get(name, 0.0), 0.0, "given") for name in names], []
+    if len(sources) < 2 or method == "none":
+        return none, []
+    if method == "auto" and all(source.timing == TABLE for source in sources):
+        return [Offset(0.0, 0.0, TABLE) for _ in sources], []
+    if method in ("auto", "audio"):
+        if all(source.sound for source in sources):
+            progress({"event": "sync", "text": "sound"})
+            found = audio_offsets.measure(sources, _distances(cameras, calibration.meters_per_unit))
+            if found is not None and all(one.sigma is not None for one in found):
+                return _significant(sources, found)
+        elif method == "audio":
+            silent = next(source.name for source in sources if not source.sound)
+            raise errors.ConfigError(f"--sync audio: {silent} has no sound; use --sync motion")
+        if method == "audio":
+            raise errors.ConfigError("--sync audio: the cameras' sounds do not match; use --sync motion")
+    if any(camera.moves for camera in cameras):
+        return none, ["clocks are not compared, because a camera moves; give offsets with --offset NAME=MS"]
+    return _by_motion(sources, cameras, progress)
+
+
+def _by_motion(
+    sources: Sequence[CameraSource], cameras: Sequence[CalibratedCamera], progress: Callable[[dict[str, Any]], None]
+) -> tuple[list[Offset], list[str]]:
+    total = sum(min(len(source.times), motion_tracks.MOST_FRAMES) for source in sources)
+    done, tracks = 0, []
+    for source, camera in zip(sources, cameras, strict=True):
+
+        def report(count: int, before: int = done, name: str = source.name) -> None:
+            event = {"event": "sync", "done": before + count, "total": total, "unit": "frames"}
+            progress({**event, "text": f"motion in {name}"})
+
+        tracks.append(motion_tracks.track(source, camera.lens, report))
+        done += min(len(source.times), motion_tracks.MOST_FRAMES)
+    poses = [camera.T_cam_world for camera in cameras]
+    intervals = [source.interval for source in sources]
+    found = motion_offsets.measure(tracks, poses, intervals)
+    none = [Offset(0.0, None, "none") for _ in sources]
+    if found is None:
+        return none, ["clocks are not compared: too little moves in the cameras' common view; offsets of 0 are used"]
+    values = np.array([one.seconds for one in found])
+    before = motion_offsets.misfit(tracks, poses, max(intervals), 0 * values)
+    after = motion_offsets.misfit(tracks, poses, max(intervals), values)
+    if np.isfinite(before) and after > (1 - GAIN) * before:
+        sigmas = [one.sigma for one in found]
+        return [Offset(0.0, sigma, "motion") for sigma in sigmas], []
+    return _significant(sources, found)
+
+
+def _significant(sources: Sequence[CameraSource], found: Sequence[Offset]) -> tuple[list[Offset], list[str]]:
+    """Replace offsets that are not significant by 0; returns them, and a remark for each that was not measured."""
+    result, notes = [], []
+    for source, one in zip(sources, found, strict=True):
+        if one.sigma is None or one.sigma > UNSURE * source.interval:
+            notes.append(f"{source.name}: its clock could not be compared with the others; offset 0 is used")
+            result.append(Offset(0.0, None, "none"))
+        elif one.sigma and abs(one.seconds) < SIGNIFICANT * one.sigma:
+            result.append(Offset(0.0, one.sigma, one.method))
+        else:
+            result.append(one)
+    return result, notes
+
+
+def _distances(cameras: Sequence[CalibratedCamera], meters_per_unit: float | None) -> np.ndarray | None:
+    """Distances between cameras, metres; None if the unit is unknown. [C, C]"""
+    if meters_per_unit is None:
+        return None
+    centers = np.stack([camera.camera_to_world[:3, 3] for camera in cameras])
+    return np.linalg.norm(centers[:, None] - centers[None], axis=-1) * meters_per_unit

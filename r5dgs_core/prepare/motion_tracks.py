@@ -1,0 +1,98 @@
+"""Path of the largest moving region in the frames of a static camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from ..capture.calibration.lens import Lens
+from .camera_source import CameraSource
+
+WIDTH = 240  # of the reduced frames, pixels
+MOST_FRAMES = 1200  # per camera, consecutive; bounds memory
+BACKGROUND_FRAMES = 41
+_NOISE = 12  # least difference from the background, of 255
+_AREA = 0.0008  # least share of the frame
+_SHARE = 0.5  # largest share of the frame
+
+
+@dataclass(frozen=True)
+class MotionTrack:
+    """Path of a moving region.
+
+    Attributes:
+        times: Times at which it is seen, on the camera's clock, seconds. [F]
+        points: Its centre in the plane at depth 1, camera axes. [F, 2]
+        pixel: Size of a pixel of the full image in that plane.
+    """
+
+    times: np.ndarray
+    points: np.ndarray
+    pixel: float
+
+
+def track(source: CameraSource, lens: Lens, report: Callable[[int], None]) -> MotionTrack:
+    """Follow the largest moving region of a camera.
+
+    Args:
+        source: The camera, static.
+        lens: Its lens for the size of the frames.
+        report: Called with the number of each decoded frame.
+    """
+    first = max(0, (len(source.times) - MOST_FRAMES) // 2)
+    wanted = range(first, min(first + MOST_FRAMES, len(source.times)))
+    step = max(1, source.width // WIDTH)
+    found, small = [], []
+    for count, (index, pixels) in enumerate(source.read(list(wanted)), 1):
+        found.append(index)
+        small.append(reduce(pixels, step))
+        report(count)
+    if len(small) < 4:
+        return MotionTrack(np.zeros(0), np.zeros((0, 2)), 1.0 / lens.fx)
+    stack = np.stack(small)
+    centers = _centers(stack)
+    seen = np.isfinite(centers[:, 0])
+    pixels = (centers[seen] + 0.5) * step
+    rays = lens.unproject(pixels) if len(pixels) else np.zeros((0, 3))
+    good = np.isfinite(rays).all(1) & (rays[:, 2] > 1e-3)
+    return MotionTrack(source.times[found][seen][good], rays[good, :2] / rays[good, 2:], 1.0 / lens.fx)
+
+
+def reduce(pixels: np.ndarray, step: int) -> np.ndarray:
+    """Return the mean gray of squares of pixels. [H, W, 3] uint8 -> [H // step, W // step] uint8"""
+    height, width = pixels.shape[0] // step, pixels.shape[1] // step
+    cut = pixels[: height * step, : width * step].reshape(height, step, width, step, 3)
+    return cut.mean(axis=(1, 3, 4), dtype=np.float32).astype(np.uint8)
+
+
+def background(stack: np.ndarray) -> np.ndarray:
+    """Return the median of frames spread over time. [F, h, w] -> [h, w] float32"""
+    chosen = np.unique(np.linspace(0, len(stack) - 1, BACKGROUND_FRAMES).astype(int))
+    return np.median(stack[chosen], axis=0).astype(np.float32)
+
+
+def _centers(stack: np.ndarray) -> np.ndarray:
+    """Centre (x, y) of the largest region that differs from the background, NaN if there is none. [F, 2]"""
+    behind = background(stack)
+    area = behind.size
+    centers = np.full((len(stack), 2), np.nan)
+    for k, frame in enumerate(stack):
+        apart = np.abs(frame.astype(np.float32) - behind)
+        gain = np.median(frame) - np.median(behind)  # a change of exposure is no motion
+        apart = np.abs(frame.astype(np.float32) - behind - gain) if abs(gain) > 1 else apart
+        moving = ndimage.binary_opening(apart > _NOISE, iterations=1)
+        labels, count = ndimage.label(ndimage.binary_dilation(moving, iterations=2))
+        if not count:
+            continue
+        sizes = np.bincount(labels[moving], minlength=count + 1)
+        largest = int(np.argmax(sizes[1:])) + 1
+        region = moving & (labels == largest)
+        y, x = np.nonzero(region)
+        edge = x.min() == 0 or y.min() == 0 or x.max() == frame.shape[1] - 1 or y.max() == frame.shape[0] - 1
+        if _AREA * area <= sizes[largest] <= _SHARE * area and not edge:
+            weight = np.minimum(apart[region], 64.0)
+            centers[k] = np.average(x, weights=weight), np.average(y, weights=weight)
+    return centers

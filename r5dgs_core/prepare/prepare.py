@@ -1,0 +1,215 @@
+"""Preparation of a data set from recordings of calibrated cameras, resumable, with memory that frames do not increase.
+
+The record ``capture.json`` is written before the images, with everything that was measured. The same command continues
+from it: it measures nothing again and writes only missing images, so that the result is that of an uninterrupted run.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .. import errors, folder_lock
+from ..capture.calibration.calibration import Calibration
+from ..data import images
+from . import cameras, capture_file, clocks, data_splits, frame_choice, image_size, record, rectify
+from .cameras import Camera
+from .clock import Offset
+from .data_splits import HoldOut, Timeline
+from .frame_choice import Choice, Window
+
+IMAGES = "images"
+_WRITTEN = (IMAGES, "object_mask", "check", "transforms_train.json", "transforms_val.json", "transforms_test.json")
+_WRITTEN += ("objects.json", capture_file.FILE)
+Progress = Callable[[dict[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class Request:
+    """Arguments of `prepare`.
+
+    Attributes:
+        source: Folder of videos or frames, or one video.
+        out: Folder of the data set.
+        calibration: File or folder of the calibration; that in the source's folder if None.
+        window: Part of the recording.
+        hold_out: Frames that training does not use.
+        lines: Height of the images; the largest that fits the memory if None.
+        lossless: Write PNG instead of JPEG.
+        sync: One of `clocks.METHODS`.
+        offsets: Known offsets of clocks by camera, seconds.
+        rate: Frames per second of recordings without usable times.
+        overwrite: Replace a data set that was prepared with other settings.
+    """
+
+    source: Path
+    out: Path
+    calibration: Path | None = None
+    window: Window = field(default_factory=Window)
+    hold_out: HoldOut = field(default_factory=HoldOut)
+    lines: int | None = None
+    lossless: bool = False
+    sync: str = "auto"
+    offsets: dict[str, float] = field(default_factory=dict)
+    rate: float | None = None
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that determines the data set.
+
+    Attributes:
+        request: The request.
+        cameras: The cameras.
+        calibration: Their calibration.
+        offsets: Offsets of their clocks.
+        choice: Chosen frames.
+        timeline: Scene times and splits.
+        size: Height of the images.
+        rectifiers: One for each camera.
+        notes: Remarks for the user.
+    """
+
+    request: Request
+    cameras: tuple[Camera, ...]
+    calibration: Calibration
+    offsets: tuple[Offset, ...]
+    choice: Choice
+    timeline: Timeline
+    size: image_size.Size
+    rectifiers: tuple[rectify.Rectifier, ...]
+    notes: tuple[str, ...]
+
+    def image_name(self, camera: int, index: int) -> str:
+        """Return the path of an image in the data set, without suffix."""
+        return f"{IMAGES}/{self.cameras[camera].name}/{self.cameras[camera].source.frame_name(index)}"
+
+    @property
+    def suffix(self) -> str:
+        """Suffix of the images."""
+        return ".png" if self.request.lossless else ".jpg"
+
+
+def prepare(request: Request, progress: Progress) -> Plan:
+    """Write a data set.
+
+    Args:
+        request: The request.
+        progress: Called with progress events.
+
+    Raises:
+        ConfigError, DatasetError, BackendError: An input cannot be used.
+        CheckpointError: Another process writes to the folder.
+    """
+    source, out = Path(request.source).resolve(), Path(request.out).resolve()
+    if out == source or source in out.parents and source.is_dir() and (out.parent == source):
+        raise errors.ConfigError(
+            f"--out {request.out}: is among the recordings; name a folder outside {request.source}"
+        )
+    progress({"event": "read", "text": "recordings and calibration"})
+    opened, calibration = cameras.open_all(request.source, request.calibration, request.rate)
+    with folder_lock.hold(out):
+        known = _begin(request, opened, calibration, out)
+        plan = _plan(request, opened, calibration, known, progress)
+        capture_file.write(out, record.content(plan, finished=False))
+        lost = _write_images(plan, out, progress)
+        record.write_cameras(plan, out, lost)
+        capture_file.write(out, record.content(plan, finished=True, lost=lost))
+    return plan
+
+
+def _begin(request: Request, opened: list[Camera], calibration: Calibration, out: Path) -> dict[str, Any] | None:
+    """Return the record of a run with the same input, or None; with ``overwrite``, remove that of another run."""
+    present = capture_file.read(out)
+    if present is None:
+        foreign = [path.name for path in out.iterdir() if path.name != folder_lock.LOCK_FILE]
+        if foreign:
+            raise errors.DatasetError(
+                f"{out}: expected an empty folder or a prepared data set, found {foreign[0]}; name another folder"
+            )
+        return None
+    wanted = record.identity(request, opened, calibration)
+    if present.get("identity") == wanted:
+        return present
+    if not request.overwrite:
+        changed = [key for key in wanted if present.get("identity", {}).get(key) != wanted[key]]
+        raise errors.DatasetError(
+            f"{out}: was prepared from other input or settings ({', '.join(changed)}); name another folder with --out, "
+            "or give --overwrite"
+        )
+    for name in _WRITTEN:
+        path = out / name
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+    return None
+
+
+def _plan(
+    request: Request, opened: list[Camera], calibration: Calibration, known: dict[str, Any] | None, progress: Progress
+) -> Plan:
+    sources = [camera.source for camera in opened]
+    if known is not None:
+        offsets, notes = record.offsets_of(known), list(known["notes"])
+    else:
+        calibrated = [camera.calibrated for camera in opened]
+        offsets, notes = clocks.offsets(sources, calibration, calibrated, request.sync, request.offsets, progress)
+    names = [source.name for source in sources]
+    times = [
+        camera.source.times[camera.usable] + offset.seconds for camera, offset in zip(opened, offsets, strict=True)
+    ]
+    choice = frame_choice.choose(names, times, request.window)
+    indices = tuple(camera.usable[index] for camera, index in zip(opened, choice.indices, strict=True))
+    choice = frame_choice.replace_indices(choice, indices)
+    if known is None:
+        notes += _length_notes(names, choice)
+    timeline = data_splits.arrange(names, choice, request.hold_out)
+    sizes = [(source.width, source.height) for source in sources]
+    counts = [sum(split == "train" for split in splits) for splits in timeline.splits]
+    size = image_size.choose(sizes, counts, request.lines if known is None else known["images"]["lines"])
+    rectifiers = tuple(
+        rectify.rectifier(camera.calibrated.lens, wh, size.lines) for camera, wh in zip(opened, sizes, strict=True)
+    )
+    return Plan(request, tuple(opened), calibration, tuple(offsets), choice, timeline, size, rectifiers, tuple(notes))
+
+
+def _length_notes(names: list[str], choice: Choice) -> list[str]:
+    """Remarks about time that only some cameras recorded."""
+    limit = max(2 * choice.source_interval, 0.1)
+    return [
+        f"{name}: {unused:.2f} s at its ends are not used, because another camera does not record then"
+        for name, unused in zip(names, choice.unused, strict=True)
+        if unused > limit
+    ]
+
+
+def _write_images(plan: Plan, out: Path, progress: Progress) -> dict[str, list[int]]:
+    """Write the images that are missing. Returns indices of frames that cannot be decoded, by camera."""
+    total, done = sum(len(indices) for indices in plan.choice.indices), 0
+    write = images.write_png if plan.request.lossless else images.write_jpeg
+    lost = {}
+    for number, camera in enumerate(plan.cameras):
+        indices = plan.choice.indices[number].tolist()
+        paths = {index: out / (plan.image_name(number, index) + plan.suffix) for index in indices}
+        missing = [index for index in indices if not paths[index].is_file()]
+        done += len(indices) - len(missing)
+        written = set()
+        for index, pixels in camera.source.read(missing):
+            write(paths[index], plan.rectifiers[number].image(pixels))
+            written.add(index)
+            done += 1
+            progress({"event": "images", "done": done, "total": total, "text": camera.name})
+        gone = [index for index in missing if index not in written]
+        done += len(gone)
+        if len(gone) == len(indices):
+            raise errors.DatasetError(
+                f"{camera.source.paths[0]}: none of the {len(gone)} requested frames can be decoded; copy it again"
+            )
+        lost[camera.name] = gone
+    progress({"event": "images", "done": total, "total": total, "text": ""})
+    return lost

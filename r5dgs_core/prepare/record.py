@@ -1,0 +1,173 @@
+"""Files of a prepared data set: the content of ``capture.json``, and the camera files."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import __version__
+from ..capture.calibration.calibration import Calibration
+from ..data.splits import SPLITS
+from . import capture_file
+from .cameras import Camera
+from .clock import Offset
+
+if TYPE_CHECKING:
+    from .prepare import Plan, Request
+
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_EDGE_BYTES = 1 << 16  # of a file that enter its fingerprint, at each end
+
+
+def identity(request: Request, opened: Sequence[Camera], calibration: Calibration) -> dict[str, Any]:
+    """Return the input and the settings that determine a data set. JSON types."""
+    settings = {
+        "start": request.window.start,
+        "end": request.window.end,
+        "every": request.window.every,
+        "fps": request.window.fps,
+        "size": request.lines,
+        "lossless": request.lossless,
+        "sync": request.sync,
+        "offsets": dict(sorted(request.offsets.items())),
+        "rate": request.rate,
+        "hold_out_camera": list(request.hold_out.cameras),
+        "hold_out_every": request.hold_out.every,
+        "hold_out_after": request.hold_out.after,
+        "horizon": request.hold_out.horizon,
+    }
+    files = {camera.name: _fingerprint(camera.source.paths) for camera in opened}
+    lenses = repr([(c.name, c.lens, c.camera_to_world.tolist()) for c in (camera.calibrated for camera in opened)])
+    times = hashlib.sha256(b"".join(camera.source.times.tobytes() for camera in opened)).hexdigest()
+    cameras = hashlib.sha256((calibration.format + lenses).encode()).hexdigest()
+    return {**settings, "recordings": files, "calibration": cameras, "times": times}
+
+
+def _fingerprint(paths: Sequence[Path]) -> str:
+    """Hash of the names, sizes and ends of files."""
+    hasher = hashlib.sha256()
+    for path in paths:
+        size = path.stat().st_size
+        with path.open("rb") as stream:
+            head = stream.read(_EDGE_BYTES)
+            stream.seek(max(size - _EDGE_BYTES, 0))
+            hasher.update(f"{path.name} {size} ".encode() + head + stream.read(_EDGE_BYTES))
+    return hasher.hexdigest()
+
+
+def content(plan: Plan, *, finished: bool, lost: Mapping[str, list[int]] | None = None) -> dict[str, Any]:
+    """Return the content of ``capture.json``. JSON types."""
+    unit = plan.calibration.meters_per_unit
+    return {
+        "generator": f"r5dgs {__version__}",
+        "finished": finished,
+        "source": str(plan.request.source),
+        "identity": identity(plan.request, plan.cameras, plan.calibration),
+        "cameras": [_camera(plan, number, (lost or {})) for number in range(len(plan.cameras))],
+        "calibration": {
+            "format": plan.calibration.format,
+            "file": plan.calibration.path.name,
+            "meters_per_unit": unit,
+            "world_convention": plan.calibration.world_convention,
+        },
+        "time": {
+            "seconds_per_unit": plan.timeline.seconds_per_unit,
+            "frames_per_unit": plan.timeline.frames_per_unit,
+            "t_max": plan.timeline.t_max,
+            "interval_ms": 1e3 * plan.choice.interval,
+        },
+        "images": {"lines": plan.size.lines, "kind": "PNG" if plan.request.lossless else "JPEG 95"},
+        "notes": list(plan.notes),
+    }
+
+
+def _camera(plan: Plan, number: int, lost: Mapping[str, list[int]]) -> dict[str, Any]:
+    source, offset = plan.cameras[number].source, plan.offsets[number]
+    lens = plan.cameras[number].calibrated.lens
+    steps = np.diff(source.times)
+    interval = source.interval
+    long = np.flatnonzero(steps > 1.5 * interval)
+    return {
+        "name": source.name,
+        "files": [path.name for path in source.paths] if source.videos else [f"{len(source.paths)} frames"],
+        "width": source.width,
+        "height": source.height,
+        "frames": len(source.times),
+        "used": len(plan.choice.indices[number]),
+        "rate": 1.0 / interval,
+        "times": source.timing,
+        "gaps": [{"after_frame": int(k), "ms": 1e3 * float(steps[k])} for k in long[:100]],
+        "offset_ms": 1e3 * offset.seconds,
+        "offset_sigma_ms": None if offset.sigma is None else 1e3 * offset.sigma,
+        "offset_from": offset.method,
+        "lens": dataclasses.asdict(lens),
+        "undecodable": lost.get(source.name, []),
+        "notes": list(source.notes),
+    }
+
+
+def offsets_of(known: Mapping[str, Any]) -> list[Offset]:
+    """Return the offsets that a record holds."""
+    return [
+        Offset(
+            camera["offset_ms"] / 1e3,
+            None if camera["offset_sigma_ms"] is None else camera["offset_sigma_ms"] / 1e3,
+            camera["offset_from"],
+        )
+        for camera in known["cameras"]
+    ]
+
+
+def write_cameras(plan: Plan, out: Path, lost: Mapping[str, list[int]]) -> None:
+    """Write the camera file of each split that has images, and remove those of empty splits."""
+    for split in SPLITS:
+        data = {}
+        for number, camera in enumerate(plan.cameras):
+            frames = _frames(plan, number, split, set(lost.get(camera.name, [])))
+            if frames:
+                data[camera.name] = {**_lens(plan, number), **_shared_pose(camera), "frames": frames}
+        path = out / f"transforms_{split}.json"
+        if not data:
+            path.unlink(missing_ok=True)
+            continue
+        top = {
+            "world_convention": plan.calibration.world_convention,
+            "frames_per_unit": plan.timeline.frames_per_unit,
+            "seconds_per_unit": plan.timeline.seconds_per_unit,
+            "meters_per_unit": plan.calibration.meters_per_unit,
+        }
+        capture_file.write_json(path, {**top, "data": data})
+
+
+def _lens(plan: Plan, number: int) -> dict[str, float]:
+    rectifier = plan.rectifiers[number]
+    k = rectifier.intrinsics
+    lens = {"fl_x": k[0, 0], "fl_y": k[1, 1], "cx": k[0, 2], "cy": k[1, 2], "w": rectifier.width, "h": rectifier.height}
+    return {key: value if isinstance(value, int) else float(value) for key, value in lens.items()}
+
+
+def _shared_pose(camera: Camera) -> dict[str, Any]:
+    return {} if camera.poses else {"transform_matrix": (camera.pose(0) @ _OPENGL).tolist()}
+
+
+def _frames(plan: Plan, number: int, split: str, lost: set[int]) -> list[dict[str, Any]]:
+    camera, found = plan.cameras[number], []
+    rows = zip(
+        plan.choice.indices[number].tolist(),
+        plan.timeline.times[number].tolist(),
+        plan.timeline.splits[number],
+        plan.choice.moments[number].tolist(),
+        strict=True,
+    )
+    for index, t, own, moment in rows:
+        if own == split and index not in lost:
+            frame = {"file_path": plan.image_name(number, index) + plan.suffix, "time": t, "frame": moment}
+            if camera.poses:
+                frame["transform_matrix"] = (camera.pose(index) @ _OPENGL).tolist()
+            found.append(frame)
+    return found
