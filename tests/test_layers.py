@@ -71,6 +71,7 @@ ALLOWED = {
     "language": {"scene", "data", "search", "playback", "render"},
     "train": {"motion", "motion_fit", "scene", "data", "raster", "config", "model", "render"},
     "masks": {"data", "language"},
+    "prepare": {"color", "data", "capture", "masks"},
     "worker": {"scene", "raster", "playback", "editing", "protocol", "render", "language"},
     "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train", "shapes"},
     "check": {"motion", "terminal", "scene", "data", "formats", "config", "train"},
@@ -108,6 +109,7 @@ ALLOWED = {
         "language",
         "train",
         "masks",
+        "prepare",
         "bake",
         "check",
         "stability",
@@ -119,7 +121,7 @@ ALLOWED = {
 # Commands that import numpy or torch.
 COMMANDS = (
     *("associate", "bake", "bench", "demo", "evaluate", "export", "import_run", "info", "lookup", "masks", "name"),
-    *("objects", "query", "report", "train", "warm_up"),
+    *("objects", "prepare", "query", "report", "train", "warm_up"),
 )
 # Modules that may import modules of the project inside functions: the command line and the public functions, which
 # start fast, and the worker, which answers before torch is there and if it is missing.

@@ -131,6 +131,7 @@ def _sound(source: CameraSource, start: float, end: float) -> Iterator[tuple[flo
     """Yield blocks of mono sound: the time of the first sample on the camera's clock, and samples at `RATE`."""
     with extras.required("sound", "video"):
         import av
+        import av.error
     for video, first in zip(source.videos, source.first, strict=True):
         shift = float(source.times[first] - video.times[0])  # from the file's clock to the camera's
         if source.times[first] > end:
@@ -140,7 +141,7 @@ def _sound(source: CameraSource, start: float, end: float) -> Iterator[tuple[flo
             stream = container.streams.audio[0]
             wanted = start - shift - 0.2
             if wanted > 0:
-                container.seek(int(wanted / stream.time_base), stream=stream, backward=True)
+                container.seek(int(wanted / float(stream.time_base or 1)), stream=stream, backward=True)
             began, count = None, 0
             try:
                 for frame in container.decode(stream):

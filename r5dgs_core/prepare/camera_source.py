@@ -113,12 +113,13 @@ def _open_frames(files: CameraFiles) -> CameraSource:
 
 def _open_videos(files: CameraFiles) -> CameraSource:
     videos = tuple(video_file.probe(path) for path in files.paths)
+    leading = videos[0]
     notes = [note for video in videos for note in _notes(video)]
     parts, first, start, count = [], [], 0.0, 0
     for video in videos:
-        if (video.width, video.height) != (videos[0].width, videos[0].height):
+        if (video.width, video.height) != (leading.width, leading.height):
             raise errors.DatasetError(
-                f"{video.path}: expected {videos[0].width}x{videos[0].height} like {videos[0].path.name}, found "
+                f"{video.path}: expected {leading.width}x{leading.height} like {leading.path.name}, found "
                 f"{video.width}x{video.height}; chapters of one recording have one size"
             )
         own = video.times if not parts else start + video.times - video.times[0]
@@ -131,8 +132,8 @@ def _open_videos(files: CameraFiles) -> CameraSource:
     return CameraSource(
         name=files.name,
         paths=files.paths,
-        width=videos[0].width,
-        height=videos[0].height,
+        width=leading.width,
+        height=leading.height,
         times=np.concatenate(parts),
         timing=CONTAINER,
         videos=videos,

@@ -46,7 +46,7 @@ def solve_pairs(count: int, pairs: Sequence[tuple[int, int, float, float]], meth
     for row, (a, b, offset, _) in enumerate(pairs):
         rows[row, b], rows[row, a], wanted[row] = 1.0, -1.0, offset
     robust = weights.copy()
-    solution = np.zeros(size)
+    solution, off = np.zeros(size), np.zeros(len(pairs))
     for _ in range(10):  # least squares with Huber weights, so that one wrong pair does not spoil the others
         part = np.linalg.lstsq(robust[:, None] * rows[:, 1:], robust * wanted, rcond=None)[0]
         solution[1:] = part

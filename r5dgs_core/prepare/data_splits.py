@@ -37,7 +37,7 @@ class Timeline:
 
     Attributes:
         times: Scene time of each frame in [0, 1]. C arrays [F]
-        splits: Split of each frame. C tuples
+        splits: Split of each frame, "" for frames of held-out cameras outside the observed time. C tuples
         t_max: Last time of the training frames.
         seconds_per_unit: Seconds per unit of scene time.
         frames_per_unit: Frames of the source per unit of scene time.
@@ -79,6 +79,14 @@ def arrange(names: Sequence[str], choice: Choice, hold_out: HoldOut) -> Timeline
     if not observed:
         raise errors.ConfigError("no frame is left for training; hold out fewer cameras or times")
     end = max(observed) - zero
+    within = min(observed), max(observed)
+    splits = [
+        tuple(
+            "" if kind == "val" and not within[0] <= t <= within[1] else kind
+            for t, kind in zip(times, kinds, strict=True)
+        )
+        for times, kinds in zip(choice.times, splits, strict=True)
+    ]
     horizon = HORIZON_SHARE * end if hold_out.horizon is None else hold_out.horizon
     unit = max(last - zero, end + horizon) or 1.0
     return Timeline(

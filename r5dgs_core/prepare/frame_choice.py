@@ -65,7 +65,8 @@ def choose(names: Sequence[str], clocks: Sequence[np.ndarray], window: Window) -
         DatasetError: The cameras never record at the same time, or no frame is in the window.
     """
     steps = [float(np.median(np.diff(times))) if len(times) > 1 else 0.0 for times in clocks]
-    slowest = int(np.argmax(steps))
+    alike = [k for k, step in enumerate(steps) if step >= 0.95 * max(steps)]
+    slowest = max(alike, key=lambda k: len(clocks[k]))  # one that dropped frames would drop moments
     first, last = max(times[0] for times in clocks), min(times[-1] for times in clocks)
     slack = 0.5 * max(steps) + SAME_S
     if last < first - slack:

@@ -75,7 +75,7 @@ def measure(
     guess = _descend(pairs, tracks, guess, step, FINE * step, 1.5)
     dropped = [_descend(pairs, tracks, guess, step, FINE * step, 1.0, leave=block) for block in range(BLOCKS)]
     spread = np.sqrt((BLOCKS - 1) / BLOCKS * np.square(np.array(dropped) - np.mean(dropped, axis=0)).sum(0))
-    floor = 0.5 * FINE * step
+    floor = FINE * step
     return [
         Offset(float(value), 0.0 if k == first else float(max(sigma, floor)), "motion") if known[k] else coarse[k]
         for k, (value, sigma) in enumerate(zip(guess, spread, strict=True))

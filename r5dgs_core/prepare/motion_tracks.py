@@ -12,7 +12,7 @@ from ..capture.calibration.lens import Lens
 from .camera_source import CameraSource
 
 WIDTH = 240  # of the reduced frames, pixels
-MOST_FRAMES = 1200  # per camera, consecutive; bounds memory
+MOST_FRAMES = 600  # per camera, consecutive; bounds memory
 BACKGROUND_FRAMES = 41
 _NOISE = 12  # least difference from the background, of 255
 _AREA = 0.0008  # least share of the frame
@@ -62,37 +62,39 @@ def track(source: CameraSource, lens: Lens, report: Callable[[int], None]) -> Mo
 
 
 def reduce(pixels: np.ndarray, step: int) -> np.ndarray:
-    """Return the mean gray of squares of pixels. [H, W, 3] uint8 -> [H // step, W // step] uint8"""
+    """Return the mean colour of squares of pixels. [H, W, 3] uint8 -> [H // step, W // step, 3] uint8"""
+    if step == 1:
+        return pixels
     height, width = pixels.shape[0] // step, pixels.shape[1] // step
-    cut = pixels[: height * step, : width * step].reshape(height, step, width, step, 3)
-    return cut.mean(axis=(1, 3, 4), dtype=np.float32).astype(np.uint8)
+    rows = np.add.reduceat(pixels[: height * step], np.arange(0, height * step, step), axis=0, dtype=np.uint32)
+    cells = np.add.reduceat(rows[:, : width * step], np.arange(0, width * step, step), axis=1)
+    return (cells // step**2).astype(np.uint8)
 
 
 def background(stack: np.ndarray) -> np.ndarray:
-    """Return the median of frames spread over time. [F, h, w] -> [h, w] float32"""
+    """Return the median of frames spread over time. [F, h, w, 3] -> [h, w, 3] int16"""
     chosen = np.unique(np.linspace(0, len(stack) - 1, BACKGROUND_FRAMES).astype(int))
-    return np.median(stack[chosen], axis=0).astype(np.float32)
+    return np.median(stack[chosen], axis=0).astype(np.int16)
 
 
 def _centers(stack: np.ndarray) -> np.ndarray:
     """Centre (x, y) of the largest region that differs from the background, NaN if there is none. [F, 2]"""
     behind = background(stack)
-    area = behind.size
+    area = behind[..., 0].size
     centers = np.full((len(stack), 2), np.nan)
     for k, frame in enumerate(stack):
-        apart = np.abs(frame.astype(np.float32) - behind)
-        gain = np.median(frame) - np.median(behind)  # a change of exposure is no motion
-        apart = np.abs(frame.astype(np.float32) - behind - gain) if abs(gain) > 1 else apart
-        moving = ndimage.binary_opening(apart > _NOISE, iterations=1)
-        labels, count = ndimage.label(ndimage.binary_dilation(moving, iterations=2))
-        if not count:
-            continue
-        sizes = np.bincount(labels[moving], minlength=count + 1)
+        apart = frame.astype(np.int16) - behind
+        apart -= np.median(apart, axis=(0, 1)).astype(np.int16)  # a change of exposure is no motion
+        apart = np.abs(apart).max(-1)
+        moving = np.asarray(ndimage.binary_opening(apart > _NOISE))
+        labels: np.ndarray = np.asarray(ndimage.label(ndimage.binary_dilation(moving, iterations=2))[0])  # type: ignore
+        sizes = np.bincount(labels[moving], minlength=2)
         largest = int(np.argmax(sizes[1:])) + 1
-        region = moving & (labels == largest)
-        y, x = np.nonzero(region)
+        if not _AREA * area <= sizes[largest] <= _SHARE * area:
+            continue
+        y, x = np.argwhere(moving & (labels == largest)).T
         edge = x.min() == 0 or y.min() == 0 or x.max() == frame.shape[1] - 1 or y.max() == frame.shape[0] - 1
-        if _AREA * area <= sizes[largest] <= _SHARE * area and not edge:
-            weight = np.minimum(apart[region], 64.0)
-            centers[k] = np.average(x, weights=weight), np.average(y, weights=weight)
+        if not edge:
+            weights = np.minimum(apart[y, x], 3 * _NOISE)  # pixels at the border count by their share
+            centers[k] = np.average(x, weights=weights), np.average(y, weights=weights)
     return centers

@@ -18,7 +18,8 @@ def match(wanted: Sequence[str], given: Sequence[str]) -> dict[str, str] | None:
     for key in (str, _plain, _number):
         by_key: dict[str, list[str]] = {}
         for name in given:
-            by_key.setdefault(key(name), []).append(name)
+            if key(name):
+                by_key.setdefault(key(name), []).append(name)
         found = {name: by_key.get(key(name), []) for name in wanted}
         if all(len(names) == 1 for names in found.values()):
             matched = {name: names[0] for name, names in found.items()}

@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,7 @@ from ..data.splits import SPLITS
 from . import capture_file
 from .cameras import Camera
 from .clock import Offset
-
-if TYPE_CHECKING:
-    from .prepare import Plan, Request
+from .plan import Plan, Request
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _EDGE_BYTES = 1 << 16  # of a file that enter its fingerprint, at each end

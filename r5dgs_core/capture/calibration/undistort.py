@@ -43,7 +43,7 @@ class Undistortion:
 
         Args:
             pixels: Source image. [H, W] or [H, W, C]; uint8, uint16 or float32
-            nearest: Take the nearest pixel, for masks, instead of Lanczos interpolation over 8 x 8 pixels.
+            nearest: Take the nearest pixel, for masks, instead of cubic interpolation.
 
         Raises:
             BackendError: OpenCV is not installed.
@@ -52,7 +52,7 @@ class Undistortion:
             return pixels
         with extras.required("undistortion", "prepare"):
             import cv2
-        way = cv2.INTER_NEAREST if nearest else cv2.INTER_LANCZOS4
+        way = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
         result = cv2.remap(pixels, self.map_x, self.map_y, way, borderMode=cv2.BORDER_REPLICATE)
         return result.reshape(self.height, self.width, *pixels.shape[2:])
 

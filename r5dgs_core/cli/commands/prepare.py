@@ -12,8 +12,7 @@ from ... import errors, terminal
 from .. import options
 
 if TYPE_CHECKING:
-    from ...findings import Finding
-    from ...prepare.prepare import Plan
+    from ...prepare.plan import Plan
 
 NAME = "prepare"
 SHORT = "make a data set of videos or frames of calibrated cameras"
@@ -23,6 +22,7 @@ LONG = (
 )
 EXAMPLE = "VIDEOS --calibration calibration.toml --out DATA"
 PAGE = "user/your_data.md"
+MODELS = ("sam2",)
 SYNC = ("auto", "audio", "motion", "none")
 
 
@@ -47,10 +47,9 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     offset = "known offset of a camera's clock in milliseconds, which is added to its times; may be repeated"
     p.add_argument("--offset", action="append", default=[], metavar="CAMERA=MS", help=offset)
     _add_hold_out(p)
-    masks = "masks: a folder with a mask per frame (CAMERA/FRAME.png), sam2, sam3 or none (default)"
+    masks = "masks: a folder with a mask per frame (CAMERA/FRAME.png), sam2 or none (default)"
     p.add_argument("--masks", default="none", metavar="FOLDER|sam2|none", help=masks)
-    p.add_argument("--model", type=Path, metavar="DIR", help="folder of the weights of sam2 or sam3")
-    p.add_argument("--words", metavar="WORDS", help='objects that sam3 looks for, as "mug, red apple"')
+    p.add_argument("--model", type=Path, metavar="DIR", help="folder of the weights of sam2")
     p.add_argument("--overwrite", action="store_true", help="replace a data set that was prepared with other settings")
     options.add_progress(p)
 
@@ -88,6 +87,8 @@ def run(args: argparse.Namespace) -> None:
         offsets=_offsets(args.offset),
         rate=args.rate,
         overwrite=args.overwrite,
+        masks=args.masks,
+        model=args.model,
     )
 
 
@@ -97,6 +98,8 @@ def run_prepare(
     *,
     window: dict[str, Any] | None = None,
     hold_out: dict[str, Any] | None = None,
+    masks: str = "none",
+    model: Path | None = None,
     progress_kind: str = "none",
     **fields: Any,
 ) -> Plan:
@@ -107,8 +110,10 @@ def run_prepare(
         out: Folder of the data set.
         window: Fields of `prepare.frame_choice.Window`.
         hold_out: Fields of `prepare.data_splits.HoldOut`.
+        masks: Folder of masks of the frames, "sam2" or "none".
+        model: Folder of the SAM2 weights; that of the user's settings if None.
         progress_kind: Form of progress output (`progress.make`).
-        **fields: Further fields of `prepare.prepare.Request`.
+        **fields: Further fields of `prepare.plan.Request`.
 
     Raises:
         ConfigError, DatasetError, BackendError: An input cannot be used.
@@ -117,10 +122,10 @@ def run_prepare(
     window = window or {}
     if window.get("end") is not None and window["end"] <= window.get("start", 0.0):
         raise errors.UsageError(f"--end {window['end']:g}: expected a time after --start {window.get('start', 0.0):g}")
-    from ...prepare import data_splits, frame_choice, prepare
+    from ...prepare import data_splits, frame_choice, plan, prepare
     from ...progress import make
 
-    request = prepare.Request(
+    request = plan.Request(
         source,
         out,
         window=frame_choice.Window(**window),
@@ -129,7 +134,7 @@ def run_prepare(
     )
     with make(progress_kind) as progress:
         try:
-            plan = prepare.prepare(request, progress)
+            made = prepare.prepare(request, progress)
         except KeyboardInterrupt as stop:
             raise errors.Interrupted(
                 f"stopped; finished images are kept in {out}, run the same command again to continue"
@@ -137,8 +142,27 @@ def run_prepare(
         if progress_kind == "json":
             progress({"event": "prepared", "path": str(out)})
     if progress_kind == "auto":
-        terminal.print_lines(summary(plan))
-    return plan
+        terminal.print_lines(summary(made))
+    _make_masks(made, masks, model, progress_kind)
+    return made
+
+
+def _make_masks(plan: Plan, masks: str, model: Path | None, progress_kind: str) -> None:
+    """Write the masks of the images."""
+    from . import masks as masks_command
+
+    if masks == "none":
+        return
+    if masks in MODELS:
+        masks_command.run_masks(plan.request.out, backend=masks, model=model, progress_kind=progress_kind)
+        return
+    from ...prepare import source_masks
+    from ...progress import make
+
+    with make(progress_kind) as progress:
+        made = source_masks.write(Path(masks), plan, progress)
+    if progress_kind == "auto":
+        terminal.print_lines([f"{made.images} masks, {made.objects} objects"])
 
 
 def summary(plan: Plan) -> list[str]:

@@ -78,7 +78,7 @@ def test_an_undistorted_pattern_is_straight():
     pinhole = Lens("pinhole", *new.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]])
     expected = waves(pinhole.unproject(grid)).reshape(SIZE[::-1])
     inner = np.s_[5:-5, 5:-5]
-    assert np.abs(new.apply(source) - expected)[inner].max() < 0.2
+    assert np.abs(new.apply(source) - expected)[inner].max() < 0.5
     assert np.abs(new.apply(source, nearest=True) - expected)[inner].max() < 5
     assert new.apply(np.zeros((*SIZE[::-1], 3), np.uint8)).shape == (*SIZE[::-1], 3)
 

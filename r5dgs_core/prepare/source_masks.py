@@ -1,0 +1,111 @@
+"""Masks of the recordings' frames, as masks of the images: undistorted and reduced like them.
+
+FOLDER/cam0/000012.png     frame 12 of cam0; or the name of the frame's file
+FOLDER/objects.json        names of the ids, optional
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import atomic_files, errors
+from ..data import dataset as datasets
+from ..data import mask_notes, masks, view_masks
+from ..data.annotations import OBJECTS, read_objects
+from ..data.splits import SPLITS
+from ..masks import make_masks
+from ..masks.make_masks import MaskingResult, Progress
+from ..masks.videos import Video
+from . import names
+from .plan import Plan
+
+
+class SourceMasks:
+    """Mask backend (`masks.make_masks.MaskBackend`) that reads masks of the recordings' frames.
+
+    Args:
+        folder: The folder; its ``masks.json`` is applied.
+        plan: The prepared data set.
+
+    Raises:
+        DatasetError: The folder has no masks of the cameras, or they cannot be decoded.
+    """
+
+    name = "frames"
+    own_names: Path | None = None
+
+    def __init__(self, folder: Path, plan: Plan):
+        self.folder, self._plan = Path(folder), plan
+        if not self.folder.is_dir():
+            raise errors.DatasetError(f"--masks {folder}: expected a folder of masks, found none")
+        notes = mask_notes.read(self.folder)
+        self.numbering, self._unknown = notes.numbering, notes.unknown
+        self.made_with: dict[str, Any] = {"folder": self.folder.name, "unknown": notes.unknown}
+        cameras = [camera.name for camera in plan.cameras]
+        folders = {path.name: path for path in sorted(self.folder.iterdir()) if path.is_dir()}
+        matched = names.match(cameras, list(folders))
+        if matched is None:
+            raise errors.DatasetError(
+                f"{folder}: expected a folder of masks per camera ({', '.join(cameras)}), found "
+                f"{', '.join(folders) or 'none'}"
+            )
+        self._paths = {
+            plan.image_name(number, index): path
+            for number, name in enumerate(cameras)
+            for index, path in _by_index(plan, number, folders[matched[name]]).items()
+        }
+        if not self._paths:
+            example = plan.cameras[0].source.frame_name(int(plan.choice.indices[0][0]))
+            raise errors.DatasetError(f"{folder}: expected masks such as {cameras[0]}/{example}.png, found none")
+        self._colors = masks.color_table(self._paths.values())
+
+    def label(self, video: Video, room: Path, report: Callable[[float], None]) -> Iterator[np.ndarray | None]:
+        """Implement `make_masks.MaskBackend.label`."""
+        numbers = {camera.name: number for number, camera in enumerate(self._plan.cameras)}
+        for k, view in enumerate(video.views):
+            path = self._paths.get(view.name)
+            if path is None:
+                yield None
+            else:
+                rectifier = self._plan.rectifiers[numbers[view.name.split("/")[1]]]
+                yield rectifier.mask(masks.read(path, self._colors, self._unknown), str(path))
+            report((k + 1) / len(video.views))
+
+
+def _by_index(plan: Plan, number: int, folder: Path) -> dict[int, Path]:
+    """Find the mask of each chosen frame of a camera, by the frame's name or else by the number in the mask's name."""
+    source, chosen = plan.cameras[number].source, plan.choice.indices[number].tolist()
+    present = {path.stem: path for path in folder.iterdir() if path.suffix.lower() == ".png"}
+    named = {index: present[source.frame_name(index)] for index in chosen if source.frame_name(index) in present}
+    if named:
+        return named
+    numbered = {int(found[-1]): path for stem, path in present.items() if (found := re.findall(r"\d+", stem))}
+    first = 0 if 0 in numbered else 1
+    return {index: numbered[index + first] for index in chosen if index + first in numbered}
+
+
+def write(folder: Path, plan: Plan, progress: Progress) -> MaskingResult:
+    """Write the masks of all images, and the names of their ids.
+
+    Args:
+        folder: Masks of the recordings' frames.
+        plan: The prepared data set.
+        progress: Called with progress events.
+
+    Raises:
+        DatasetError: The masks cannot be read.
+    """
+    backend = SourceMasks(folder, plan)
+    out = Path(plan.request.out)
+    dataset = datasets.read(out, view_masks.NO_MASKS)
+    views = [view for split in SPLITS for view in dataset.views(split)]
+    made = make_masks.make(views, backend, out / view_masks.MASKS, overwrite=plan.request.overwrite, progress=progress)
+    if (folder / OBJECTS).is_file():
+        read_objects(folder)
+        atomic_files.write(out / OBJECTS, (folder / OBJECTS).read_bytes())
+    return made

@@ -1,0 +1,134 @@
+"""Offsets between clocks are recovered from sound and from motion, and are not invented."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from r5dgs_core import errors
+from r5dgs_core.prepare import cameras, clock, clocks, motion_offsets, motion_tracks
+from tests.support import recordings
+
+CLOCKS = (0.0, 0.0071, -0.0133)  # seconds
+STARTS = (0.5, 0.503, 0.511)
+
+
+def draw_nothing(camera, lens, t):
+    return np.zeros((32, 48, 3), np.uint8)
+
+
+def measured(folder, method="auto", given=None, calibration=None):
+    opened, found = cameras.open_all(folder, calibration, None)
+    calibrated = [camera.calibrated for camera in opened]
+    return clocks.offsets(
+        [camera.source for camera in opened], found, calibrated, method, given or {}, lambda event: None
+    )
+
+
+@pytest.fixture(scope="module")
+def swinging(tmp_path_factory):
+    """Three cameras that see a swinging ball, with clocks that differ."""
+    rig = recordings.make_rig(3, 256, 192, (-0.1, 0.02, 0.001, -0.001, 0.0))
+    times = [start + np.arange(90) / 30 for start in STARTS]
+    return recordings.record(tmp_path_factory.mktemp("swinging"), rig, times, recordings.draw_ball, clocks=CLOCKS)
+
+
+def test_motion_gives_offsets_to_a_millisecond_and_says_how_sure_they_are(swinging):
+    found, notes = measured(swinging)
+    assert notes == [] and {one.method for one in found} == {"motion"}
+    for one, truth in zip(found, CLOCKS, strict=True):
+        assert abs(one.seconds - truth) < 1e-3
+        assert abs(one.seconds - truth) < 3 * one.sigma + 1e-12 and one.sigma < 2e-3
+
+
+def test_cameras_in_step_keep_their_times(tmp_path):
+    rig = recordings.make_rig(3, 192, 144)
+    recordings.record(tmp_path, rig, [np.arange(60) / 30] * 3, recordings.draw_ball)
+    found, notes = measured(tmp_path)
+    assert [one.seconds for one in found] == [0.0, 0.0, 0.0] and notes == []
+    assert all(one.sigma is not None for one in found)
+
+
+def test_without_motion_nothing_is_invented(tmp_path):
+    rig = recordings.make_rig(2, 96, 72)
+    recordings.record(
+        tmp_path, rig, [np.arange(20) / 30] * 2, lambda camera, lens, t: recordings.draw_ball(camera, lens, 0.0)
+    )
+    found, notes = measured(tmp_path)
+    assert [one.sigma for one in found] == [None, None] and "too little moves" in notes[0]
+
+
+def sounds(shifts, seconds=4.0):
+    """Clicks and noise as heard by each camera from its own start on."""
+    rate = recordings.SOUND_RATE
+    rng = np.random.default_rng(3)
+    clicks = (rng.uniform(size=int((seconds + 2) * rate)) < 8 / rate) * rng.normal(size=int((seconds + 2) * rate))
+    heard = signal.lfilter([1.0], [1.0, -0.95], clicks).astype(np.float32)
+    result = []
+    for shift in shifts:
+        first = round((1.0 + shift) * rate)
+        part = heard[first : first + int(seconds * rate)]
+        result.append((0.3 * part / np.abs(heard).max() + rng.normal(size=len(part)) * 1e-3).astype(np.float32))
+    return result
+
+
+def test_sound_gives_offsets_of_cameras_that_started_far_apart(tmp_path):
+    shifts = (0.0, 0.4137, -0.2511)  # start of each recording
+    rig = recordings.make_rig(3, 48, 32)
+    times = [np.arange(100) / 25] * 3
+    recordings.record(tmp_path, rig, times, draw_nothing, sound=sounds(shifts))
+    found, _ = measured(tmp_path)
+    assert {one.method for one in found} == {"audio"}
+    for one, truth in zip(found, shifts, strict=True):
+        assert abs(one.seconds - truth) < 1e-3
+
+
+def test_unrelated_sounds_are_not_compared(tmp_path):
+    rng = np.random.default_rng(0)
+    rig = recordings.make_rig(2, 48, 32)
+    noise = [rng.normal(size=2 * recordings.SOUND_RATE).astype(np.float32) * 0.1 for _ in range(2)]
+    recordings.record(tmp_path, rig, [np.arange(50) / 25] * 2, draw_nothing, sound=noise)
+    with pytest.raises(errors.ConfigError, match="the cameras' sounds do not match"):
+        measured(tmp_path, "audio")
+
+
+def test_given_offsets_are_used_as_they_are(swinging):
+    found, _ = measured(swinging, given={"cam1": 0.25})
+    assert [one.seconds for one in found] == [0.0, 0.25, 0.0] and found[1].method == "given"
+    with pytest.raises(errors.ConfigError, match="--offset cam9: expected one of cam0, cam1, cam2"):
+        measured(swinging, given={"cam9": 0.25})
+
+
+def test_sound_that_is_missing_is_named(swinging):
+    with pytest.raises(errors.ConfigError, match="--sync audio: cam0 has no sound"):
+        measured(swinging, "audio")
+
+
+def test_one_wrong_pair_does_not_spoil_the_offsets():
+    truth = np.array([0.0, 0.1, -0.2, 0.05])
+    pairs = [(a, b, truth[b] - truth[a], 0.001) for a in range(4) for b in range(a + 1, 4)]
+    pairs[2] = (0, 3, 1.0, 0.001)
+    found = clock.solve_pairs(4, pairs, "motion")
+    np.testing.assert_allclose([one.seconds for one in found], truth, atol=0.01)
+
+
+def test_cameras_that_no_pair_connects_have_no_uncertainty():
+    found = clock.solve_pairs(4, [(1, 2, 0.1, 0.01)], "motion")
+    assert [one.sigma is None for one in found] == [True, False, False, True]
+    assert found[2].seconds == pytest.approx(0.1)
+    assert clock.solve_pairs(3, [], "motion") is None
+
+
+def test_the_misfit_is_least_at_the_true_offsets():
+    rig = recordings.make_rig(2, 320, 240)
+    times = np.arange(80) / 30
+    tracks = []
+    for camera, shift in zip(rig.cameras, (0.0, 0.02), strict=True):
+        seen = np.stack([recordings.ball(t + shift) for t in times])
+        local = seen @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
+        points = local[:, :2] / local[:, 2:]
+        tracks.append(motion_tracks.MotionTrack(times, points, 1 / camera.intrinsics[0, 0]))
+    poses = [camera.T_cam_world for camera in rig.cameras]
+    found = motion_offsets.measure(tracks, poses, [1 / 30, 1 / 30])
+    assert found[1].seconds == pytest.approx(0.02, abs=3e-4)
+    at = [motion_offsets.misfit(tracks, poses, 1 / 30, np.array([0.0, value])) for value in (0.0, 0.02, 0.04)]
+    assert at[1] < 0.1 * min(at[0], at[2])

@@ -1,0 +1,218 @@
+"""Recordings become a data set: images, cameras, times, masks, record; resumable, reproducible, refused in words."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from r5dgs_core import errors
+from r5dgs_core.capture.calibration import undistort
+from r5dgs_core.cli.commands import prepare as command
+from r5dgs_core.data import dataset, images, masks
+from r5dgs_core.prepare import camera_source, image_size, prepare, rectify
+from tests.support import recordings
+
+COEFFICIENTS = (-0.12, 0.03, 0.002, -0.001, 0.0)
+COUNT = 6
+WIDTH, HEIGHT = 96, 72
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """Three short videos of the tiny scene through distorted lenses, with their calibration."""
+    rig = recordings.make_rig(3, WIDTH, HEIGHT, COEFFICIENTS)
+    folder = tmp_path_factory.mktemp("capture") / "videos"
+    return recordings.record(folder, rig, [np.arange(COUNT) / 10] * 3, recordings.draw_tiny)
+
+
+def prepared(source, out, **fields):
+    command.run_prepare(source, out, sync="none", **fields)
+    return dataset.read(out)
+
+
+def content(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def data(capture, tmp_path_factory):
+    out = tmp_path_factory.mktemp("data") / "data"
+    prepared(capture, out, lossless=True)
+    return out
+
+
+def test_images_are_those_of_pinhole_cameras_at_their_times(data):
+    found = dataset.read(data)
+    assert len(found.train) == 3 * COUNT and found.t_max == pytest.approx(0.8)
+    rig = recordings.make_rig(3, WIDTH, HEIGHT, COEFFICIENTS)
+    for view in found.train[:: COUNT + 1]:
+        number = rig.names.index(view.camera.name)
+        np.testing.assert_allclose(view.camera.T_cam_world, rig.cameras[number].T_cam_world, atol=1e-6)
+        pinhole = undistort.undistortion(rig.lenses[number], (WIDTH, HEIGHT))
+        np.testing.assert_allclose(view.camera.intrinsics, pinhole.intrinsics, rtol=1e-9)
+        t = view.t * 0.5 / found.t_max  # seconds
+        wanted = recordings.draw_tiny(rig.cameras[number], rig.lenses[number], t)
+        off = images.read(view.image_path) - pinhole.apply(wanted) / 255
+        assert np.sqrt(np.mean(np.square(off))) < 0.035  # compression
+
+
+def test_the_record_has_the_input_and_the_camera_files_have_the_units(data):
+    record = json.loads((data / "capture.json").read_text())
+    assert record["finished"] and [camera["name"] for camera in record["cameras"]] == ["cam0", "cam1", "cam2"]
+    assert record["cameras"][0]["used"] == record["cameras"][0]["frames"] == COUNT
+    assert record["calibration"]["format"] == "anipose"
+    top = json.loads((data / "transforms_train.json").read_text())
+    assert top["seconds_per_unit"] == pytest.approx(0.5 / 0.8) and top["meters_per_unit"] is None
+    assert top["frames_per_unit"] == pytest.approx(10 * 0.5 / 0.8)
+
+
+def test_two_runs_are_equal_bit_for_bit(capture, tmp_path):
+    for name in ("one", "two"):
+        prepared(capture, tmp_path / name, lines=36)
+    assert content(tmp_path / "one") == content(tmp_path / "two")
+    assert len(list((tmp_path / "one").rglob("*.jpg"))) == 3 * COUNT
+
+
+def test_an_interrupted_run_continues_to_the_same_result(capture, tmp_path, monkeypatch):
+    prepared(capture, tmp_path / "whole", lines=36)
+    read = camera_source.CameraSource.read
+
+    def interrupted(self, wanted):
+        for count, item in enumerate(read(self, wanted)):
+            if self.name == "cam1" and count == 2:
+                raise KeyboardInterrupt
+            yield item
+
+    monkeypatch.setattr(camera_source.CameraSource, "read", interrupted)
+    with pytest.raises(errors.Interrupted, match="run the same command again to continue"):
+        prepared(capture, tmp_path / "parts", lines=36)
+    assert not (tmp_path / "parts" / "transforms_train.json").exists()
+    decoded = []
+
+    def counted(self, wanted):
+        decoded.extend(wanted)
+        return read(self, wanted)
+
+    monkeypatch.setattr(camera_source.CameraSource, "read", counted)
+    prepared(capture, tmp_path / "parts", lines=36)
+    assert len(decoded) == 3 * COUNT - COUNT - 2
+    assert content(tmp_path / "parts") == content(tmp_path / "whole")
+
+
+def test_nothing_outside_the_output_is_written(capture, tmp_path):
+    before = content(capture)
+    prepared(capture, tmp_path / "data", lines=36)
+    assert content(capture) == before and {path.name for path in tmp_path.iterdir()} == {"data"}
+
+
+def test_other_settings_need_overwrite_and_replace_everything(capture, tmp_path):
+    out = tmp_path / "data"
+    prepared(capture, out, lines=36, hold_out={"every": 2})
+    assert (out / "transforms_val.json").exists()
+    with pytest.raises(errors.DatasetError, match=r"other input or settings \(size, hold_out_every\)"):
+        prepared(capture, out, lines=24)
+    found = prepared(capture, out, lines=24, overwrite=True)
+    assert found.train[0].camera.height == 24 and not found.val
+
+
+def test_a_folder_with_other_files_is_not_touched(capture, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(errors.DatasetError, match="expected an empty folder or a prepared data set, found notes.txt"):
+        prepared(capture, tmp_path)
+    assert content(tmp_path) == {(tmp_path / "notes.txt").relative_to(tmp_path): b"mine"}
+
+
+def test_a_folder_among_the_recordings_is_refused(capture):
+    for out in (capture, capture / "data"):
+        with pytest.raises(errors.ConfigError, match="is among the recordings"):
+            prepared(capture, out)
+
+
+def test_masks_of_the_frames_are_undistorted_like_them(capture, tmp_path):
+    folder = tmp_path / "masks"
+    for name in ("cam0", "cam1", "cam2"):
+        for k in range(COUNT):
+            ids = np.zeros((HEIGHT, WIDTH), np.uint8)
+            ids[20:50, 30:70] = 3
+            images.write_png(folder / name / f"frame_{k + 1:04d}.png", ids)
+    (folder / "objects.json").write_text(json.dumps({"3": "box"}))
+    found = prepared(capture, tmp_path / "data", masks=str(folder), hold_out={"every": 3})
+    assert found.object_names == {3: "box"} and len(found.val) == 3
+    rig = recordings.make_rig(3, WIDTH, HEIGHT, COEFFICIENTS)
+    pinhole = undistort.undistortion(rig.lenses[0], (WIDTH, HEIGHT))
+    square = np.zeros((HEIGHT, WIDTH), np.float32)
+    square[20:50, 30:70] = 1
+    wanted = cv2.remap(square, pinhole.map_x, pinhole.map_y, cv2.INTER_LINEAR) > 0.5
+    for view in (*found.train, *found.val):
+        ids = dataset.load_mask(view)
+        assert ids is not None and set(np.unique(ids)) == {0, 3}
+        if view.camera.name == "cam0":
+            assert ((ids == 3) != wanted).mean() < 0.01
+
+
+def test_pixels_beyond_the_frame_are_unknown_in_masks():
+    lens = recordings.make_rig(1, WIDTH, HEIGHT, COEFFICIENTS).lenses[0]
+    whole = undistort.undistortion(lens, (WIDTH, HEIGHT), field=1.0)
+    made = rectify.Rectifier(whole, WIDTH, HEIGHT).mask(np.full((HEIGHT, WIDTH), 2), "mask")
+    assert set(np.unique(made)) == {2, masks.UNKNOWN}
+    np.testing.assert_array_equal(made == masks.UNKNOWN, ~whole.known)
+
+
+def test_frames_as_images_give_the_same_data_set_as_their_video(capture, tmp_path, data):
+    frames = tmp_path / "frames"
+    for camera in ("cam0", "cam1", "cam2"):
+        (source,) = prepare.cameras.source_files.find(capture / f"{camera}.mp4")
+        for index, pixels in camera_source.open_camera(source).read(range(COUNT)):
+            images.write_png(frames / camera / f"{index:06d}.png", pixels)
+    shutil.copy(capture / "calibration.toml", frames)
+    prepared(frames, tmp_path / "data", lossless=True, rate=10.0)
+    one, other = content(tmp_path / "data"), content(data)
+    del one[next(p for p in one if p.name == "capture.json")], other[next(p for p in other if p.name == "capture.json")]
+    assert set(one) == set(other)
+    assert all(one[path] == other[path] for path in one if path.suffix == ".png")
+
+
+def test_the_calibration_of_other_cameras_is_refused(capture, tmp_path):
+    shutil.copytree(capture, tmp_path / "videos")
+    (tmp_path / "videos" / "cam2.mp4").rename(tmp_path / "videos" / "side.mp4")
+    with pytest.raises(errors.DatasetError, match="expected the cameras cam0, cam1, side, found cam0, cam1, cam2"):
+        prepared(tmp_path / "videos", tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_missing_calibration_is_named_with_the_option(capture, tmp_path):
+    shutil.copy(capture / "cam0.mp4", tmp_path)
+    with pytest.raises(errors.DatasetError, match="expected the cameras' calibration.*--calibration"):
+        prepared(tmp_path, tmp_path.with_name("out"))
+
+
+def test_recordings_of_different_lengths_are_cut_and_named(capture, tmp_path):
+    shutil.copytree(capture, tmp_path / "videos")
+    rig = recordings.make_rig(3, WIDTH, HEIGHT, COEFFICIENTS)
+    frames = [recordings.draw_tiny(rig.cameras[0], rig.lenses[0], k / 10) for k in range(3)]
+    recordings.write_video(tmp_path / "videos" / "cam0.mp4", frames, np.arange(3) / 10)
+    plan = command.run_prepare(tmp_path / "videos", tmp_path / "data", sync="none")
+    assert [len(indices) for indices in plan.choice.indices] == [3, 3, 3]
+    assert "cam1: 0.30 s at its ends are not used" in plan.notes[0]
+
+
+def test_frames_that_cannot_be_decoded_are_left_out_and_listed(capture, tmp_path, monkeypatch):
+    read = camera_source.CameraSource.read
+    without = lambda self, wanted: (item for item in read(self, wanted) if item[0] != 2 or self.name != "cam1")  # noqa: E731
+    monkeypatch.setattr(camera_source.CameraSource, "read", without)
+    found = prepared(capture, tmp_path / "data", lines=36)
+    assert len(found.train) == 3 * COUNT - 1
+    record = json.loads((tmp_path / "data" / "capture.json").read_text())
+    assert [camera["undecodable"] for camera in record["cameras"]] == [[], [2], []]
+
+
+def test_the_size_is_the_largest_whose_training_fits_half_of_the_memory(monkeypatch):
+    monkeypatch.setattr(image_size, "machine_memory", lambda: 8e9)
+    sizes, counts = [(3840, 2160)] * 4, [300] * 4
+    size = image_size.choose(sizes, counts, None)
+    memory = [image_size.training_memory(sizes, counts, lines) for lines in (size.lines, size.lines + 8)]
+    assert memory[0] <= 4e9 < memory[1] and size.training_bytes == memory[0]
+    assert image_size.choose([(640, 480)], [10], None).lines == 480
+    assert image_size.choose([(3840, 2160)], [10], None).lines == 960
