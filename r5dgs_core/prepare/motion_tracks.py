@@ -86,8 +86,9 @@ def _centers(stack: np.ndarray) -> np.ndarray:
         apart = frame.astype(np.int16) - behind
         apart -= np.median(apart, axis=(0, 1)).astype(np.int16)  # a change of exposure is no motion
         apart = np.abs(apart).max(-1)
-        moving = np.asarray(ndimage.binary_opening(apart > _NOISE))
-        labels: np.ndarray = np.asarray(ndimage.label(ndimage.binary_dilation(moving, iterations=2))[0])  # type: ignore
+        moving = np.asarray(ndimage.binary_opening(apart > _NOISE), bool)
+        labels = np.zeros(moving.shape, np.int32)
+        ndimage.label(ndimage.binary_dilation(moving, iterations=2), output=labels)
         sizes = np.bincount(labels[moving], minlength=2)
         largest = int(np.argmax(sizes[1:])) + 1
         if not _AREA * area <= sizes[largest] <= _SHARE * area:
