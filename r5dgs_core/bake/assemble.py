@@ -36,6 +36,7 @@ def draft(observed: ObservedScene, context: Context) -> Draft:
         t_max=float(times[-1]),
         frames_per_unit=dataset.frames_per_unit,
         world_convention=dataset.world_convention,
+        units=dataset.units,
         cameras=dataset.cameras,
         background_sh=sky.astype(np.float32),
         shading=_shading(cloud, order, observed.light) if shaded else None,

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from .. import errors, findings
-from ..scene import cameras
+from ..scene import cameras, units
+from ..scene.units import Units
 from . import images, masks, transforms, view_masks
 from . import origin as origins
 from .annotations import OBJECTS, GroundTruth, read_ground_truth, read_objects
@@ -47,6 +48,7 @@ class Dataset:
         ground_truth: True poses, or None.
         world_convention: Key of ``cameras.WORLD_TO_BLENDER``.
         frames_per_unit: Blender frames per unit of scene time.
+        units: Units of time and length, if known.
         has_alpha: True if images have transparent pixels (checked for three training images).
         digest: Hash of the camera files and of names, sizes and ends of the images, for provenance.
         points: Points of a COLMAP reconstruction, world. [P, 3] float64 or None
@@ -74,6 +76,7 @@ class Dataset:
     mask_folder: Path | None = None
     own_ids: bool = False
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    units: Units = Units()
 
     def views(self, split: str) -> tuple[View, ...]:
         """Return the views of "train", "val" or "test"."""
@@ -176,6 +179,9 @@ def read(
     frames_per_unit = FRAMES_PER_UNIT
     with guard():
         frames_per_unit = _frames_per_unit(root, raw.header, [e for split in SPLITS for e in raw.entries[split]])
+    found_units = Units()
+    with guard():
+        found_units = _units(root, raw.header)
     return Dataset(
         root=root,
         name=root.resolve().name,
@@ -192,7 +198,15 @@ def read(
         mask_folder=mask_folder,
         own_ids=own_ids,
         origin=origin,
+        units=found_units,
     )
+
+
+def _units(root: Path, header: dict[str, Any]) -> Units:
+    try:
+        return units.read(header)
+    except ValueError as error:
+        raise errors.DatasetError(f"{root / CAMERAS_FILE}: {error}", code="D23") from error
 
 
 def _object_names(folder: Path, guard: findings.Guard) -> tuple[dict[int, str], dict[int, tuple[str, ...]]]:

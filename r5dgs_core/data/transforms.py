@@ -108,7 +108,8 @@ def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
     distorted = [key for key in _DISTORTION if abs(lens.get(key, 0.0)) > 1e-9]
     if distorted:
         raise errors.DatasetError(
-            f"{place}: lens distortion ({', '.join(distorted)}) is not supported; undistort the images first",
+            f"{place}: lens distortion ({', '.join(distorted)}) is not supported; undistort the images: "
+            "r5dgs prepare FOLDER --out DATA",
             code="D08",
         )
     if "fl_x" in lens or "fl_y" in lens:

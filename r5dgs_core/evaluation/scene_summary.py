@@ -52,14 +52,27 @@ def summary(scene: Scene, path: Path | None = None) -> str:
     lines = [
         f"scene      {terminal.printable(scene.name)}: {len(scene.gaussians.means)} Gaussians, {count}",
         f"duration   {frames} frame{'s' * (frames != 1)}: scene time {first:g} to {scene.t_max:g}, then predicted",
-        f"frames     {fps:g} per unit of scene time (per second if the data set's times are seconds)",
-        f"extent     {scene.extent:.3g} world units",
+        f"frames     {_rate(scene)}",
+        f"extent     {scene.extent:.3g} world units" + _meters(scene),
         f"moving     {len(moving)} of {len(objects)} objects",
         *(f"  {terminal.printable(item.name)}: {motion}{_band(scene, outlooks[item.id])}" for item, motion in moving),
         f"quality    {quality.measure(scene, path).text()}",
         *_loss_of_baking(scene),
     ]
     return "\n".join(lines)
+
+
+def _meters(scene: Scene) -> str:
+    unit = scene.units.meters_per_unit
+    return "" if unit is None else f" ({scene.extent * unit:.3g} m)"
+
+
+def _rate(scene: Scene) -> str:
+    """Return the number of Blender frames per unit of scene time and, if it is known, per second."""
+    fps, seconds = scene.frames_per_unit, scene.units.seconds_per_unit
+    if seconds is None:
+        return f"{fps:g} per unit of scene time (per second if the data set's times are seconds)"
+    return f"{fps / seconds:.4g} per second; a unit of scene time is {seconds:.4g} s"
 
 
 def _band(scene: Scene, outlook: predictability.Outlook) -> str:

@@ -39,6 +39,7 @@ def info(scene: Scene) -> dict[str, Any]:
         "knots": len(scene.tracks.times),
         "frames_per_unit": scene.frames_per_unit,
         "world_convention": scene.world_convention,
+        **scene.units.to_json(),
         "cameras": len(scene.cameras),
         "extent": scene.extent,
         **({"origin": scene.origin.tolist()} if scene.origin.any() else {}),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+
+from ..data import memory
 
 MOST_LINES = 960
 LEAST_LINES = 64
@@ -38,7 +38,7 @@ def choose(sizes: Sequence[tuple[int, int]], counts: Sequence[int], lines: int |
         counts: Number of training images of each camera.
         lines: Requested height, or None.
     """
-    machine = machine_memory()
+    machine = memory.total()
     if lines is not None:
         return Size(lines, training_memory(sizes, counts, lines), machine)
     lines = min(MOST_LINES, max(height for _, height in sizes))
@@ -64,18 +64,3 @@ def training_memory(sizes: Sequence[tuple[int, int]], counts: Sequence[int], lin
     images = 3 * sum(count * area for count, area in zip(counts, pixels, strict=True))
     cache = 4 * images if 4 * images <= _CACHE else 0
     return _BASE + images * 4 / 3 + cache + _PER_CAMERA_PIXEL * sum(pixels)
-
-
-def machine_memory() -> float:
-    """Return the memory of this machine, or of the control group that limits this process; bytes."""
-    found = [8 * 2.0**30]
-    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        found = [float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))]
-    for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        try:
-            text = Path(path).read_text().strip()
-        except OSError:
-            continue
-        if text.isdigit():
-            found.append(float(text))
-    return min(found)

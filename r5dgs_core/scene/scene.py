@@ -21,6 +21,7 @@ from ..motion.models import MotionModel
 from .cameras import Camera
 from .hull import Hull
 from .lookup_table import LookupTable
+from .units import Units
 
 ROLES = ("pinned", "body", "shadow")
 IDENTITY_DIM = 16  # size of an identity encoding (Gaussian Grouping)
@@ -269,12 +270,11 @@ class Scene:
         provenance: Configuration, data hash, versions.
         needs: The needs table: rows of ``name, value, threshold, decision, reason``.
         near_plane: Near clipping depth of Gaussian centres, as in training; world units.
-        harmonics_turn: True if harmonics also follow the rotations of individual Gaussians; imported scenes of other
-            projects keep them in the world frame.
-        origin: Point of the data set's world from which all positions of the scene are measured:
-            world = origin + position. Zero unless the world's origin is so far away that float32 would lose detail. [3]
-            float64
-        hulls: Convex hulls of objects, at most one for each object and motion group. Empty in scenes without them.
+        harmonics_turn: True if harmonics follow the rotations of Gaussians; those of imported scenes do not.
+        origin: Point of the data set's world from which all positions of the scene are measured. Zero unless the
+            world's origin is so far away that float32 would lose detail. [3] float64
+        hulls: Convex hulls of objects, at most one for each object and motion group.
+        units: Units of time and length, if known.
     """
 
     name: str
@@ -303,6 +303,7 @@ class Scene:
     harmonics_turn: bool = True
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     hulls: tuple[Hull, ...] = ()
+    units: Units = Units()
 
     @functools.cached_property
     def extent(self) -> float:

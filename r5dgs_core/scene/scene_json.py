@@ -11,7 +11,7 @@ import numpy as np
 from .. import __version__, errors, findings, strict_json
 from ..motion.joint import Joint
 from ..motion.models import MotionModel
-from . import history_json, joint_json
+from . import history_json, joint_json, units
 from .cameras import Camera
 from .json_row import Row
 from .lookup_table import POOLINGS, EmbeddingSource, EncoderCard, LookupTable
@@ -29,6 +29,7 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
         "t_max": float(scene.t_max),
         "frames_per_unit": float(scene.frames_per_unit),
         "world_convention": scene.world_convention,
+        **scene.units.to_json(),
         "near_plane": float(scene.near_plane),
         "harmonics_turn": bool(scene.harmonics_turn),
         "objects": [_object_tree(item) for item in scene.objects],
@@ -57,6 +58,7 @@ def fields(top: Row) -> dict[str, Any]:
         "t_max": top.get("t_max", float),
         "frames_per_unit": top.get("frames_per_unit", float),
         "world_convention": top.get("world_convention", str),
+        "units": findings.attempt(top.guard, lambda: _units(top)),
         "cameras": top.each("cameras", _read_camera),
         "light_direction": None if top.lacks("light_direction") else top.numbers("light_direction", (3,)),
         "vocabulary": top.words("vocabulary"),
@@ -91,6 +93,13 @@ def table(top: Row) -> LookupTable | None:
         thresholds=found.each("objects", lambda row: row.optional("threshold", float)),
         margin=found.get("margin", float),
     )
+
+
+def _units(top: Row) -> units.Units:
+    try:
+        return units.read(top.data)
+    except ValueError as error:
+        raise errors.SceneFileError(f"{top.place}: {error}") from error
 
 
 def _pooling(found: Row) -> str:

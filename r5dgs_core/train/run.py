@@ -19,6 +19,7 @@ from .. import folder_lock
 from ..config import training_needs
 from ..config.config import Config
 from ..data import dataset as datasets
+from ..data import memory
 from ..errors import CheckpointError, Interrupted, TrainingError
 from ..render import warm_up
 from ..time_left import Phase, TimedProgress
@@ -168,6 +169,7 @@ def _prepare(request: _Request, claim: Callable[[], None]) -> tuple[_Request, da
     settled = run_folder.open_run(folder).config if request.resume else request.config
     dataset = datasets.read(request.dataset_root, settled.data.masks, settled.data.min_registered)
     dataset.require_one_numbering()
+    memory.check_images(dataset)
     if is_new:  # created only now, so that an unreadable data set leaves no folder
         run_folder.plan_run(folder, dataset, request.config)
         claim()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import shlex
 from pathlib import Path
 from types import ModuleType
 
 from ... import errors
+from .. import file_kinds
 
 CAMERAS_FILE = "transforms_train.json"  # of the layout `camera_files`
 MODULES = ["camera_files", "colmap"]  # modules of this folder; the first that detects its files reads the folder
@@ -27,9 +29,23 @@ def find(root: Path) -> ModuleType:
         module = importlib.import_module(f".{name}", __package__)
         if module.detect(root):
             return module
+    _check_recordings(root)
     lone = (root / "transforms.json").exists()
     remedy = "split transforms.json into transforms_train/val/test.json" if lone else "is it the right folder?"
     raise errors.DatasetError(f"{root / CAMERAS_FILE}: the file is missing; {remedy}")
+
+
+def _check_recordings(root: Path) -> None:
+    """Raise `DatasetError` with the command that makes a data set of videos, if the folder has any."""
+    inside = [path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    for folder in (root, *inside):
+        video = next((path for path in sorted(folder.iterdir()) if path.suffix.lower() in file_kinds.VIDEOS), None)
+        if video is not None:
+            source = shlex.quote(str(root))
+            raise errors.DatasetError(
+                f"{root}: expected images and camera files, found videos ({video.name}). Remedy: make a data set of "
+                f"them: r5dgs prepare {source} --out {shlex.quote(str(root.with_name(root.name + '_data')))}"
+            )
 
 
 def check(root: Path) -> None:

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import strategies as st
 
 from r5dgs_core import errors
-from r5dgs_core.data import dataset, images, view_masks
+from r5dgs_core.data import dataset, images, memory, view_masks
 from r5dgs_core.scene import cameras
+from r5dgs_core.scene.units import Units
 
 WIDTH, HEIGHT = 12, 8
 ANGLE = 0.8
@@ -301,6 +302,41 @@ def test_frames_per_unit_follows_frame_numbers(flat):
             split,
         )
     assert dataset.read(flat).frames_per_unit == pytest.approx(80.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, Units()),
+        ({"seconds_per_unit": 2.5, "meters_per_unit": None}, Units(2.5)),
+        ({"meters_per_unit": 1}, Units(None, 1.0)),
+    ],
+)
+def test_units_are_those_of_the_camera_file(tmp_path, given, expected):
+    write_flat(tmp_path, **given)
+    assert dataset.read(tmp_path).units == expected
+
+
+@pytest.mark.parametrize("value", [0, -1, "one", True, 1e13])
+def test_impossible_units_are_refused(tmp_path, value):
+    write_flat(tmp_path, seconds_per_unit=value)
+    with pytest.raises(errors.DatasetError, match="'seconds_per_unit' must be a positive number"):
+        dataset.read(tmp_path)
+
+
+def test_images_that_exceed_the_available_memory_are_refused_with_the_remedy(flat, monkeypatch):
+    found = dataset.read(flat)
+    needed = memory.of_images(found)
+    assert needed == sum(3 * view.camera.width * view.camera.height for view in found.train)
+    monkeypatch.setattr(memory, "available", lambda: needed - 1)
+    with pytest.raises(
+        errors.DatasetError, match="training images need .* GB of memory.*smaller --size or with --every"
+    ):
+        memory.check_images(found)
+    for free in (needed, None):
+        monkeypatch.setattr(memory, "available", lambda free=free: free)
+        memory.check_images(found)
+    assert 1e6 < memory.total() < 1e15
 
 
 def test_the_digest_changes_with_cameras_and_images_only(flat):

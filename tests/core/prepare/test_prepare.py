@@ -209,7 +209,7 @@ def test_frames_that_cannot_be_decoded_are_left_out_and_listed(capture, tmp_path
 
 
 def test_the_size_is_the_largest_whose_training_fits_half_of_the_memory(monkeypatch):
-    monkeypatch.setattr(image_size, "machine_memory", lambda: 8e9)
+    monkeypatch.setattr(image_size.memory, "total", lambda: 8e9)
     sizes, counts = [(3840, 2160)] * 4, [300] * 4
     size = image_size.choose(sizes, counts, None)
     memory = [image_size.training_memory(sizes, counts, lines) for lines in (size.lines, size.lines + 8)]

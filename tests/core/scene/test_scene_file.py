@@ -11,6 +11,7 @@ from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_info, scene_player
 from r5dgs_core.scene import scene_file
 from r5dgs_core.scene.scene import GROUPS
+from r5dgs_core.scene.units import Units
 from tests.support.scenes import make_scene
 
 # Half a step of the stored fixed point, and half-precision rounding.
@@ -115,6 +116,13 @@ def test_a_file_keeps_its_near_plane_and_one_without_has_the_default(scene, path
     assert scene_file.read(scene_file.write(near, tmp_path / "near.r5dgs")).near_plane == 2.5e-4
     older = rewrite(tmp_path / "near.r5dgs", tmp_path / "older.r5dgs", lambda tree: tree.pop("near_plane") and None)
     assert scene_file.read(older).near_plane == scene_file.read(path).near_plane == 0.01
+
+
+def test_a_file_keeps_its_units_and_one_without_has_none(scene, path, tmp_path):
+    for known in (Units(2.5, None), Units(None, 0.01), Units(1.25, 1.0)):
+        written = scene_file.write(dataclasses.replace(scene, units=known), tmp_path / "units.r5dgs")
+        assert scene_file.read(written).units == known
+    assert scene_file.read(path).units == Units()
 
 
 def test_a_scene_without_gaussians_is_a_scene(tmp_path):
@@ -235,6 +243,8 @@ def setter(*keys_and_value):
         (setter("t_max", None), "t_max: expected float"),
         (setter("frames_per_unit", 0), "frames_per_unit"),
         (setter("near_plane", 0), "near_plane: expected a positive depth"),
+        (setter("seconds_per_unit", 0), "'seconds_per_unit' must be a positive number"),
+        (setter("meters_per_unit", "one"), "'meters_per_unit' must be a positive number"),
         (setter("near_plane", "far"), "near_plane: expected float"),
         (setter("world_convention", "mars"), "world_convention"),
         (setter("name", 5), "name: expected str"),

@@ -41,3 +41,11 @@ def test_a_folder_without_a_known_layout_is_refused(tmp_path):
     for path in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(errors.DatasetError, match=str(path)):
             registry.check(path)
+
+
+@pytest.mark.parametrize("video", ["cam0.mp4", "left/GX010042.MP4"])
+def test_a_folder_of_videos_is_refused_with_the_command_that_prepares_it(tmp_path, video):
+    (tmp_path / "my videos" / video).parent.mkdir(parents=True)
+    (tmp_path / "my videos" / video).write_bytes(b"")
+    with pytest.raises(errors.DatasetError, match="found videos.*r5dgs prepare '.*my videos' --out '.*my videos_data'"):
+        registry.check(tmp_path / "my videos")
