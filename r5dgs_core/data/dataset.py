@@ -179,9 +179,6 @@ def read(
     frames_per_unit = FRAMES_PER_UNIT
     with guard():
         frames_per_unit = _frames_per_unit(root, raw.header, [e for split in SPLITS for e in raw.entries[split]])
-    found_units = Units()
-    with guard():
-        found_units = _units(root, raw.header)
     return Dataset(
         root=root,
         name=root.resolve().name,
@@ -198,15 +195,18 @@ def read(
         mask_folder=mask_folder,
         own_ids=own_ids,
         origin=origin,
-        units=found_units,
+        units=_units(root, raw.header, guard),
     )
 
 
-def _units(root: Path, header: dict[str, Any]) -> Units:
-    try:
-        return units.read(header)
-    except ValueError as error:
-        raise errors.DatasetError(f"{root / CAMERAS_FILE}: {error}", code="D23") from error
+def _units(root: Path, header: dict[str, Any], guard: findings.Guard) -> Units:
+    """Return the units of the camera files; unknown ones after an error that the guard collects."""
+    with guard():
+        try:
+            return units.read(header)
+        except ValueError as error:
+            raise errors.DatasetError(f"{root / CAMERAS_FILE}: {error}", code="D23") from error
+    return Units()
 
 
 def _object_names(folder: Path, guard: findings.Guard) -> tuple[dict[int, str], dict[int, tuple[str, ...]]]:
