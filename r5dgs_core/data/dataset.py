@@ -173,9 +173,6 @@ def read(
     with guard():
         _check_convention(root, raw.header)
     ground_truth = None if own_ids else _true_poses(root, origin, names, guard)  # these use the data set's own ids
-    has_alpha = False
-    with guard():
-        has_alpha = _has_alpha(views["train"])
     frames_per_unit = FRAMES_PER_UNIT
     with guard():
         frames_per_unit = _frames_per_unit(root, raw.header, [e for split in SPLITS for e in raw.entries[split]])
@@ -188,7 +185,7 @@ def read(
         ground_truth=ground_truth,
         world_convention=raw.header.get("world_convention", "blender"),
         frames_per_unit=frames_per_unit,
-        has_alpha=has_alpha,
+        has_alpha=_has_alpha(views["train"], guard),
         digest=digest,
         points=raw.points,
         point_colors=raw.colors,
@@ -317,10 +314,12 @@ def _frames_per_unit(root: Path, header: dict[str, Any], entries: list[transform
     return FRAMES_PER_UNIT
 
 
-def _has_alpha(views: tuple[View, ...]) -> bool:
-    for view in {views[0].name: views[0], "middle": views[len(views) // 2], "last": views[-1]}.values():
-        if images.size(view.image_path)[2] in (2, 4) and float(images.read(view.image_path)[..., -1].min()) < 1.0:
-            return True
+def _has_alpha(views: tuple[View, ...], guard: findings.Guard) -> bool:
+    with guard():
+        for view in {views[0].name: views[0], "middle": views[len(views) // 2], "last": views[-1]}.values():
+            channels = images.size(view.image_path)[2]
+            if channels in (2, 4) and float(images.read(view.image_path)[..., -1].min()) < 1.0:
+                return True
     return False
 
 
