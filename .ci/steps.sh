@@ -24,17 +24,21 @@ work=$(mktemp -d -t r5dgs-ci.XXXXXX)
 trap 'status=$?; rm -rf "$work"; [ "$status" -eq 0 ] || echo "failed in step: $step_name, after $(minutes "$SECONDS")"' EXIT
 
 fresh_environment() {
-  step "system libraries of bpy"
+  step "system libraries of bpy, Node and a browser"
   local libraries=(libx11-6 libxrender1 libxxf86vm1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1 libgomp1
-             libegl1 libegl-mesa0 libgl1-mesa-dri)
+             libegl1 libegl-mesa0 libgl1-mesa-dri chromium)
+  if ! command -v npm >/dev/null; then libraries+=(nodejs npm); fi
   if ! command -v dpkg-query >/dev/null; then
-    echo "not a Debian system: the libraries that bpy needs are taken to be installed"
+    echo "not a Debian system: the libraries that bpy needs, Node and Chromium are taken to be installed"
   elif ! dpkg-query -W -f '${Status}\n' "${libraries[@]}" 2>/dev/null | grep -c '^install ok installed$' | grep -qx "${#libraries[@]}"; then
     local root=()
     if [ "$(id -u)" -ne 0 ]; then root=(sudo); fi
     "${root[@]}" apt-get update -qq
     "${root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${libraries[@]}"
   fi
+
+  step "packages of the player"
+  npm --prefix player ci --ignore-scripts --no-audit --no-fund
 
   step "fresh environment"
   "${PYTHON:-python3}" -m venv "$work/venv"

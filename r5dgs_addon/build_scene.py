@@ -16,7 +16,7 @@ from mathutils import Matrix, Vector
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.color import srgb
-from ..r5dgs_core.playback import group_dynamics
+from ..r5dgs_core.playback import group_curves, group_dynamics
 from ..r5dgs_core.scene import cameras, spherical_harmonics
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
 from ..r5dgs_core.scene.splats import to_opacities
@@ -134,7 +134,7 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         first_view.remember(collection, scene)
         if options.cameras:
             captured_cameras.build(context, collection, root, scene)
-        reaches = keyframes.reaches(scene)
+        reaches = group_curves.reaches(scene)
         for (_, motion_id), anchor in anchors.items():
             keyframes.animate(anchor, scene, motion_id, times, options.key_tolerance, float(reaches[motion_id]))
         physics.remember(anchors, scene, times, options.key_tolerance, reaches)

@@ -61,7 +61,7 @@ ALLOWED = {
     "capture": {"motion"},
     "config": {"data"},
     "playback": {"motion", "scene", "color"},
-    "formats": {"motion", "scene", "playback"},
+    "formats": {"motion", "scene", "color", "search", "playback"},
     "editing": {"motion", "scene", "color", "playback"},
     "protocol": {"scene", "search"},
     "model": {"motion", "scene"},

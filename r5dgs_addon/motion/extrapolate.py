@@ -15,6 +15,7 @@ from ...r5dgs_core import errors
 from ...r5dgs_core.motion import key_reduction as reduction
 from ...r5dgs_core.motion import models, rotations
 from ...r5dgs_core.motion.cubic_curves import Keys
+from ...r5dgs_core.playback import group_curves
 from ...r5dgs_core.scene import scene_file
 from ...r5dgs_core.scene.scene import Scene
 from .. import compat
@@ -101,7 +102,7 @@ def _plan(anchor: bpy.types.Object, t_end: float | None, most: int) -> PendingKe
         allowed, reach = physics.key_error(anchor)
         sample, model = _sampler(anchor, location, quat, times, most)
         stop = physics.stop_time(physics.mover(anchor))
-        sample = keyframes.stopped(sample, times.t_max, stop)
+        sample = group_curves.stopped(sample, times.t_max, stop)
         future = keyframes.reduced_keys(sample, times.t_max, times, allowed, reach, most, model, stop)
         too_fast = not future.followed
         tails = {

@@ -6,22 +6,19 @@ the motion model within the same tolerance and have another key type. There may 
 for this gets a key at every frame, and its anchor is marked.
 """
 
-import math
-
 import bpy
 import numpy as np
 
-from ...r5dgs_core.motion import cubic_curves, models, rotations
+from ...r5dgs_core.motion import cubic_curves, models
 from ...r5dgs_core.motion import key_reduction as reduction
 from ...r5dgs_core.motion.cubic_curves import Curves, Keys
-from ...r5dgs_core.playback import group_dynamics
-from ...r5dgs_core.scene import row_runs
+from ...r5dgs_core.playback import group_curves
 from ...r5dgs_core.scene.scene import Scene
 from .. import compat
 from ..scene import timeline
 
 # Fraction of the scene's extent. Blender may deviate from playback by 1e-5, including its float32 evaluation.
-TOLERANCE = 3e-6
+TOLERANCE = group_curves.TOLERANCE
 _PER_KNOT = 4  # limit of reduced keys per knot; beyond it, one key per knot takes fewer keys
 NEAREST = 0.011  # minimum distance of keys in frames; Blender merges keys closer than 0.01
 _INTERVALS = 1 << 17  # limit of key intervals of all objects, so that no file blocks Blender for minutes
@@ -44,7 +41,7 @@ def animate(
         motion_id: Motion group.
         times: Scene times and their frames.
         tolerance: Maximum error of reduced keys at the group's members, as a fraction of the scene's extent.
-        reach: Reach of the group, from `reaches`.
+        reach: Reach of the group, from `group_curves.reaches`.
     """
     if motion_id == 0:
         return
@@ -71,7 +68,7 @@ def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float
         motion_id: Motion group.
         times: Scene times and their frames; nothing is extrapolated if the end is not after t_max.
         tolerance: Maximum error of reduced keys at the group's members, as a fraction of the scene's extent.
-        reach: Reach of the group, from `reaches`.
+        reach: Reach of the group, from `group_curves.reaches`.
 
     Returns:
         Displacement of the anchor and rotation, in the frame of its parent if the group is a part, with a key at t_max
@@ -82,23 +79,8 @@ def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float
     if times.t_end <= scene.t_max:
         return observed
     most = intervals_per_object(len(scene.groups))
-    sample, model = _future(scene, motion_id, most)
-    joint = scene.groups[motion_id].joint
-    stop = None if joint is None else joint.stop_time
+    sample, model, stop = group_curves.future(scene, motion_id, most)
     return cubic_curves.join(observed, reduced_keys(sample, scene.t_max, times, allowed, reach, most, model, stop))
-
-
-def stopped(sample: reduction.Sampler, start: float, stop_time: float | None) -> reduction.Sampler:
-    """Sampler of a motion since ``start`` that rests from ``stop_time`` on, if it is not None."""
-    if stop_time is None:
-        return sample
-
-    def held(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        quats, displacements, quat_slopes, slopes = sample(np.minimum(at, start + stop_time))
-        moving = (at < start + stop_time)[:, None]
-        return quats, displacements, quat_slopes * moving, slopes * moving
-
-    return held
 
 
 def intervals_per_object(objects: int) -> int:
@@ -128,36 +110,16 @@ def reduced_keys(
         model: Motion behind the samples since ``start``, whose kinks become keys.
         stop_time: Time since ``start`` at which the motion stops, which becomes a key, too; None if it does not.
     """
-    kinks = start + models.kinks(model, times.t_end - start)
-    if stop_time is not None and 0 < stop_time < times.t_end - start:
-        kinks = np.append(kinks[kinks < start + stop_time], start + stop_time)
+    kinks = group_curves.kinks(model, start, times.t_end, stop_time)
     frames = reduction.FrameTimes(times.time(0.0), 1 / times.frames_per_unit)
     nearest = NEAREST / times.frames_per_unit
-    return reduction.reduce(sample, start, times.t_end, allowed, reach, kinks.tolist(), nearest, frames, most)
-
-
-def reaches(scene: Scene) -> np.ndarray:
-    """Largest distance of a member from the pivot of each motion group. [G] float64"""
-    result = np.zeros(len(scene.groups))
-    for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
-        pivot = scene.groups[g].home
-        squares = np.zeros(stop - start)
-        for axis in range(3):  # one column at a time, because numpy is slow for rows of three
-            arms = scene.gaussians.means[start:stop, axis] - pivot[axis]
-            squares += arms * arms
-        result[g] = max(result[g], math.sqrt(float(squares.max())))
-    return result
+    return reduction.reduce(sample, start, times.t_end, allowed, reach, kinks, nearest, frames, most)
 
 
 def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Curves:
     """One key per knot, which is exact, or fewer keys if they stay within the tolerance."""
-    times = np.asarray(scene.tracks.times, np.float64)
-    quats, displacements = group_dynamics.local_knots(scene, scene.groups[motion_id])
-    quat_slopes, displacement_slopes = (cubic_curves.slopes(times, values) for values in (quats, displacements))
-    exact = Curves(
-        Keys(times, displacements, displacement_slopes, displacement_slopes),
-        Keys(times, quats, quat_slopes, quat_slopes),
-    )
+    exact = group_curves.observed(scene, motion_id)
+    times = exact.location.times
     if len(times) < 2 or not _worth_reducing(exact, allowed, radius):
         return exact
 
@@ -202,24 +164,6 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
         if (worst <= allowed).mean() > 0.05:
             return True
     return False
-
-
-def _future(scene: Scene, motion_id: int, most: int) -> tuple[reduction.Sampler, models.MotionModel]:
-    """Sampler past t_max and its model: the anchor's own, or the leader's as in `GroupMotion.poses`."""
-    group = scene.groups[motion_id]
-    if group.follows is None or group.follow_matrix is None:
-        model, stop = group.own_model, None if group.joint is None else group.joint.stop_time
-        return stopped(reduction.model_sampler(model, scene.t_max, most), scene.t_max, stop), model
-    model = scene.groups[group.follows].model
-    leader = reduction.model_sampler(model, scene.t_max, most)
-    follow = np.asarray(group.follow_matrix, np.float64)
-
-    def sample(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        _, displacements, _, velocities = leader(at)
-        quats = rotations.identity(len(at))
-        return quats, displacements @ follow.T, np.zeros_like(quats), velocities @ follow.T
-
-    return sample, model
 
 
 def _cubic(keys: Keys, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

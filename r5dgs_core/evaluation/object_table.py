@@ -16,10 +16,10 @@ from ..data import dataset as datasets
 from ..playback import scene_player
 from ..render import viewpoints
 from ..scene import predictability, sampling
+from ..scene.motion_words import motion_of
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
 from . import evaluate, miou
-from .scene_summary import motion_of
 
 MAX_VIEWS = 24  # maximum number of views in which pixels are counted
 

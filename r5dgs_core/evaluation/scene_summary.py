@@ -1,40 +1,15 @@
-"""Motion of objects in words, and the scene summary of ``r5dgs info`` and ``bake``."""
+"""Scene summary of ``r5dgs info`` and ``bake``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from .. import terminal
-from ..motion.models import KINDS
 from ..scene import predictability, quality
-from ..scene.scene import MotionGroup, Scene
-
-STILL = 0.05  # maximum motion of a still object, as a share of its radius
-
-
-def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
-    """Return the motion of an object past t_max in words, by its motion models; "pinned" if no group can move."""
-    words = []
-    for number, group in enumerate(groups, start=1):
-        if group.joint is not None:
-            words.append(f"part {number}: {group.joint.text()}")
-        elif not KINDS[group.model.kind].fields and _moved(scene, group) <= STILL * group.model.radius:
-            words.append("still")
-        else:
-            words.append(KINDS[group.model.kind].word)
-        if history := group.history.text():
-            words[-1] += f"; {history}"
-    return ", ".join(dict.fromkeys(words)) or "pinned"
-
-
-def _moved(scene: Scene, group: MotionGroup) -> float:
-    """Return the largest displacement of a point at the group's radius in the observed time, world units."""
-    poses = scene.tracks.poses[group.id]
-    chords = 2 * np.linalg.norm(poses[:, 1:4], axis=1)  # 2 sin(angle / 2)
-    return float((np.linalg.norm(poses[:, 4:], axis=1) + chords * group.model.radius).max())
+from ..scene.motion_words import motion_of
+from ..scene.scene import Scene
 
 
 def summary(scene: Scene, path: Path | None = None) -> str:

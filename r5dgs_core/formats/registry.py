@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 MODULES = {  # module of this room that defines `FORMAT`, by the name of the format
     "ply": "ply",
     "cameras": "camera_files",
+    "glb": "glb",
 }
 
 
@@ -28,11 +29,15 @@ class Options:
         times: Scene times, at least one.
         frames: Frame number of each time; None for a single time without a number.
         object_ids: Objects to export; None for all.
+        still: PNG of the scene at t_max for formats with a picture, or None.
+        until: Last scene time of formats with motion; None for the time up to which Blender extrapolates by default.
     """
 
     times: tuple[float, ...]
     frames: tuple[int, ...] | None = None
     object_ids: frozenset[int] | None = None
+    until: float | None = None
+    still: bytes | None = None
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,9 @@ class Format:
         write: Writes a scene and yields the path of each file when it is complete. Files are replaced atomically.
         per_frame: True if each frame is a file of its own.
         has_objects: True if a file holds objects, so that `Options.object_ids` applies.
+        has_motion: True if a file holds the motion up to `Options.until`; `Options.times` then do not apply.
+        has_still: True if a file holds `Options.still`.
+        losses: Returns sentences about the parts of a given scene that a file does not hold.
         extra: Extra of ``pip install r5dgs[extra]`` that it needs, or None.
         packages: Packages of the extra that `write` imports.
     """
@@ -60,6 +68,9 @@ class Format:
     write: Callable[[Scene, Path, Options], Iterator[Path]]
     per_frame: bool = False
     has_objects: bool = True
+    has_motion: bool = False
+    has_still: bool = False
+    losses: Callable[[Scene], list[str]] = lambda scene: []
     extra: str | None = None
     packages: tuple[str, ...] = ()
 

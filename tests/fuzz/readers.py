@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import io
 import json
+import struct
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from r5dgs_core import errors
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset, images, mask_notes, masks
 from r5dgs_core.data.layouts import colmap
-from r5dgs_core.formats import ply
+from r5dgs_core.formats import glb, glb_reader, ply, registry
 from r5dgs_core.importing import importer, weights
 from r5dgs_core.language.encoders import encoder_base
 from r5dgs_core.playback import scene_info, scene_player
@@ -33,7 +34,7 @@ from r5dgs_core.search import embedding_search, object_search
 from r5dgs_core.train import checkpoint, run_folder
 from tests.fuzz import mutations
 from tests.fuzz.campaign import Files, Reader
-from tests.support import colmap_files, foreign_runs, scenes
+from tests.support import arms, colmap_files, foreign_runs, scenes
 
 SIDE = 8  # pixels of the pictures that accepted scenes are drawn in
 COUNT = 30
@@ -599,6 +600,33 @@ def checkpoint_reader() -> Reader:
     return Reader("checkpoint", make, read)
 
 
+def glb_reader_of_scenes() -> Reader:
+    """Binary glTF files of scenes."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = [scenes.make_scene(n=COUNT, objects=2, sh_degree=1), arms.make_arm("hinge", n=COUNT * 2)]
+        paths = [Path(folder, f"{number}.glb") for number in range(len(made))]
+        for scene, path in zip(made, paths, strict=True):
+            list(glb.export(scene, path, registry.Options((0.0,))))
+        bases = [path.read_bytes() for path in paths]
+
+    def make(random: Random) -> Files:
+        data = random.choice(bases)
+        length = struct.unpack_from("<I", data, 12)[0]
+        tree, rest = data[20 : 20 + length], data[20 + length :]
+        if random.random() < 0.7:
+            tree = mutations.tree(random, tree.rstrip())
+            tree += b" " * (-len(tree) % 4)
+        else:
+            rest = rest[:8] + mutations.data(random, rest[8:])
+        size = 20 + len(tree) + len(rest)
+        return {"a.glb": data[:8] + struct.pack("<II", size % 2**32, len(tree)) + data[16:20] + tree + rest}
+
+    def read(folder: Path) -> None:
+        use_scene(glb_reader.read(folder / "a.glb"), folder / "again.r5dgs")
+
+    return Reader("glb", make, read)
+
+
 def notes_reader() -> Reader:
     """JSON beside other files: configurations of encoders, and the evaluation of a scene."""
     scene = scenes.make_scene(n=COUNT)
@@ -622,6 +650,7 @@ def notes_reader() -> Reader:
 READERS: dict[str, Callable[[], Reader]] = {
     "scene": scene_reader,
     "ply": ply_reader,
+    "glb": glb_reader_of_scenes,
     "dataset": dataset_reader,
     "colmap": colmap_reader,
     "image": image_reader,
@@ -635,8 +664,9 @@ READERS: dict[str, Callable[[], Reader]] = {
 }
 # Share of the inputs of each reader.
 SHARES = {
-    "scene": 40,
+    "scene": 32,
     "ply": 8,
+    "glb": 8,
     "dataset": 8,
     "colmap": 8,
     "image": 5,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,6 +35,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     when.add_argument("--time", type=float, metavar="T", help="scene time (default: t_max); may exceed t_max")
     frames = "range of Blender frames, both included; frame 1 is scene time 0"
     when.add_argument("--frames", type=frame_range, metavar="A:B", help=frames)
+    until = "last scene time of formats with motion, such as glb (default: a third of the observed span after t_max)"
+    when.add_argument("--until", type=float, metavar="T", help=until)
     p.add_argument("--objects", metavar="WORDS", help="objects to export: 'red mug', 'all except the table'")
     p.add_argument("--overwrite", action="store_true", help="replace existing files")
     options.add_progress(p)
@@ -41,8 +44,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
-    given = {"t": args.time, "frames": args.frames, "words": args.objects, "overwrite": args.overwrite}
-    run_export(args.file, args.to, args.out, **given, progress_kind=args.progress)
+    given = {"t": args.time, "frames": args.frames, "until": args.until, "words": args.objects}
+    run_export(args.file, args.to, args.out, **given, overwrite=args.overwrite, progress_kind=args.progress)
 
 
 @folder_lock.writes("out")
@@ -53,6 +56,7 @@ def run_export(
     *,
     t: float | None = None,
     frames: tuple[int, int] | None = None,
+    until: float | None = None,
     words: str | None = None,
     overwrite: bool = False,
     progress_kind: str = "none",
@@ -65,6 +69,7 @@ def run_export(
         out: File to write; the frame number is inserted if each frame is a file of its own.
         t: Scene time; t_max if neither ``t`` nor ``frames`` is given.
         frames: First and last Blender frame; frame 1 is scene time 0.
+        until: Last scene time of formats with motion (see `formats.registry.Options`).
         words: Objects to export, as in ``r5dgs query``; all if None.
         overwrite: True to replace existing files.
         progress_kind: Form of progress output (`progress.make`).
@@ -73,7 +78,7 @@ def run_export(
         The files written.
 
     Raises:
-        UsageError: The format is unknown, or ``out``, ``t`` or ``words`` does not suit it.
+        UsageError: The format is unknown, or another argument does not suit it.
         ConfigError: A file exists, or no object matches the words.
         BackendError: The format needs a package that is not installed.
     """
@@ -82,37 +87,62 @@ def run_export(
     input_paths.check_output("--out", out)
     input_paths.check_scene(path)
     chosen = registry.usable(to)  # imports numpy
-    _check_arguments(chosen, out, t, words)
-    from ...progress import make
+    _check_arguments(chosen, out, words, t=t, frames=frames, until=until)
     from ...scene import scene_file
 
     scene = scene_file.read(path)
-    what = _selection(scene, t, frames, words)
+    if until is not None and until < scene.t_max:
+        raise errors.UsageError(f"--until {until:g}: expected a time from t_max on, which is {scene.t_max:g}")
+    what = dataclasses.replace(_selection(scene, t, frames, words), until=until)
     targets = chosen.paths(out, what)
     present = [target for target in targets if target.exists()]
     if present and not overwrite:
         raise errors.ConfigError(f"{present[0]}: the file exists; replace it with --overwrite, or choose another name")
-    written = []
-    with make(progress_kind) as progress:
-        for target in chosen.write(scene, out, what):
-            written.append(target)
-            progress({"event": "export", "done": len(written), "total": len(targets), "unit": "files"})
-        if progress_kind == "json":
-            progress({"event": "written", "paths": [str(target) for target in written]})
+    written = _write(chosen, scene, out, what, progress_kind)
     if progress_kind != "json":
         print(f"written: {written[0]}" + (f" to {written[-1].name}" if len(written) > 1 else ""))
         print(f"not kept: {chosen.loses}")
+        for sentence in chosen.losses(scene):
+            print(f"lost here: {sentence}")
     return written
 
 
-def _check_arguments(chosen: registry.Format, out: Path, t: float | None, words: str | None) -> None:
+def _write(chosen: registry.Format, scene: Scene, out: Path, what: registry.Options, progress_kind: str) -> list[Path]:
+    """Write the files of a format with progress output and return their paths."""
+    from ...progress import make
+
+    written, total = [], len(chosen.paths(out, what))
+    with make(progress_kind) as progress:
+        for target in chosen.write(scene, out, what):
+            written.append(target)
+            progress({"event": "export", "done": len(written), "total": total, "unit": "files"})
+        if progress_kind == "json":
+            progress({"event": "written", "paths": [str(target) for target in written]})
+    return written
+
+
+def _check_arguments(
+    chosen: registry.Format,
+    out: Path,
+    words: str | None,
+    *,
+    t: float | None,
+    frames: tuple[int, int] | None,
+    until: float | None,
+) -> None:
     """Raise UsageError if arguments of `run_export` do not suit the format."""
     if out.suffix.lower() != chosen.suffix:
         raise errors.UsageError(f"--out {out}: expected a name that ends in {chosen.suffix}")
     if words is not None and not chosen.has_objects:
         raise errors.UsageError(f"--objects: files of format {chosen.name} hold no objects; leave it out")
-    if t is not None and not math.isfinite(t):
-        raise errors.UsageError(f"--time {t}: expected a finite number")
+    if chosen.has_motion and not (t is None and frames is None):
+        option = "--frames" if t is None else "--time"
+        raise errors.UsageError(f"{option}: files of format {chosen.name} hold the motion; give its end with --until")
+    if until is not None and not chosen.has_motion:
+        raise errors.UsageError(f"--until: files of format {chosen.name} hold no motion; leave it out")
+    for option, time in (("--time", t), ("--until", until)):
+        if time is not None and not math.isfinite(time):
+            raise errors.UsageError(f"{option} {time}: expected a finite number")
 
 
 def _selection(scene: Scene, t: float | None, frames: tuple[int, int] | None, words: str | None) -> registry.Options:

@@ -1,26 +1,33 @@
-"""The command ``r5dgs import``: convert a run of another program to a scene file."""
+"""The command ``r5dgs import``: convert a run of another program, or an exported scene, to a scene file."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ... import folder_lock, input_paths
+from ... import errors, folder_lock, input_paths
 from .. import inputs, options
 
+if TYPE_CHECKING:
+    from ...scene.scene import Scene
+
 NAME = "import"
-SHORT = "convert a run of 3DGS or a related program to a scene file"
-LONG = "Read a run folder of 3DGS, Gaussian Grouping, Deformable-3DGS, TRACE or FreeGave and write a scene file."
+SHORT = "convert a run of 3DGS or a related program, or an exported scene, to a scene file"
+LONG = (
+    "Read a run folder of 3DGS, Gaussian Grouping, Deformable-3DGS, TRACE or FreeGave, or a .glb file that\n"
+    "'r5dgs export' wrote, and write a scene file."
+)
 EXAMPLE = "OUTPUT --data DATA --out scene.r5dgs"
 PAGE = "user/import.md"
 
+GLB = ".glb"
 WORLDS = ("blender", "colmap", "opengl")  # of `scene.cameras`
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    p.add_argument("run", type=Path, help="run folder of the other program")
+    p.add_argument("run", type=Path, help="run folder of the other program, or .glb file")
     p.add_argument("--out", type=Path, required=True, metavar="FILE.r5dgs", help="scene file to write")
     p.add_argument("--iteration", type=options.at_least(0), metavar="N", help="iteration to read (default: last)")
     data = "data set of the run, which provides cameras, times and axes"
@@ -42,15 +49,21 @@ def run(args: argparse.Namespace) -> None:
 
 @folder_lock.writes("out")
 def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **fields: Any) -> None:
-    """Convert a run folder of another program to a scene file (see `importing.importer.import_run`).
+    """Convert a run folder of another program (see `importing.importer.import_run`) or a .glb file to a scene file.
 
     Args:
-        run_folder: Run folder of the other program.
+        run_folder: Run folder of the other program, or file of ``r5dgs export --to glb``.
         out: Scene file to write.
         progress_kind: Form of progress output (`progress.make`).
-        **fields: Fields of `importing.importer.Options`.
+        **fields: Fields of `importing.importer.Options`; all None for a file.
+
+    Raises:
+        UsageError: ``out`` has another suffix, or an option does not apply to a file.
     """
     input_paths.check_scene_output(out)
+    if run_folder.suffix.lower() == GLB and run_folder.is_file():
+        _import_file(run_folder, out, progress_kind, fields)
+        return
     input_paths.check_foreign_run(run_folder)
     if fields.get("data") is not None:
         inputs.check_dataset(fields["data"])
@@ -69,6 +82,29 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **fi
         if progress_kind == "json":
             progress({"event": "imported", "path": str(out), "gaussians": len(scene.gaussians.means)})
     if progress_kind != "json":
-        count = sum(o.id > 0 for o in scene.objects)
-        objects = "1 object" if count == 1 else f"{count} objects"
-        print(f"{out}: {len(scene.gaussians.means)} Gaussians, {objects}, t_max {scene.t_max:g}")
+        _print_summary(scene, out)
+
+
+def _import_file(path: Path, out: Path, progress_kind: str, fields: dict[str, Any]) -> None:
+    """Convert a .glb file of ``r5dgs export`` to a scene file."""
+    given = [name for name, value in fields.items() if value is not None]
+    if given:
+        option = f"--{given[0].replace('_', '-')}"
+        raise errors.UsageError(f"{option}: applies to run folders only, and {path} is a file; leave it out")
+    from ...formats import glb_reader
+    from ...progress import make
+    from ...scene import scene_file
+
+    with make(progress_kind) as progress:
+        scene = glb_reader.read(path)
+        scene_file.write(scene, out)
+        if progress_kind == "json":
+            progress({"event": "imported", "path": str(out), "gaussians": len(scene.gaussians.means)})
+    if progress_kind != "json":
+        _print_summary(scene, out)
+
+
+def _print_summary(scene: Scene, out: Path) -> None:
+    count = sum(o.id > 0 for o in scene.objects)
+    objects = "1 object" if count == 1 else f"{count} objects"
+    print(f"{out}: {len(scene.gaussians.means)} Gaussians, {objects}, t_max {scene.t_max:g}")

@@ -5,9 +5,10 @@ import pytest
 
 from r5dgs_core.bake import parts
 from r5dgs_core.data.annotations import GroundTruth
-from r5dgs_core.evaluation import ground_truth_poses, scene_summary
+from r5dgs_core.evaluation import ground_truth_poses
 from r5dgs_core.motion import models, se3
 from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import motion_words
 from tests.support import arms
 
 
@@ -25,7 +26,7 @@ def test_joints_between_bodies_of_one_object_are_found(kind):
     jointed = [g for g in found.groups if g.joint is not None]
     assert len(jointed) == 1 and jointed[0].joint.kind == kind
     assert {jointed[0].id, jointed[0].parent} == {1, 2}
-    words = scene_summary.motion_of(found, [found.groups[1], found.groups[2]])
+    words = motion_words.motion_of(found, [found.groups[1], found.groups[2]])
     assert f": {kind}" in words and "part" in words
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from r5dgs_core.evaluation import evaluate, object_table, scene_summary
+from r5dgs_core.evaluation import evaluate, object_table
 from r5dgs_core.motion.history import Band, Event, History, PoseErrors
+from r5dgs_core.scene import motion_words
 from tests.support import pictures
 
 BACKEND = pictures.BACKEND
@@ -88,13 +89,13 @@ def test_motion_is_named_as_in_the_sidebar(scene):
     words = {row.id: row.motion for row in object_table.measure(scene, [])}
     assert words[0] == "pinned" and words[1] == "throw+spin" and words[2] == "slide" and words[3] == "screw"
     group = dataclasses.replace(scene.groups[1], model=dataclasses.replace(scene.groups[1].model, kind="static"))
-    assert scene_summary.motion_of(scene, [group]) == "rests"
+    assert motion_words.motion_of(scene, [group]) == "rests"
     for share, word in ((0.8, "still"), (1.2, "rests")):
         poses = scene.tracks.poses.copy()
         poses[1] = [1, 0, 0, 0, 0, 0, 0]
-        poses[1, 0, 4] = share * scene_summary.STILL * group.model.radius
+        poses[1, 0, 4] = share * motion_words.STILL * group.model.radius
         noisy = scene.with_arrays(track_poses=poses)
-        assert scene_summary.motion_of(noisy, [group]) == word
+        assert motion_words.motion_of(noisy, [group]) == word
 
 
 def test_the_residual_is_a_share_of_the_radius_and_absent_if_nothing_bends(scene):
