@@ -5,6 +5,7 @@ A path without read permission passes: the code that opens it reports the reason
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -72,6 +73,12 @@ def check_output_folder(option: str, path: Path) -> None:
     """Raise `ConfigError` if the path of an output folder is a file."""
     if path.exists() and not path.is_dir():
         raise errors.ConfigError(f"{option} {path}: expected a folder or an unused path, found a file")
+
+
+def prepare_command(source: Path) -> str:
+    """Return the command that makes a data set of a folder of videos or of distorted images, for messages."""
+    out = source.with_name(f"{source.name}_data")
+    return f"r5dgs prepare {shlex.quote(str(source))} --out {shlex.quote(str(out))}"
 
 
 def _found(path: Path) -> str:

@@ -58,7 +58,7 @@ ALLOWED = {
     "data": {"motion", "scene", "color"},
     "raster": {"motion", "scene"},
     "search": {"scene"},
-    "capture": {"motion"},
+    "capture": {"motion", "scene", "data"},
     "config": {"data"},
     "playback": {"motion", "scene", "color"},
     "formats": {"motion", "scene", "color", "search", "playback"},

@@ -20,7 +20,7 @@ CODES: dict[str, Code] = {
     "D11": Code(ERROR, "image of an unreadable kind", "convert it to PNG or JPEG"),
     "D12": Code(ERROR, "image damaged", "copy or render it again"),
     "D13": Code(ERROR, "image listed twice in a split", "give each frame an image of its own"),
-    "D14": Code(ERROR, "COLMAP files damaged or not supported", "run COLMAP again, and then its image_undistorter"),
+    "D14": Code(ERROR, "COLMAP files damaged or not supported", "run COLMAP again; undistort the images"),
     "D15": Code(ERROR, "most images not registered by COLMAP", "match more pairs of images, or remove the others"),
     "D16": Code(ERROR, "times of COLMAP images missing or wrong", "correct times.json or the numbers in the names"),
     "D17": Code(ERROR, "mask damaged or missing", "write the mask again, with one channel of ids"),

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .. import errors, findings, strict_json
+from .. import errors, findings, input_paths, strict_json
 from ..scene import cameras
 from . import colmap_model, file_kinds, images, transforms
 from .colmap_model import Registered
@@ -38,11 +38,17 @@ def read(root: Path, sparse: Path, min_registered: float, guard: findings.Guard)
         raise errors.DatasetError(f"{root / IMAGES}: expected the folder of the images, found none", code="D14")
     with findings.coded("D14"):
         model = colmap_model.read(sparse)
+        for image in model.images:
+            if image.lens.model not in colmap_model.PINHOLES:
+                raise errors.DatasetError(
+                    f"{image.lens.place}: expected the lens SIMPLE_PINHOLE or PINHOLE, found {image.lens.model}, which "
+                    f"is distorted. Remedy: {input_paths.prepare_command(root)}"
+                )
     path = root / "times.json"
     header: dict[str, Any] = {"world_convention": "colmap"}
     if path.exists():
         with findings.coded("D16"):
-            times, more = _read_times(path)
+            times, more = read_times(path)
         header |= more
         frames = _timed(root, model.images, times, path, guard)
     else:
@@ -61,7 +67,7 @@ def read(root: Path, sparse: Path, min_registered: float, guard: findings.Guard)
     return RawDataset(entries, header, root / IMAGES, files, model.points, model.colors)
 
 
-def _read_times(path: Path) -> tuple[dict[str, float], dict[str, float]]:
+def read_times(path: Path) -> tuple[dict[str, float], dict[str, float]]:
     """Read the time of each image, and the other keys of ``times.json``."""
     content = strict_json.read(path, errors.DatasetError)
     if not isinstance(content, dict):

@@ -30,21 +30,45 @@ MODELS = {
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
 }
-_REMEDY = "run 'colmap image_undistorter' and use the folder that it writes"
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+SINGLE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"} | {
+    *("SIMPLE_DIVISION", "SIMPLE_FISHEYE")
+}
 LONGEST_NAME = 255  # bytes in a file or folder name; the limit of common file systems
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole lens for an image of a given size, in pixels."""
+    """A lens for an image of a given size.
 
+    Attributes:
+        place: File and camera, for errors.
+        model: Name of COLMAP's camera model.
+        width: Width of the image in pixels.
+        height: Height of the image in pixels.
+        fx: Focal length in pixels, horizontal.
+        fy: Focal length in pixels, vertical.
+        cx: Principal point in pixels from the left edge.
+        cy: Principal point in pixels from the upper edge.
+        coefficients: Parameters of the distortion, in COLMAP's order.
+    """
+
+    place: str
+    model: str
     width: int
     height: int
     fx: float
     fy: float
     cx: float
     cy: float
+    coefficients: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -83,7 +107,7 @@ def read(folder: Path) -> Reconstruction:
     """Read a reconstruction, preferring binary files to text files.
 
     Raises:
-        DatasetError: A file is missing or damaged, or a lens is distorted.
+        DatasetError: A file is missing or damaged, or a lens is unknown.
     """
     camera_path, image_path = _file(folder, "cameras"), _file(folder, "images")
     lenses = dict(_text_lenses(camera_path) if camera_path.suffix == ".txt" else _binary_lenses(camera_path))
@@ -123,17 +147,17 @@ def _file(folder: Path, name: str) -> Path:
 
 
 def _lens(place: str, model: str, width: int, height: int, numbers: list[float]) -> Lens:
-    if model not in ("SIMPLE_PINHOLE", "PINHOLE"):
-        raise errors.DatasetError(
-            f"{place}: expected the lens SIMPLE_PINHOLE or PINHOLE, found {model}, which is distorted; {_REMEDY}"
-        )
-    wanted = 3 if model == "SIMPLE_PINHOLE" else 4
-    if len(numbers) != wanted or not np.isfinite(numbers).all() or min(numbers[:-2]) <= 0 or min(width, height) < 1:
+    wanted = dict(MODELS.values()).get(model)
+    if wanted is None or model == "EQUIRECTANGULAR":
+        kind = "a panorama; render perspective views of it" if wanted else "unknown; convert it to a model of COLMAP's"
+        raise errors.DatasetError(f"{place}: the lens {model} is {kind}, and use these images")
+    count = 1 if model in SINGLE_FOCAL else 2  # of focal lengths
+    if len(numbers) != wanted or not np.isfinite(numbers).all() or min(numbers[:count]) <= 0 or min(width, height) < 1:
         raise errors.DatasetError(
             f"{place}: expected {wanted} parameters and a size, found {numbers} and {width}x{height}"
         )
-    fx, fy, cx, cy = numbers if wanted == 4 else (numbers[0], *numbers)
-    return Lens(width, height, fx, fy, cx, cy)
+    focal, (cx, cy) = numbers[:count], numbers[count : count + 2]
+    return Lens(place, model, width, height, focal[0], focal[-1], cx, cy, tuple(numbers[count + 2 :]))
 
 
 class _Bytes:
@@ -179,7 +203,7 @@ def _binary_lenses(path: Path) -> Iterator[tuple[int, Lens]]:
     for _ in range(data.take("Q")[0]):
         camera_id, kind, width, height = data.take("iiQQ")
         if kind not in MODELS:
-            raise errors.DatasetError(f"{path}: camera {camera_id}: unknown lens {kind}; {_REMEDY}")
+            raise errors.DatasetError(f"{path}: camera {camera_id}: unknown lens {kind}; write the model as text")
         model, count = MODELS[kind]
         yield camera_id, _lens(f"{path}: camera {camera_id}", model, width, height, list(data.take("d" * count)))
 

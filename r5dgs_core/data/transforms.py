@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from .. import errors, findings, strict_json
+from .. import errors, findings, input_paths, strict_json
 from ..scene.model_checks import MAX_TIME
 
 RIGID_TOLERANCE = 1e-3
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,11 @@ def read(path: Path, guard: findings.Guard = findings.STRICT) -> tuple[list[Entr
     """
     with findings.coded("D02"):
         content = strict_json.read(path, errors.DatasetError, finite=False)  # frames are named below
+    return parse(path, content, guard)
+
+
+def parse(path: Path, content: Any, guard: findings.Guard = findings.STRICT) -> tuple[list[Entry], dict[str, Any]]:
+    """Read the parsed content of a camera file; see `read`."""
     if not isinstance(content, dict):
         raise errors.DatasetError(f"{path}: expected a JSON object, found {type(content).__name__}", code="D02")
     if isinstance(content.get("frames"), list):
@@ -84,7 +89,7 @@ def read(path: Path, guard: findings.Guard = findings.STRICT) -> tuple[list[Entr
 
 
 def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
-    """Return the camera matrix of a frame for the actual size of its image.
+    """Return the camera matrix of a frame for the actual size of its image, without its distortion.
 
     Uses ``fl_x fl_y cx cy`` (pixels of an image of ``w`` x ``h``, if given), else ``camera_angle_x`` and
     ``camera_angle_y`` (radians). Defaults are square pixels and a centred principal point.
@@ -105,13 +110,6 @@ def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
             f"{entry.place}: the image is {width}x{height}, but 'w' and 'h' are {declared[0]:g}x{declared[1]:g}",
             code="D09",
         )
-    distorted = [key for key in _DISTORTION if abs(lens.get(key, 0.0)) > 1e-9]
-    if distorted:
-        raise errors.DatasetError(
-            f"{place}: lens distortion ({', '.join(distorted)}) is not supported; undistort the images: "
-            "r5dgs prepare FOLDER --out DATA",
-            code="D08",
-        )
     if "fl_x" in lens or "fl_y" in lens:
         focal_x = lens.get("fl_x", lens.get("fl_y", 0.0)) * scale[0]
         focal_y = lens.get("fl_y", lens.get("fl_x", 0.0)) * scale[1]
@@ -131,6 +129,27 @@ def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
     cx = lens["cx"] * scale[0] if "cx" in lens else 0.5 * width
     cy = lens["cy"] * scale[1] if "cy" in lens else 0.5 * height
     return np.array([[focal_x, 0.0, cx], [0.0, focal_y, cy], [0.0, 0.0, 1.0]])
+
+
+def check_undistorted(entry: Entry, root: Path) -> None:
+    """Raise `DatasetError` with the command that undistorts a data set if a frame has lens distortion."""
+    distorted = [key for key in DISTORTION if abs(entry.lens.get(key, 0.0)) > 1e-9]
+    if distorted:
+        raise errors.DatasetError(
+            f"{entry.lens_place or entry.place}: expected undistorted images, found lens distortion "
+            f"({', '.join(distorted)}). Remedy: {input_paths.prepare_command(root)}",
+            code="D08",
+        )
+
+
+def check_perspective(path: Path, header: dict[str, Any]) -> None:
+    """Raise `DatasetError` with the command that undistorts a data set if its camera model is not perspective."""
+    model = "OPENCV_FISHEYE" if header.get("is_fisheye") else str(header.get("camera_model", ""))
+    if "FISHEYE" in model:
+        raise errors.DatasetError(
+            f"{path}: expected perspective cameras, found {model}. Remedy: {input_paths.prepare_command(path.parent)}",
+            code="D08",
+        )
 
 
 def view_name(file_path: str) -> str:
@@ -221,7 +240,7 @@ def rigid_matrix(place: str, value: Any) -> np.ndarray:
 
 def _lens_keys(source: dict) -> dict[str, Any]:
     names = {"img_w": "w", "img_h": "h"}
-    keys = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h", "img_w", "img_h", *_DISTORTION)
+    keys = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h", "img_w", "img_h", *DISTORTION)
     return {names.get(key, key): source[key] for key in keys if key in source}
 
 

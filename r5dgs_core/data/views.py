@@ -72,6 +72,7 @@ def _views_of(
                 raise errors.DatasetError(
                     f"{entry.place}: the image is listed twice; each frame needs its own", code="D13"
                 )
+            transforms.check_undistorted(entry, raw.image_root)
             image_path = _find_image(raw.image_root, entry)
             width, height, _ = images.size(image_path)
             matrix = cameras.opengl_to_cam_world(entry.matrix)

@@ -77,8 +77,8 @@ def _field_of_view(points: np.ndarray, coefficients: tuple[float, ...]) -> np.nd
     return points * factor[:, None]
 
 
-def _thin_prism_fisheye(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """COLMAP's model: k1 k2 p1 p2 k3 k4 sx1 sy1, in the plane of angles."""
+def _thin_prism(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """COLMAP's model: k1 k2 p1 p2 k3 k4 sx1 sy1."""
     k1, k2, p1, p2, k3, k4, sx, sy = coefficients
     x, y = points[:, 0], points[:, 1]
     r2 = x * x + y * y
@@ -123,7 +123,8 @@ MODELS = {
     "brown": Model(TANGENT, (4, 5, 8, 12, 14), _brown),
     "fisheye": Model(ANGLES, (0, 1, 2, 3, 4), _fisheye),
     "field_of_view": Model(TANGENT, (1,), _field_of_view),
-    "thin_prism_fisheye": Model(ANGLES, (8,), _thin_prism_fisheye),
+    "thin_prism": Model(TANGENT, (8,), _thin_prism),
+    "thin_prism_fisheye": Model(ANGLES, (8,), _thin_prism),
     "project_aria": Model(ANGLES, (12,), _project_aria),
     "division": Model(ANGLES, (1,), _division),
     "extended_unified": Model(ANGLES, (2,), _extended_unified),

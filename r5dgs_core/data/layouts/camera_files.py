@@ -41,4 +41,6 @@ def read(root: Path, min_registered: float = 0.0, guard: findings.Guard = findin
                 entries[split], top = transforms.read(path, guard)
                 header = {**top, **header}
             files.append(path)
+            with guard():
+                transforms.check_perspective(path, header)
     return RawDataset(entries, header, root, tuple(files))

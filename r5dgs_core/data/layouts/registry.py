@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import importlib
-import shlex
 from pathlib import Path
 from types import ModuleType
 
-from ... import errors
+from ... import errors, input_paths
 from .. import file_kinds
 
 CAMERAS_FILE = "transforms_train.json"  # of the layout `camera_files`
@@ -31,7 +30,7 @@ def find(root: Path) -> ModuleType:
             return module
     _check_recordings(root)
     lone = (root / "transforms.json").exists()
-    remedy = "split transforms.json into transforms_train/val/test.json" if lone else "is it the right folder?"
+    remedy = f"make a data set of it with '{input_paths.prepare_command(root)}'" if lone else "is it the right folder?"
     raise errors.DatasetError(f"{root / CAMERAS_FILE}: the file is missing; {remedy}")
 
 
@@ -41,10 +40,9 @@ def _check_recordings(root: Path) -> None:
     for folder in (root, *inside):
         video = next((path for path in sorted(folder.iterdir()) if path.suffix.lower() in file_kinds.VIDEOS), None)
         if video is not None:
-            source = shlex.quote(str(root))
             raise errors.DatasetError(
                 f"{root}: expected images and camera files, found videos ({video.name}). Remedy: make a data set of "
-                f"them: r5dgs prepare {source} --out {shlex.quote(str(root.with_name(root.name + '_data')))}"
+                f"them: {input_paths.prepare_command(root)}"
             )
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 import shutil
 
 import hypothesis
@@ -415,6 +416,23 @@ def test_a_faulty_frame_is_one_clear_error(flat, edit, message):
 
 
 @pytest.mark.parametrize(
+    "edit",
+    [
+        lambda content: content["frames"][1].update(p1=0.01),
+        lambda content: content.update(k1=0.1),
+        lambda content: content.update(camera_model="OPENCV_FISHEYE"),
+        lambda content: content.update(is_fisheye=True),
+    ],
+)
+def test_distorted_cameras_are_refused_with_the_command_that_undistorts(flat, edit):
+    change(flat, edit)
+    with pytest.raises(
+        errors.DatasetError, match=rf"Remedy: r5dgs prepare {re.escape(str(flat))} --out {re.escape(str(flat))}_data"
+    ):
+        dataset.read(flat)
+
+
+@pytest.mark.parametrize(
     ("content", "message"),
     [
         ('{"frames": [', "line 1, column"),
@@ -451,7 +469,7 @@ def test_folders_that_are_not_data_sets_raise(tmp_path):
     with pytest.raises(errors.DatasetError, match=r"transforms_train\.json: the file is missing"):
         dataset.read(tmp_path)
     write_json(tmp_path / "transforms.json", {})
-    with pytest.raises(errors.DatasetError, match=r"split transforms\.json"):
+    with pytest.raises(errors.DatasetError, match="r5dgs prepare"):
         dataset.read(tmp_path)
 
 

@@ -7,7 +7,10 @@ from pathlib import Path
 from types import ModuleType
 
 # Modules of this folder; the first that detects its files reads the path.
-MODULES = ("caliscope", "pose2sim", "anipose")
+MODULES = (
+    *("caliscope", "pose2sim", "anipose", "qualisys", "opencv_yaml", "panoptic", "nerfies", "nerfstudio", "llff"),
+    "colmap",
+)
 
 
 def find(path: Path) -> tuple[ModuleType, Path] | None:

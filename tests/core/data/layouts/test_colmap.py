@@ -193,7 +193,7 @@ def test_distorted_lenses_are_refused_with_the_remedy(flat, text):
     shutil.rmtree(root / "sparse")
     colmap_files.write(root / "sparse" / "0", views, POINTS, text=text, model=colmap_files.OPENCV)
     with pytest.raises(
-        DatasetError, match="expected the lens SIMPLE_PINHOLE or PINHOLE, found OPENCV.*image_undistorter"
+        DatasetError, match="expected the lens SIMPLE_PINHOLE or PINHOLE, found OPENCV.*r5dgs prepare .*--out .*_data"
     ):
         datasets.read(root)
 
