@@ -263,7 +263,9 @@ def check_camera_images(before: np.ndarray):
     space, scene = area_of("VIEW_3D").spaces[0], main_window().scene
     loaded = next(one for one in bpy.data.collections if one.r5dgs.is_scene)
     camera, frame = service("scene.captured_cameras").all_of(loaded)[0], scene.frame_current
-    folder = out / "images"
+    folder, view = out / "images", space.region_3d
+    kept = {"view_rotation": view.view_rotation.copy(), "view_location": view.view_location.copy()}
+    kept["view_distance"] = view.view_distance
     for number, color in enumerate(((1, 0, 0, 1), (0, 0, 1, 1))):
         image = bpy.data.images.new("plain", 8, 8)
         image.pixels.foreach_set(np.tile(np.float32(color), 64))
@@ -293,7 +295,9 @@ def check_camera_images(before: np.ndarray):
     space.overlay.show_overlays = False
     yield 0.5
     compare("without overlays", seen("without_image"), through)
-    space.region_3d.view_perspective = "PERSP"
+    view.view_perspective = "PERSP"  # seen from the camera
+    for name, value in kept.items():
+        setattr(view, name, value)
     with inside():
         bpy.ops.ed.undo_push(message="After")
     yield 0.5
