@@ -79,6 +79,7 @@ class Finding:
         place: Path of the file or folder.
         problem: Expected and found content.
         remedy: Advice to the user.
+        picture: File of a picture that shows it, or "".
     """
 
     code: str
@@ -86,10 +87,12 @@ class Finding:
     place: str
     problem: str
     remedy: str
+    picture: str = ""
 
     def __str__(self) -> str:
         stop = "" if self.problem.endswith((".", "?", "!")) else "."
-        return f"{self.code} {self.severity} {self.place}: {self.problem}{stop} Remedy: {self.remedy}"
+        text = f"{self.code} {self.severity} {self.place}: {self.problem}{stop} Remedy: {self.remedy}"
+        return f"{text}. Picture: {self.picture}" if self.picture else text
 
 
 @contextlib.contextmanager
@@ -131,13 +134,14 @@ class Collector:
             if not any(found.severity == ERROR for found in self.findings):
                 raise
 
-    def add(self, code: str, message: str) -> None:
+    def add(self, code: str, message: str, picture: str = "") -> None:
         """Record a fault; beyond `MAX_FINDINGS`, record once that there are more.
 
         Args:
             code: Code of the fault.
             message: "place: problem; remedy" or "place: problem. Remedy: remedy", the forms of error messages. Without
                 a remedy, that of the code is used.
+            picture: File of a picture that shows it, or "".
         """
         kind = self.codes[code]
         body, mark, remedy = message.partition("Remedy: ")
@@ -148,7 +152,7 @@ class Collector:
             place, problem = place, kind.meaning
         if len(self._known) == MAX_FINDINGS:
             problem, remedy = f"more than {MAX_FINDINGS} faults; the others are not listed", ""
-        finding = Finding(code, kind.severity, place, problem, remedy.strip() or kind.remedy)
+        finding = Finding(code, kind.severity, place, problem, remedy.strip() or kind.remedy, picture)
         if finding not in self._known and len(self._known) <= MAX_FINDINGS:
             self._known.add(finding)
             self.findings.append(finding)

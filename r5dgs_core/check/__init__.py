@@ -13,11 +13,13 @@ from ..findings import Collector, Finding
 from .codes import CODES
 
 
-def check(path: Path) -> list[Finding]:
+def check(path: Path, pictures: Path | None = None) -> list[Finding]:
     """Return all faults of a file or folder, errors first.
 
     Args:
         path: A data set, run folder, scene file, PLY file or TOML configuration.
+        pictures: Folder for pictures of faults of a capture. If it is None, pictures of a data set that `r5dgs prepare`
+            wrote go to its folder ``check``, and those of others are not drawn.
 
     Raises:
         ConfigError: The path does not exist, or its kind cannot be checked.
@@ -26,20 +28,23 @@ def check(path: Path) -> list[Finding]:
     try:
         if not path.exists():
             raise errors.ConfigError(f"{path}: expected a file or folder, found nothing; check the path")
-        found = _check_folder(path) if path.is_dir() else _check_file(path)
+        found = _check_folder(path, pictures) if path.is_dir() else _check_file(path)
     except OSError as error:
         raise errors.ConfigError(f"{path}: cannot be read ({error})") from error
     return sorted(found, key=lambda finding: finding.severity != findings.ERROR)
 
 
-def _check_folder(path: Path) -> list[Finding]:
+def _check_folder(path: Path, pictures: Path | None) -> list[Finding]:
     if (path / input_paths.RUN_FILE).exists():
         from . import run
 
         return run.check(path)
+    from ..prepare import capture_file
     from . import data
 
-    return data.check(path)
+    if pictures is None and (path / capture_file.FILE).exists():
+        pictures = path / "check"
+    return data.check(path, pictures=pictures)
 
 
 def _check_file(path: Path) -> list[Finding]:

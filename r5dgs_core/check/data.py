@@ -13,7 +13,10 @@ from ..data import colmap_dataset, dataset, images, masks
 from ..data.dataset import Dataset, View
 from ..data.layouts import camera_files, colmap
 from ..findings import Collector, Finding, coded
+from ..prepare import capture_file
 from ..terminal import printable
+from .capture import agreement, arrangement, over_time, recording, timing
+from .capture.pictures import Album
 from .codes import CODES
 
 MIN_CAMERAS, MIN_IMAGES = 3, 3
@@ -23,12 +26,18 @@ _LISTED = 5  # names per finding
 _OF_ALL_TRAINING_IMAGES = {"D41", "D42", "D43", "D47"}
 
 
-def check(root: Path, train_masks: str = dataset.MASKS, min_registered: float = colmap.MIN_REGISTERED) -> list[Finding]:
+def check(
+    root: Path,
+    train_masks: str = dataset.MASKS,
+    min_registered: float = colmap.MIN_REGISTERED,
+    pictures: Path | None = None,
+) -> list[Finding]:
     """Return all faults of a data set folder.
 
     Args:
         root: The folder.
         train_masks, min_registered: As of `dataset.read`.
+        pictures: Folder for pictures of faults of the capture; None to draw none.
     """
     collect = Collector(CODES, "D00")
     found: Dataset | None = None
@@ -50,8 +59,10 @@ def check(root: Path, train_masks: str = dataset.MASKS, min_registered: float = 
     if faulty:  # rules that compare with the whole training split
         collect.findings = [finding for finding in collect.findings if finding.code not in _OF_ALL_TRAINING_IMAGES]
     _check_names(found, collect)
-    _check_images(found, collect)
-    _check_masks(found, collect)
+    album = Album(pictures)
+    arrangement.check(found, collect, album)
+    _check_images(found, collect, album)
+    _check_masks(found, collect, album)
     return collect.findings
 
 
@@ -134,22 +145,35 @@ def _check_names(found: Dataset, collect: Collector) -> None:
             collect.add("D52", f"{found.root}: the name {printable(word)!r} holds control characters")
 
 
-def _check_images(found: Dataset, collect: Collector) -> None:
+def _check_images(found: Dataset, collect: Collector, album: Album) -> None:
+    """Decode all images, camera by camera, and check those of a camera over time."""
     same: dict[bytes, View] = {}
-    for view in {view.image_path: view for view in _views(found)}.values():
-        with collect(), coded("D12"):
-            images.read(view.image_path)
-            digest = hashlib.sha256(view.image_path.read_bytes()).digest()
-            other = same.setdefault(digest, view)
-            if other.camera.name != view.camera.name:
-                collect.add("D51", f"{view.image_path}: the same file as {other.image_path}, from another camera")
+    clocks = timing.Clocks(str(found.root), found.units.seconds_per_unit, collect, album)
+    for views in recording.by_camera(_views(found)):
+        reduced = []
+        for view in views:
+            with collect(), coded("D12"):
+                pixels = images.read(view.image_path)
+                digest = hashlib.sha256(view.image_path.read_bytes()).digest()
+                other = same.setdefault(digest, view)
+                if other.camera.name != view.camera.name:
+                    collect.add("D51", f"{view.image_path}: the same file as {other.image_path}, from another camera")
+                if len(reduced) < recording.MOST:
+                    reduced.append((view, recording.reduce(pixels)))
+        if len(reduced) >= recording.LEAST:
+            one = recording.measure([view for view, _ in reduced], [picture for _, picture in reduced])
+            over_time.check(one, str(found.root), found.units.seconds_per_unit, collect, album)
+            clocks.add(one)
+    clocks.check()
+    clocks.check_record(capture_file.read(found.root))
 
 
-def _check_masks(found: Dataset, collect: Collector) -> None:
+def _check_masks(found: Dataset, collect: Collector, album: Album) -> None:
     without = [view.name for view in found.train if view.mask_path is None]
     if 0 < len(without) < len(found.train):
         collect.add("D48", f"{found.mask_folder}: {len(without)} training images have no mask: {_some(without)}")
     seen: dict[int, set[str]] = defaultdict(set)
+    sightings: dict[int, list[agreement.Sighting]] = defaultdict(list)
     complete = True
     for view in _views(found):
         loaded = None
@@ -159,6 +183,8 @@ def _check_masks(found: Dataset, collect: Collector) -> None:
         if loaded is not None:
             for object_id in np.unique(loaded):
                 seen[int(object_id)].add(view.name)
+            for object_id, one in agreement.sightings(view, loaded).items() if view.split == "train" else ():
+                sightings[object_id].append(one)
     ids = sorted(set(seen) - {0, masks.UNKNOWN})
     folder = found.mask_folder or found.root / dataset.MASKS
     unnamed = [object_id for object_id in ids if object_id not in found.object_names]
@@ -171,3 +197,4 @@ def _check_masks(found: Dataset, collect: Collector) -> None:
     absent = [name for object_id, name in found.object_names.items() if object_id not in seen]
     if seen and complete and absent:
         collect.add("D55", f"{folder}: expected pixels of {_some(absent)}, found none")
+    agreement.check(found, sightings, collect, album)

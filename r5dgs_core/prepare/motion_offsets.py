@@ -20,6 +20,7 @@ from .motion_tracks import MotionTrack
 
 SEARCH_S = 5.0  # largest offset
 FINE = 0.02  # step of the second scan, frame intervals
+_ROUNDS = 12  # of the minimisation
 BLOCKS = 8  # of time, for the uncertainty
 SCALE_PX = 4.0  # distance at which the loss bends, pixels of the full image
 BIAS_PX = 8.0  # largest constant distance that is taken as an error of the calibration
@@ -36,7 +37,10 @@ class _Pair:
 
 
 def measure(
-    tracks: Sequence[MotionTrack], T_cam_world: Sequence[np.ndarray], intervals: Sequence[float]
+    tracks: Sequence[MotionTrack],
+    T_cam_world: Sequence[np.ndarray],
+    intervals: Sequence[float],
+    search: float = SEARCH_S,
 ) -> list[Offset] | None:
     """Measure the offset of each camera's clock.
 
@@ -44,6 +48,7 @@ def measure(
         tracks: A moving region per camera.
         T_cam_world: World to camera of each camera. C arrays [4, 4]
         intervals: Time between two frames of each camera, seconds.
+        search: Largest offset, seconds.
 
     Returns:
         One offset per camera as `clock.solve_pairs` returns them; None if motion does not determine any.
@@ -57,7 +62,7 @@ def measure(
         return None
     step = max(intervals)
     spans = [float(np.ptp(tracks[camera].times)) for pair in pairs for camera in (pair.a, pair.b)]
-    reach = min(SEARCH_S, 0.5 * min(spans))
+    reach = min(search, 0.5 * min(spans))
     wide = np.arange(-reach, reach + step / 8, step / 4)
     starts = []
     for pair in pairs:
@@ -71,9 +76,11 @@ def measure(
     known = [one.sigma is not None for one in coarse]
     pairs = [pair for pair in pairs if known[pair.a] and known[pair.b]]
     first = known.index(True)
-    guess = _descend(pairs, tracks, np.array([one.seconds for one in coarse]), step, step / 4, 3)
-    guess = _descend(pairs, tracks, guess, step, FINE * step, 1.5)
-    dropped = [_descend(pairs, tracks, guess, step, FINE * step, 1.0, leave=block) for block in range(BLOCKS)]
+    guess = np.array([one.seconds for one in coarse])
+    for resolution, reach in ((step / 4, 3.0), (FINE * step, 1.5)):
+        guess = _Scan(pairs, tracks, guess, step, resolution, reach).lowest()
+    last = _Scan(pairs, tracks, guess, step, FINE * step, 1.0)
+    dropped = [last.lowest(block) for block in range(BLOCKS)]
     spread = np.sqrt((BLOCKS - 1) / BLOCKS * np.square(np.array(dropped) - np.mean(dropped, axis=0)).sum(0))
     floor = FINE * step
     return [
@@ -95,37 +102,52 @@ def misfit(
     return float(np.mean(values)) if values else float("nan")
 
 
-def _descend(
-    pairs: Sequence[_Pair],
-    tracks: Sequence[MotionTrack],
-    start: np.ndarray,
-    step: float,
-    resolution: float,
-    reach: float,
-    leave: int | None = None,
-) -> np.ndarray:
-    """Minimise the loss of all pairs by one camera at a time, within ``reach`` intervals of the start. [C]"""
-    span = 2.0 * reach * step
-    trials = np.arange(-span, span + resolution / 2, resolution)
-    curves = {}
-    for pair in pairs:
-        center = start[pair.b] - start[pair.a]
-        curves[pair] = _curve(_distances(pair, tracks, center + trials, step), leave)
-    moved = np.zeros(len(start))
-    grid = np.arange(-reach * step, reach * step + resolution / 2, resolution)
-    for _ in range(12):
-        before = moved.copy()
-        for camera in range(min(pair.a for pair in pairs) + 1, len(start)):
-            total = np.zeros(len(grid))
-            for pair, curve in curves.items():
-                if camera in (pair.a, pair.b):
-                    shift = grid - moved[pair.a] if camera == pair.b else moved[pair.b] - grid
-                    total += np.interp(shift, trials, np.where(np.isfinite(curve), curve, 1e3))
-            if total.any():
-                moved[camera] = _lowest(grid, total)
-        if np.abs(moved - before).max() < 0.1 * resolution:
-            break
-    return start + moved
+class _Scan:
+    """Losses of all pairs within ``reach`` intervals of given offsets.
+
+    Args:
+        pairs: The pairs.
+        tracks: A moving region per camera.
+        start: The offsets. [C]
+        step: Interval between frames, seconds.
+        resolution: Step of the trial offsets, seconds.
+        reach: Largest change of an offset, intervals.
+    """
+
+    def __init__(
+        self,
+        pairs: Sequence[_Pair],
+        tracks: Sequence[MotionTrack],
+        start: np.ndarray,
+        step: float,
+        resolution: float,
+        reach: float,
+    ):
+        self._pairs, self._start, self._resolution = pairs, start, resolution
+        span = reach * step
+        self._trials = np.arange(-2 * span, 2 * span + resolution / 2, resolution)
+        self._grid = np.arange(-span, span + resolution / 2, resolution)
+        self._distances = [
+            _distances(pair, tracks, start[pair.b] - start[pair.a] + self._trials, step) for pair in pairs
+        ]
+
+    def lowest(self, leave: int | None = None) -> np.ndarray:
+        """Minimise the loss by one camera at a time, without one block of the times. [C]"""
+        curves = [_curve(distances, leave) for distances in self._distances]
+        moved = np.zeros(len(self._start))
+        for _ in range(_ROUNDS):
+            before = moved.copy()
+            for camera in range(min(pair.a for pair in self._pairs) + 1, len(moved)):
+                total = np.zeros(len(self._grid))
+                for pair, curve in zip(self._pairs, curves, strict=True):
+                    if camera in (pair.a, pair.b):
+                        at = self._grid - moved[pair.a] if camera == pair.b else moved[pair.b] - self._grid
+                        total += np.interp(at, self._trials, np.where(np.isfinite(curve), curve, 1e3))
+                if total.any():
+                    moved[camera] = _lowest(self._grid, total)
+            if np.abs(moved - before).max() < 0.1 * self._resolution:
+                break
+        return self._start + moved
 
 
 def _lowest(grid: np.ndarray, values: np.ndarray) -> float:

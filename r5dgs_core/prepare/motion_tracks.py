@@ -27,11 +27,13 @@ class MotionTrack:
         times: Times at which it is seen, on the camera's clock, seconds. [F]
         points: Its centre in the plane at depth 1, camera axes. [F, 2]
         pixel: Size of a pixel of the full image in that plane.
+        rows: Height of the centre in the image, from -0.5 at the upper edge to 0.5. [F]
     """
 
     times: np.ndarray
     points: np.ndarray
     pixel: float
+    rows: np.ndarray
 
 
 def track(source: CameraSource, lens: Lens, report: Callable[[int], None]) -> MotionTrack:
@@ -51,14 +53,15 @@ def track(source: CameraSource, lens: Lens, report: Callable[[int], None]) -> Mo
         small.append(reduce(pixels, step))
         report(count)
     if len(small) < 4:
-        return MotionTrack(np.zeros(0), np.zeros((0, 2)), 1.0 / lens.fx)
+        return MotionTrack(np.zeros(0), np.zeros((0, 2)), 1.0 / lens.fx, np.zeros(0))
     stack = np.stack(small)
-    centers = _centers(stack)
-    seen = np.isfinite(centers[:, 0])
-    pixels = (centers[seen] + 0.5) * step
+    places = centers(stack)
+    seen = np.isfinite(places[:, 0])
+    pixels = (places[seen] + 0.5) * step
     rays = lens.unproject(pixels) if len(pixels) else np.zeros((0, 3))
+    rows = pixels[:, 1] / source.height - 0.5
     good = np.isfinite(rays).all(1) & (rays[:, 2] > 1e-3)
-    return MotionTrack(source.times[found][seen][good], rays[good, :2] / rays[good, 2:], 1.0 / lens.fx)
+    return MotionTrack(source.times[found][seen][good], rays[good, :2] / rays[good, 2:], 1.0 / lens.fx, rows[good])
 
 
 def reduce(pixels: np.ndarray, step: int) -> np.ndarray:
@@ -77,11 +80,11 @@ def background(stack: np.ndarray) -> np.ndarray:
     return np.median(stack[chosen], axis=0).astype(np.int16)
 
 
-def _centers(stack: np.ndarray) -> np.ndarray:
+def centers(stack: np.ndarray) -> np.ndarray:
     """Centre (x, y) of the largest region that differs from the background, NaN if there is none. [F, 2]"""
     behind = background(stack)
     area = behind[..., 0].size
-    centers = np.full((len(stack), 2), np.nan)
+    found = np.full((len(stack), 2), np.nan)
     for k, frame in enumerate(stack):
         apart = frame.astype(np.int16) - behind
         apart -= np.median(apart, axis=(0, 1)).astype(np.int16)  # a change of exposure is no motion
@@ -97,5 +100,5 @@ def _centers(stack: np.ndarray) -> np.ndarray:
         edge = x.min() == 0 or y.min() == 0 or x.max() == frame.shape[1] - 1 or y.max() == frame.shape[0] - 1
         if not edge:
             weights = np.minimum(apart[y, x], 3 * _NOISE)  # pixels at the border count by their share
-            centers[k] = np.average(x, weights=weights), np.average(y, weights=weights)
-    return centers
+            found[k] = np.average(x, weights=weights), np.average(y, weights=weights)
+    return found

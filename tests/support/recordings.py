@@ -106,9 +106,11 @@ class Rig:
     lenses: tuple[Lens, ...]
 
 
-def make_rig(count: int, width: int, height: int, coefficients: Sequence[float] = ()) -> Rig:
-    """Return cameras on an arc of 120 degrees, with given Brown-Conrady coefficients."""
-    angles = np.linspace(0.0, 2.1, count)
+def make_rig(
+    count: int, width: int, height: int, coefficients: Sequence[float] = (), angles: Sequence[float] | None = None
+) -> Rig:
+    """Return cameras on a circle, by default on 120 degrees of it, with given Brown-Conrady coefficients."""
+    angles = np.linspace(0.0, 2.1, count) if angles is None else angles
     cameras = tuple(tiny_datasets.orbit_camera(angle, width, height) for angle in angles)
     centered = [camera.intrinsics - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]) for camera in cameras]
     lenses = tuple(Lens.from_opencv(matrix, coefficients) for matrix in centered)

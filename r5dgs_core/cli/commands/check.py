@@ -25,17 +25,19 @@ PAGE = "reference/check.md"
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     p.add_argument("target", type=Path, metavar="DATA|RUN|FILE", help="data set, run folder or file to check")
+    pictures = "folder for pictures of faults of a capture (default: DATA/check, if DATA was made by 'r5dgs prepare')"
+    p.add_argument("--pictures", type=Path, metavar="FOLDER", help=pictures)
     p.add_argument("--json", action="store_true", help="print JSON instead of text")
 
 
 def run(args: argparse.Namespace) -> ExitStatus | None:
     """Run the command."""
-    return None if run_check(args.target, as_json=args.json) else ExitStatus.NEGATIVE
+    return None if run_check(args.target, as_json=args.json, pictures=args.pictures) else ExitStatus.NEGATIVE
 
 
-def run_check(path: Path, *, as_json: bool = False) -> bool:
+def run_check(path: Path, *, as_json: bool = False, pictures: Path | None = None) -> bool:
     """Print all faults and their counts; returns False if any fault is an error."""
-    found = check(path)
+    found = check(path, pictures)
     failed = sum(finding.severity == ERROR for finding in found)
     if as_json:
         rows = [dataclasses.asdict(finding) for finding in found]

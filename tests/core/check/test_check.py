@@ -18,7 +18,7 @@ from r5dgs_core.data import images
 from r5dgs_core.motion import models
 from r5dgs_core.scene import scene_file, validation
 from tests.core.data.test_dataset import HEIGHT, WIDTH, camera_matrix, write_flat
-from tests.support import colmap_files, scenes
+from tests.support import captures, colmap_files, scenes
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "reference" / "check.md"
 CASES = {}
@@ -311,6 +311,80 @@ def _(root):
 @case("D55")
 def _(root):
     return file_written(root, "objects.json", {"1": "mug", "2": "red apple", "3": "ghost"})
+
+
+@case("D60")
+def _(root):
+    return captures.make(root, turned=np.diag([-1.0, 1.0, -1.0]))
+
+
+@case("D61")
+def _(root):
+    return captures.make(root, angles=(0.0, 0.01, 0.02))
+
+
+@case("D62")
+def _(root):
+    return captures.make(root, drawn=captures.dimmed((0.8, 0.8, 0.8)))
+
+
+@case("D63")
+def _(root):
+    return captures.make(root, drawn=captures.dimmed((-0.12, 0.0, 0.25)))
+
+
+@case("D64")
+def _(root):
+    return captures.make(root, drawn=captures.blurred)
+
+
+@case("D65")
+def _(root):
+    return captures.make(root, drawn=captures.rolling)
+
+
+@case("D66")
+def _(root):
+    return captures.make(root, times=(captures.TIMES, np.delete(captures.TIMES, [4, 20]), captures.TIMES))
+
+
+@case("D67")
+def _(root):
+    return captures.make(root, drawn=captures.late)
+
+
+@case("D68")
+def _(root):
+    return captures.make(root, masks=captures.disagreeing)
+
+
+@case("D69")
+def _(root):
+    return captures.make(root, masks=captures.lonely)
+
+
+@case("D70")
+def _(root):
+    write_flat(root)
+    shutil.rmtree(root / "object_mask")
+    for path in (root / "train").glob("*.png"):
+        images.write_png(path, np.full((960 + HEIGHT, (960 + HEIGHT) * WIDTH // HEIGHT, 3), 90, np.uint8))
+    return root
+
+
+@case("D71")
+def _(root):
+    return captures.make(root, drawn=captures.repeated)
+
+
+@case("D72")
+def _(root):
+    write_flat(root)
+    shutil.rmtree(root / "object_mask")
+    unknown = {"offset_ms": 0.0, "offset_sigma_ms": None, "gaps": []}
+    content = {"format_version": 1, "cameras": [{"name": "a", **unknown}, {"name": "b", **unknown}]}
+    (root / "capture.json").write_text(json.dumps(content))
+    return root
 
 
 @case("S01")

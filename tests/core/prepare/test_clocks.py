@@ -126,7 +126,7 @@ def test_the_misfit_is_least_at_the_true_offsets():
         seen = np.stack([recordings.ball(t + shift) for t in times])
         local = seen @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
         points = local[:, :2] / local[:, 2:]
-        tracks.append(motion_tracks.MotionTrack(times, points, 1 / camera.intrinsics[0, 0]))
+        tracks.append(motion_tracks.MotionTrack(times, points, 1 / camera.intrinsics[0, 0], np.zeros(len(times))))
     poses = [camera.T_cam_world for camera in rig.cameras]
     found = motion_offsets.measure(tracks, poses, [1 / 30, 1 / 30])
     assert found[1].seconds == pytest.approx(0.02, abs=3e-4)
