@@ -39,6 +39,7 @@ fresh_environment() {
 
   step "packages of the player"
   npm --prefix player ci --ignore-scripts --no-audit --no-fund
+  npm --prefix player run types
 
   step "fresh environment"
   "${PYTHON:-python3}" -m venv "$work/venv"

@@ -121,7 +121,7 @@ ALLOWED = {
 # Commands that import numpy or torch.
 COMMANDS = (
     *("associate", "bake", "bench", "demo", "evaluate", "export", "import_run", "info", "lookup", "masks", "name"),
-    *("objects", "prepare", "query", "report", "train", "warm_up"),
+    *("objects", "prepare", "query", "report", "train", "view", "warm_up"),
 )
 # Modules that may import modules of the project inside functions: the command line and the public functions, which
 # start fast, and the worker, which answers before torch is there and if it is missing.

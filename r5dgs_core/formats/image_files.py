@@ -21,10 +21,16 @@ _LONG_NAMES = 1 << 10
 
 
 def write_png(path: str | Path, pixels: np.ndarray) -> Path:
-    """Write integers as a greyscale or RGB PNG, atomically, and return the path.
+    """Write integers as a PNG, as from `png`, atomically, and return the path."""
+    content = png(pixels)
+    atomic_files.write(path, content)
+    return Path(path)
+
+
+def png(pixels: np.ndarray) -> bytes:
+    """Content of a greyscale or RGB PNG.
 
     Args:
-        path: Target file.
         pixels: Top row first. [H, W] or [H, W, 3] uint8 or uint16
     """
     if pixels.shape[2:] not in ((), (3,)) or pixels.dtype not in (np.uint8, np.uint16) or pixels.size == 0:
@@ -37,9 +43,7 @@ def write_png(path: str | Path, pixels: np.ndarray) -> Path:
     filtered = np.concatenate([np.zeros((height, 1), np.uint8), lines], axis=1)  # filter "none" before each line
     content = b"\x89PNG\r\n\x1a\n"
     content += _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, 2 * (pixels.ndim == 3), 0, 0, 0))
-    content += _chunk(b"IDAT", zlib.compress(filtered.tobytes(), 6)) + _chunk(b"IEND", b"")
-    atomic_files.write(path, content)
-    return Path(path)
+    return content + _chunk(b"IDAT", zlib.compress(filtered.tobytes(), 6)) + _chunk(b"IEND", b"")
 
 
 def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> Path:

@@ -18,6 +18,7 @@ MODULES = {  # module of this room that defines `FORMAT`, by the name of the for
     "ply": "ply",
     "cameras": "camera_files",
     "glb": "glb",
+    "html": "html",
 }
 
 

@@ -457,6 +457,8 @@ NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, fo
     ["report"],
     ["bench", "nowhere", "--out", "tables"],
     ["bench", "nowhere", "--out", "tables", "--variants", "best"],
+    ["view", "nowhere"],
+    ["view", "nowhere", "--port", "70000"],
     ["info", "nowhere"],
     ["objects", "nowhere"],
     ["objects", "nowhere", "--legend", "legend.jpg"],

@@ -1,0 +1,192 @@
+"""The player in a browser, from a file and from `r5dgs view`."""
+
+import dataclasses
+import threading
+
+import numpy as np
+import pytest
+
+from r5dgs_core.cli.commands import view
+from r5dgs_core.formats import html, image_files, registry
+from r5dgs_core.scene.scene import Scene, Shading
+from tests.support import arms, player_checks, scenes
+from tests.support.player import Browser
+
+pytestmark = [pytest.mark.browser, pytest.mark.heavy]
+
+END = 1.3
+SIDE = 192
+OPTIONS = registry.Options((0.0,), until=END, still=image_files.png(np.full((30, 40, 3), 200, np.uint8)))
+
+
+@pytest.fixture(scope="module")
+def browser():
+    found = Browser()
+    yield found
+    found.close()
+
+
+def rich_scene() -> Scene:
+    """Bodies, a shadow, harmonics, shading with factors, a sky of degree 1 and stored words."""
+    scene = scenes.make_scene(n=1500, objects=4, sh_degree=2, seed=5)
+    random = np.random.default_rng(2)
+    log_scales = scene.gaussians.log_scales + np.float32(0.8)
+    sh = scene.gaussians.sh * np.float32([1] + 8 * [0.4])[:, None]
+    vectors = np.eye(4, dtype=np.float32)
+    sky = np.concatenate([scene.background_sh, 0.2 * random.normal(size=(3, 3)).astype(np.float32)])
+    scene = scene.with_arrays(
+        log_scales=log_scales,
+        sh=sh,
+        background_sh=sky,
+        embeddings=vectors[[3, 3, 0, 1, 0, 3]],
+        vocabulary_embeddings=vectors[[0, 1, 2]],
+    )
+    rest = random.uniform(0.6, 1.2, 1500).astype(np.float32)
+    shading = Shading(scene.shading.vectors, scene.shading.light, rest)
+    return dataclasses.replace(scene, shading=shading, vocabulary=("vessel", "fruit", "sofa"))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return rich_scene()
+
+
+def page_of(scene, folder):
+    (path,) = html.export(scene, folder / "scene.html", OPTIONS)
+    return path.as_uri()
+
+
+@pytest.fixture(scope="module")
+def url(scene, tmp_path_factory):
+    return page_of(scene, tmp_path_factory.mktemp("page"))
+
+
+def assert_quiet(browser, url):
+    """Check that the page had no errors and made no request but that for itself."""
+    seen = browser.send(log=True)
+    assert seen["log"] == [] and [request.partition("?")[0] for request in seen["requests"]] == [url]
+
+
+@pytest.mark.parametrize("made", [rich_scene, arms.make_arm], ids=["bodies", "parts"])
+def test_pictures_are_those_of_the_rasterizer(made, browser, tmp_path):
+    scene = made()
+    url = page_of(scene, tmp_path)
+    found = player_checks.compare(browser, scene, url, SIDE, END, tmp_path)
+    assert len(found) == 5 * len(scene.cameras)
+    assert min(one.psnr for one in found) > 43 and max(one.median for one in found) <= 1
+    assert max(one.shift for one in found) < 0.5
+    assert_quiet(browser, url)
+
+
+def test_picking_finds_the_object_of_each_pixel(browser, scene, url):
+    found = player_checks.picks(browser, scene, url, SIDE)
+    assert len(found) >= 3 and all(right == tried for right, tried in found.values())
+
+
+def test_search_ranks_as_query_does(browser, scene, url):
+    texts = player_checks.prompts(scene)
+    browser.open(url + "?t=0")
+    found = player_checks.rankings_of_page(browser, texts)
+    answered = 0
+    for text, matches in zip(texts, found, strict=True):
+        wanted = player_checks.ranking(scene, text)
+        assert [one[0] for one in matches] == [one[0] for one in wanted], text
+        assert [one[1] for one in matches] == pytest.approx([one[1] for one in wanted], abs=1e-6), text
+        answered += bool(wanted)
+    assert len(texts) == 200 and 60 < answered < 200
+    assert "nothing matches" in browser.eval("r5dgs.controls.search.find('zebra').note")
+
+
+def test_the_address_chooses_time_object_and_camera(browser, scene, url):
+    camera = scene.cameras[1].name
+    browser.open(f"{url}?t=0.9&object=vehicle&camera={camera}")
+    assert browser.eval("[r5dgs.t, r5dgs.playing, r5dgs.chosen]") == [0.9, False, 3]
+    assert browser.eval("r5dgs.views.captured.name") == camera
+    assert browser.eval("document.getElementById('now').textContent") == "0.90 predicted"
+    assert "Motion: " in browser.eval("document.getElementById('info').textContent")
+    browser.open(f"{url}?t=99&object=zebra&camera=fly")
+    assert browser.eval("[r5dgs.t, r5dgs.chosen, r5dgs.views.flying]") == [END, None, True]
+    assert "zebra" in browser.eval("document.getElementById('message').textContent")
+
+
+def test_it_plays_and_loops_unless_motion_is_reduced(browser, url):
+    browser.open(url)
+    assert browser.eval("r5dgs.playing")
+    looped = """(r5dgs.go(1.29), new Promise((done) => { let left = 5000;
+        const look = () => (r5dgs.t < 1.2 || !left-- ? done(left > 0) : requestAnimationFrame(look)); look(); }))"""
+    assert browser.eval(looped) and browser.eval("r5dgs.playing")
+    browser.open(url, still=True)
+    assert not browser.eval("r5dgs.playing") and browser.eval("r5dgs.t") == 0
+
+
+def test_keys_and_clicks_control_it(browser, scene, url):
+    camera = scene.cameras[0]
+    browser.open(f"{url}?t=0&camera=0", 960, 720)
+    browser.send(key="End")
+    assert browser.eval("r5dgs.t") == END and browser.eval("document.body.classList.contains('future')")
+    browser.send(key="ArrowLeft")
+    assert browser.eval("r5dgs.t") == pytest.approx(END - 1 / scene.frames_per_unit)
+    browser.send(key="/")
+    browser.send(type="cup")
+    browser.send(key="Enter")
+    assert browser.eval("r5dgs.chosen") == 1
+    browser.send(key="Escape")
+    browser.eval("document.getElementById('view').focus()")
+    browser.send(key="i")
+    assert browser.eval("[r5dgs.isolated, r5dgs.visible(1), r5dgs.visible(2)]") == [1, True, False]
+    browser.send(key="Escape")
+    assert browser.eval("[r5dgs.isolated, r5dgs.chosen]") == [None, None]
+    browser.send(key="Home")
+    x, y = browser.eval("""(() => { for (let y = 100; y < 560; y += 4) for (let x = 20; x < 660; x += 4)
+        if (r5dgs.pick(x, y) === 2) return [x, y]; })()""")
+    browser.send(click=[x, y])
+    assert browser.eval("r5dgs.chosen") == 2 and camera.width > 0
+    before = browser.eval("r5dgs.views.eye().place")
+    browser.send(key="f")
+    browser.eval("r5dgs.views.fly(0.1, 0, 0)")
+    assert browser.eval("r5dgs.views.flying") and browser.eval("r5dgs.views.eye().place") != before
+
+
+def test_hiding_an_object_hides_its_shadow(browser, scene, url):
+    browser.open(f"{url}?t=0")
+    name = next(item.name for item in scene.objects if item.id == 1)
+    browser.eval(f"document.querySelector('[aria-label=\"Hide {name}\"]').click()")
+    hidden = "[...r5dgs.hiddenPieces].map((piece) => [piece.object, piece.group.role])"
+    assert sorted(browser.eval(hidden)) == [[0, "shadow"], [1, "body"]]
+
+
+def test_it_fits_a_phone(browser, url, tmp_path):
+    browser.open(f"{url}?t=0.4&object=mug", 360, 640, touch=True)
+    assert browser.eval("document.documentElement.scrollWidth") <= 360
+    boxes = browser.eval("""[...document.querySelectorAll('button, select, input')].filter((e) => e.offsetParent)
+        .map((e) => { const b = e.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; })""")
+    assert len(boxes) > 5 and np.min(boxes) >= 0 and (np.max(boxes, axis=0)[2:] <= [360, 640]).all()
+    unnamed = browser.eval("""[...document.querySelectorAll('button, select, input, canvas:not([aria-hidden])')]
+        .filter((e) => !(e.getAttribute('aria-label') || e.textContent.trim() || e.closest('label')))
+        .map((e) => e.outerHTML)""")
+    assert unnamed == []
+    browser.eval("r5dgs.engine.settle()")
+    browser.send(shot=str(tmp_path / "phone.png"))
+    assert (tmp_path / "phone.png").stat().st_size > 5000
+
+
+def test_without_webgl_a_picture_and_a_message_are_shown(browser, url):
+    browser.open(url, webgl=False)
+    assert "WebGL 2 is missing" in browser.eval("document.getElementById('message').textContent")
+    assert browser.eval("document.getElementById('still').naturalWidth") == 40
+    assert browser.eval("getComputedStyle(document.getElementById('still')).display") != "none"
+    assert_quiet(browser, url)
+
+
+def test_view_serves_the_page(browser, scene):
+    with view.serving(html.page(scene, OPTIONS)) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            address = f"http://127.0.0.1:{server.server_port}/"
+            browser.open(f"{address}?t=0.5&object=lemon")
+            assert browser.eval("[r5dgs.t, r5dgs.chosen]") == [0.5, 4]
+            assert_quiet(browser, address)
+        finally:
+            server.shutdown()
+            thread.join()
