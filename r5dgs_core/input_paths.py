@@ -75,6 +75,12 @@ def check_output_folder(option: str, path: Path) -> None:
         raise errors.ConfigError(f"{option} {path}: expected a folder or an unused path, found a file")
 
 
+def check_source(source: Path) -> None:
+    """Raise `DatasetError` if a source of recordings does not exist."""
+    if not source.exists():
+        raise errors.DatasetError(f"{source}: expected a video, or a folder of videos or frames, found nothing")
+
+
 def prepare_command(source: Path) -> str:
     """Return the command that makes a data set of a folder of videos or of distorted images, for messages."""
     out = source.with_name(f"{source.name}_data")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ... import errors, terminal
+from ... import errors, input_paths, terminal
 from .. import options
 
 if TYPE_CHECKING:
@@ -122,6 +122,7 @@ def run_prepare(
     window = window or {}
     if window.get("end") is not None and window["end"] <= window.get("start", 0.0):
         raise errors.UsageError(f"--end {window['end']:g}: expected a time after --start {window.get('start', 0.0):g}")
+    input_paths.check_source(source)
     from ...prepare import data_splits, frame_choice, plan, prepare
     from ...progress import make
 

@@ -436,6 +436,8 @@ NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, fo
     ["train", ".", "--out", "run", "--threads", "2"],
     ["demo", "--preset", "slow"],
     ["demo", "--config", "nowhere.toml"],
+    ["prepare", "nowhere", "--out", "data"],
+    ["prepare", "nowhere", "--out", "data", "--start", "2", "--end", "1"],
     ["masks", "nowhere"],
     ["masks", "nowhere", "--backend", "sam3"],
     ["associate", "nowhere"],
