@@ -38,9 +38,8 @@ from scipy.spatial.transform import Rotation
 from r5dgs_core.motion import models
 from r5dgs_core.motion_fit import model_selection
 
+from . import scoring
 from . import simulated_tracks as simulated
-
-BAD = 20.0  # % of the size
 
 
 def _quats(turns: Rotation) -> np.ndarray:
@@ -83,7 +82,7 @@ def measure(name: str, noise: simulated.Noise, seed: int) -> dict[str, Any]:
     error = simulated.errors(track.places[-1] + moved, _turns(quats) * track.turns[-1], track)
     band = fit.history.band
     assert band is not None
-    half = 50 / simulated.RADIUS * band.widths(track.later)
+    half = scoring.half_widths(band, track.later, 2 * simulated.RADIUS)
     step = track.times[1] - track.times[0]
     found = [event.time for event in fit.history.events]
     true = [event for event in track.motion.events if event < track.times[-1]]
@@ -95,7 +94,7 @@ def measure(name: str, noise: simulated.Noise, seed: int) -> dict[str, Any]:
         "still": still(track),
         "inside": float((error <= half).mean()),
         "width": float(half[-1]),
-        "flagged": band.predictable_until is not None and bool(band.predictable_until < track.later[-1]),
+        "flagged": scoring.flagged(band, track.later[-1]),
         "widest": float(half.max()),
         "event": bool(found),
         "true": len(true),
@@ -162,8 +161,8 @@ def text(row: dict[str, Any]) -> str:
 
 def overall(found: list[dict[str, Any]]) -> dict[str, float]:
     """Coverage, quality of the flag, and found events, over all tracks of a noise."""
-    bad = [row["flagged"] for row in found if row["error"] > BAD]
-    good = [row["flagged"] for row in found if row["error"] <= BAD]
+    bad = [row["flagged"] for row in found if row["error"] > scoring.BAD]
+    good = [row["flagged"] for row in found if row["error"] <= scoring.BAD]
     smooth = [row["event"] for row in found if row["true"] == 0]
     return {
         "tracks": len(found),

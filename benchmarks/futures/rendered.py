@@ -37,9 +37,8 @@ from r5dgs_core.render import warm_up
 from r5dgs_core.scene.scene import Scene
 from r5dgs_core.train import run
 
-from . import rendered_scenes
+from . import rendered_scenes, scoring
 
-BAD = 20.0  # error of a failure, % of the size
 SETTINGS = (  # small images need few Gaussians
     "train.iterations=1000",
     "train.probe_every=0",
@@ -87,12 +86,11 @@ def later_errors(body: Body, times: np.ndarray, places: np.ndarray, turns: np.nd
     """
     band = body.group.history.band
     assert band is not None
-    turned = body.size * np.sin(0.5 * np.radians(turns)) if body.turn_seen else 0.0
-    until = band.predictable_until
+    angles = np.radians(turns) if body.turn_seen else 0.0
     return {
-        "errors": (100 / body.size * np.sqrt(places**2 + 2 / 3 * turned**2)).tolist(),
-        "half_widths": (100 / body.size * band.widths(times)).tolist(),
-        "flagged": until is not None and bool(until < times[-1]),
+        "errors": scoring.surface_error(places, angles, body.size).tolist(),
+        "half_widths": scoring.half_widths(band, times, body.size).tolist(),
+        "flagged": scoring.flagged(band, times[-1]),
     }
 
 
@@ -101,13 +99,14 @@ def coverage(rows: list[dict[str, Any]]) -> str:
     bodies = [one for row in rows for one in row["objects"]]
     errors, half = (np.concatenate([one[key] for one in bodies]) for key in ("errors", "half_widths"))
     widths = np.array([one["half_widths"][-1] for one in bodies])
-    failed = np.array([one["errors"][-1] > BAD for one in bodies])
+    failed = np.array([one["errors"][-1] > scoring.BAD for one in bodies])
     flagged = np.array([one["flagged"] for one in bodies])
+    alarms = (~failed & flagged).sum()
     return (
         f"{len(errors)} body-times, {100 * np.mean(errors <= half):.1f} % inside the band; half width at t = 1: median "
         f"{np.median(widths):.1f} %, 90 % quantile {np.quantile(widths, 0.9):.1f} % of the size\n"
-        f"{len(bodies)} bodies, {failed.sum()} with an error above {BAD:g} % at t = 1, {(failed & flagged).sum()} of "
-        f"them flagged; {(~failed & flagged).sum()} of the other {(~failed).sum()} flagged"
+        f"{len(bodies)} bodies, {failed.sum()} with an error above {scoring.BAD:g} % at t = 1, "
+        f"{(failed & flagged).sum()} of them flagged; {alarms} of the other {(~failed).sum()} flagged"
     )
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from . import scoring
 from . import simulated_events as events
 from . import simulated_motions as motions
 from .simulated_motions import POSES, RADIUS, T_MAX, Maker, Motion, box_inertia, grid, turned
@@ -126,6 +127,5 @@ def draw(name: str, noise: Noise, seed: int, poses: int = POSES) -> Draw:
 
 def errors(places: np.ndarray, turns: Rotation, truth: Draw) -> np.ndarray:
     """Root mean square error over the surface of the body's ball at the later times, in % of its size. [H]"""
-    angle = (turns * truth.true_turns.inv()).magnitude()
-    turned = 2 / 3 * (2 * RADIUS * np.sin(0.5 * angle)) ** 2
-    return 50 / RADIUS * np.sqrt(((places - truth.true_places) ** 2).sum(-1) + turned)
+    distances = np.linalg.norm(places - truth.true_places, axis=-1)
+    return scoring.surface_error(distances, (turns * truth.true_turns.inv()).magnitude(), 2 * RADIUS)

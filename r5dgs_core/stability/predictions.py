@@ -8,8 +8,8 @@ import math
 import numpy as np
 
 from ..motion import models, rotations
-from ..motion_fit import model_selection
-from .cases import ROUNDING, Case, largest, model_of
+from ..motion_fit import band, model_selection
+from .cases import RADIUS, ROUNDING, Case, largest, model_of
 from .scenes import DIAGONAL, T_MAX, TIMES
 
 _RATES = {"velocity": [0.5, 0, 1], "acceleration": [0, 0, -6], "angular_velocity": [1, 2, -3]}
@@ -41,27 +41,45 @@ def _many_bounces(restitution: float) -> float:
     return max(float(floor - d[:, 2].min()), 0.0)
 
 
-def _broken(left: int, events: int) -> float:
-    """Error, in radii, a quarter of the span past t_max, of bodies that were hit with this many poses left.
-
-    The hits are closer together than a time step.
-    """
-    step = TIMES[1] - TIMES[0]
-    at = TIMES[-left] - 0.5 * step
+def _hits(events: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Places of a body without spin that is hit at each event. [T, 3]"""
     velocities = [-0.6 * DIAGONAL, 1.5 * np.array([1.0, 0, 0]), np.array([0, 0.8, 0.3])]
-    times = at + 0.2 * step * np.arange(events)
-    bounds = np.r_[-np.inf, times, np.inf]
-    chosen = [velocities[0], *velocities[3 - events :]]
+    bounds = np.r_[-np.inf, events, np.inf]
+    chosen = [velocities[0], *velocities[3 - len(events) :]]
+    at = events[0]
+    spans = [np.clip(t, low, high) - np.clip(at, low, high) for low, high in zip(bounds, bounds[1:], strict=False)]
+    return sum((span[:, None] * v for span, v in zip(spans, chosen, strict=True)), np.zeros((len(t), 3)))
 
-    def place(t: np.ndarray) -> np.ndarray:
-        spans = [np.clip(t, low, high) - np.clip(at, low, high) for low, high in zip(bounds, bounds[1:], strict=False)]
-        return sum((span[:, None] * v for span, v in zip(spans, chosen, strict=True)), np.zeros((len(t), 3)))
 
-    path = place(TIMES)
-    fit = model_selection.fit(TIMES, rotations.identity(len(TIMES)), path - path[-1], radius=0.3)
-    later = 0.25 * T_MAX
-    _, d = models.evaluate(fit.model, np.array([later]))
-    return largest(d - (place(np.array([T_MAX + later])) - path[-1])) / 0.3
+def _miss(events: np.ndarray, poses: int, until: float | None) -> float:
+    """Error of the prediction of the last poses, in radii.
+
+    Args:
+        events: Times of the hits, each in a gap between poses.
+        poses: Number of the poses.
+        until: Time of the prediction; None for the last time at which the motion counts as predictable, at most a
+            quarter of the span past t_max.
+    """
+    times = TIMES[-poses:]
+    path = _hits(events, times)
+    fit = model_selection.fit(times, rotations.identity(poses), path - path[-1], radius=RADIUS)
+    if until is None:
+        assert fit.history.band is not None
+        until = min(fit.history.band.predictable_until or math.inf, 1.25 * T_MAX)
+    _, d = models.evaluate(fit.model, np.array([until - T_MAX]))
+    return largest(d - (_hits(events, np.array([until])) - path[-1])) / RADIUS
+
+
+def _broken(left: int, count: int) -> float:
+    """Error of a body that was hit with this many poses left; several hits are closer together than a time step."""
+    step = TIMES[1] - TIMES[0]
+    return _miss(TIMES[-left] - 0.5 * step + 0.2 * step * np.arange(count), len(TIMES), 1.25 * T_MAX)
+
+
+def _two_poses_each(count: int) -> float:
+    """Error, while the motion counts as predictable, of a body with two poses before, between and after its hits."""
+    step = TIMES[1] - TIMES[0]
+    return _miss(TIMES[-2 * count :: 2] - 0.5 * step, 2 * count + 2, None)
 
 
 CASES: tuple[Case, ...] = (
@@ -112,5 +130,17 @@ CASES: tuple[Case, ...] = (
             functools.partial(_broken, left, count),
         )
         for left, count in ((2, 1), (3, 1), (5, 2))
+    ),
+    *(
+        Case(
+            "breaks",
+            f"{count + 1} segments of two poses, while predictable",
+            "motion_fit.model_selection.fit",
+            "error / radius",
+            band.WIDE,
+            "half width of the band above which a motion is not predictable",
+            functools.partial(_two_poses_each, count),
+        )
+        for count in (1, 2)
     ),
 )

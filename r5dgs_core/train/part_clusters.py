@@ -43,7 +43,7 @@ def find(paths: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> np
         return None
     middle = np.median(paths[:, 0], axis=0)
     size = float(np.quantile(np.linalg.norm(paths[:, 0] - middle, axis=1), 0.9))
-    for tolerance in TOLERANCES:  # residuals blur the border of parts that turn little against each other
+    for tolerance in TOLERANCES:  # a wide tolerance joins parts that hardly move against each other
         labels = motion_clusters.find(paths[:, 1:], weights, tolerance * size, fewest, rng)
         if labels.max() > 0:
             break
