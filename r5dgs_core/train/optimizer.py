@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..config.config import Config
 from ..errors import CheckpointError, TrainingError
+from .representations.representation import TRACKS
 
 GEOMETRY = ("means", "translations", "rotvecs", "light", "slope", "residual")
 NETWORKS = ("field", "trd")
@@ -27,6 +28,10 @@ class LearningRates:
     def __init__(self, config: Config, constant: Mapping[str, float]):
         self._config = config
         self._constant = constant
+        alone, entered = config.curriculum.steps(config.train.iterations)
+        tracks = config.train.representation == TRACKS
+        # The images of one time do not show the light, and those of a few times explain turns as shading.
+        self._begins = {"light": alone, "shading": entered} if tracks else {}
 
     def initial(self, name: str) -> float:
         """Return the rate at the first step."""
@@ -38,6 +43,8 @@ class LearningRates:
         rates, base = self._config.rates, self.initial(name)
         name = name.partition(".")[0]
         if name == "shading" and not self._config.train.shading:
+            return 0.0
+        if iteration < self._begins.get(name, 0):
             return 0.0
         progress = iteration / self._config.train.iterations
         begin = self._config.residual.start if name == "residual" else rates.decay_from  # residuals start late

@@ -53,7 +53,9 @@ def shared_starts():
     def shared(views, config, motion, find_sky, rng, cloud=None):
         if any(view.mask is None for view in views) or len({view.t for view in views}) == 1:
             return start(views, config, motion, find_sky, rng, cloud)
-        settings = (config.init, config.curriculum, config.train.sh_degree, config.train.shadows, motion.name)
+        train = config.train
+        shown = (train.sh_degree, train.shadows, train.shading, train.representation)
+        settings = (config.init, config.curriculum, shown, motion.name)
         given = (views, settings, find_sky, rng.bit_generator.state, cloud)
         key = hashlib.sha1(pickle.dumps(given)).digest()
         if key not in made:

@@ -76,6 +76,7 @@ class InitSection:
         shadow_points: Gaussians per shadow.
         sweep_depths: Depths per ray that the plane sweep compares.
         opacity: Initial opacity of objects and background.
+        shading: Length of the initial shading vectors of objects with tracks, which point outwards as on a lit ball.
         min_mask_pixels: Minimum size of a mask that is used to locate an object, as a share of the image's pixels.
     """
 
@@ -85,6 +86,7 @@ class InitSection:
     shadow_points: int = 60
     sweep_depths: int = 96
     opacity: float = 0.25
+    shading: float = 0.3
     min_mask_pixels: float = 5e-4
 
 

@@ -15,7 +15,7 @@ from ...config.config import Config
 from ...config.sections.training import InitSection
 from ...model.gaussians import Gaussians
 from ...scene.sampling import spread
-from ..representations.representation import Representation
+from ..representations.representation import TRACKS, Representation
 from ..train_views import TrainView, by_camera, nearest_knot
 from . import background_images, evidence, place_gaussians, plane_sweep, scatter, shadows, triangulation, visual_hull
 
@@ -38,6 +38,7 @@ class FirstTracks:
         casters: Body that each shadow group follows. [W]
         plane_normal: Unit normal of the supporting plane, or None. [3]
         slope: Shift of a shadow along the plane per unit that its caster rises. [3]
+        light: Unit direction to the light. [3]
     """
 
     times: np.ndarray
@@ -46,6 +47,7 @@ class FirstTracks:
     casters: np.ndarray
     plane_normal: np.ndarray | None
     slope: np.ndarray
+    light: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -139,16 +141,19 @@ def start(
     log.info("background: %d points from %d cameras; %d objects", len(where), len(backgrounds), len(clouds))
     parts = [place_gaussians.solid([*clouds, (where, shade, 0)], init.opacity)]
     casters, slope = np.zeros(0, np.int64), np.zeros(3)
+    to_light = np.array([0.0, 0.0, 1.0]) if plane is None else plane[0]
     if plane is not None and config.train.shadows and init.shadow_points > 0 and motion.moves:
         casters = np.arange(1, len(centers))
         light = shadows.find_light(views, backgrounds, places, times, plane, rng)
-        slope = shadows.slope(light.direction, plane[0])
+        slope, to_light = shadows.slope(light.direction, plane[0]), -light.direction
         log.info("light travels along %s (darkening %.3f)", np.round(light.direction, 2), light.darkening)
         for body in casters:
             known, group = (centers[body], float(places.radii[body - 1])), len(centers) + int(body) - 1
             parts.append(place_gaussians.shadow(*known, light.direction, plane, group, init.shadow_points, rng))
     gaussians = place_gaussians.gaussians_of(parts, config.train.sh_degree)
-    tracks = FirstTracks(times, centers, translations, casters, None if plane is None else plane[0], slope)
+    if motion.moves and config.train.shading and config.train.representation == TRACKS:
+        place_gaussians.shade_outwards(gaussians, centers, init.shading)
+    tracks = FirstTracks(times, centers, translations, casters, None if plane is None else plane[0], slope, to_light)
     ids = np.concatenate([[0], places.object_ids])
     seen = evidence.gather(views, places, times)
     return InitialState(gaussians, tracks, ids, places, first, plane, placed.sky, seen)

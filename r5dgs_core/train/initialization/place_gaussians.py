@@ -120,6 +120,21 @@ def gaussians_of(parts: Sequence[SeedPoints], sh_degree: int) -> Gaussians:
     )
 
 
+def shade_outwards(gaussians: Gaussians, centers: np.ndarray, length: float) -> None:
+    """Give the Gaussians of bodies shading vectors that point away from the centre, as on a ball.
+
+    Args:
+        gaussians: Canonical Gaussians, changed in place.
+        centers: Centres of the bodies, row 0 for the pinned group. [B, 3]
+        length: Length of the vectors.
+    """
+    ids = gaussians.motion_ids
+    bodies = (ids > 0) & (ids < len(centers))
+    with torch.no_grad():
+        ways = gaussians.means[bodies] - torch.from_numpy(centers).float()[ids[bodies]]
+        gaussians.shading[bodies] = length * torch.nn.functional.normalize(ways, dim=1)
+
+
 def thin(gaussians: Gaussians, cap: int, rng: np.random.Generator) -> Gaussians:
     """Keep ``cap`` Gaussians: the same share of every motion group, and at least one of each if possible.
 

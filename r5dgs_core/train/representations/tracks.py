@@ -39,7 +39,7 @@ class TracksRepresentation(Representation):
 
     def __init__(self, start: initialize.InitialState, config: Config):
         self.tracks = first_tracks(start.tracks)
-        self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
+        self.light = torch.from_numpy(start.tracks.light).float().requires_grad_(True)
         self._places = start.places
         self._absent = start.evidence.absent
         self._stiffness = tuple(

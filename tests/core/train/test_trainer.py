@@ -151,6 +151,30 @@ def test_times_enter_from_the_first_one_outwards_until_all_are_in(tiny):
     assert seen[-1] == (0, 5) and len(set(seen)) > 2
 
 
+def test_shading_starts_as_on_a_ball_and_is_trained_once_all_times_have_entered(tiny):
+    trainer = make(tiny, "train.iterations=100", "densify.start=1000")
+    centers, ids = trainer.motion.tracks.centers, trainer.gaussians.motion_ids
+    bodies = (ids > 0) & (ids < len(centers))
+    ways = trainer.gaussians.means.detach() - centers[ids.clamp(max=len(centers) - 1)]
+    expected = torch.where(bodies[:, None], 0.3 * torch.nn.functional.normalize(ways, dim=1), 0.0)
+    light = trainer.motion.light.detach().clone()
+    while trainer.curriculum.entered == (trainer.first_time,) * 2:
+        assert torch.allclose(trainer.gaussians.shading, expected, atol=1e-6)
+        assert torch.equal(trainer.motion.light, light)
+        trainer.step()
+    for _ in range(trainer.iteration, trainer.config.curriculum.steps(100)[1]):
+        assert torch.allclose(trainer.gaussians.shading, expected, atol=1e-6)
+        trainer.step()
+    assert trainer.curriculum.entered == (0, 5)
+    trainer.step()
+    assert (trainer.gaussians.shading != expected).any(1)[bodies].float().mean() > 0.5
+
+
+def test_objects_without_shading_and_fields_start_with_constant_colours(tiny):
+    for override in ("train.shading=false", "train.representation='field'", "init.shading=0"):
+        assert not make(tiny, override).gaussians.shading.any()
+
+
 def test_background_seen_by_a_single_camera_keeps_its_position(tiny):
     trainer = make(tiny, "densify.start=1000")
     means = trainer.gaussians.params["means"]
