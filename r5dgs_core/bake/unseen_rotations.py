@@ -23,7 +23,8 @@ from ..motion import rotations
 TEXTURE = 0.22  # share of the contrast above which a texture is seen; 0.14 for plain balls, 0.33 and more with texture
 ROUND = 0.92  # smallest ratio of two axes of the ellipsoid that count as equal
 ROUNDS = 15  # number of fits with new weights
-HEIGHTS = 10  # number of heights along an axis between which colours are interpolated
+LIGHT = 4  # number of polynomials for the brightness and the direction of the light at a time: constant, x, y, z
+HEIGHTS = 20  # number of heights along an axis between which colours are interpolated
 DARKEST = 0.02  # smallest colour, because shade is fitted to logarithms
 MIN_PIXELS_PER_COEFFICIENT = 3  # minimum number of pixels per coefficient of a fit
 
@@ -116,24 +117,39 @@ def _ellipsoid(surfaces: Sequence[Surface]) -> tuple[np.ndarray, np.ndarray] | N
 
 
 def _texture(surfaces: Sequence[Surface], axis: np.ndarray | None) -> float:
-    """Return the share of the contrast that shade, and colours by the height along an axis, do not explain."""
+    """Return the share of the contrast that shade, and colours by the height along an axis, do not explain.
+
+    Shade is one smooth function of the direction at all times, but the brightness of the light and its direction may
+    change with the place. Coarse texture is smooth as well; it turns with the body, so no such function fits all times.
+    """
     rest, contrast = 0.0, 0.0
-    for surface in surfaces:
-        columns = _smooth(surface.directions)
-        if axis is not None:
-            heights = surface.directions @ rotations.rotate(surface.turn, axis)
-            columns = np.concatenate([columns, _interpolation(heights)], axis=1)
-        if len(columns) < MIN_PIXELS_PER_COEFFICIENT * columns.shape[1]:
-            continue
-        colors = np.maximum(surface.colors, DARKEST)
-        logs = np.log(colors)
-        for channel in range(3):
-            # The weights make the errors those of the colours themselves.
-            weighted = columns * colors[:, channel, None]
-            fit = np.linalg.lstsq(weighted, logs[:, channel] * colors[:, channel], rcond=1e-6)[0]
-            rest += float(((columns @ fit - logs[:, channel]) ** 2 * colors[:, channel] ** 2).mean())
-        contrast += float(colors.var(axis=0).sum())
+    parts = [_columns(surface, axis) for surface in surfaces]
+    parts = [part for part in parts if len(part[0]) >= MIN_PIXELS_PER_COEFFICIENT * (LIGHT + part[2].shape[1])]
+    for channel in range(3):
+        common, wanted = [], []
+        for colors, light, shade in parts:
+            # The weights make the errors those of the colours themselves, and all times count the same.
+            weights = colors[:, channel, None] / math.sqrt(len(colors))
+            both = weights * np.concatenate([shade, np.log(colors[:, channel, None])], axis=1)
+            both -= weights * light @ np.linalg.lstsq(weights * light, both, rcond=1e-6)[0]
+            common.append(both[:, :-1])
+            wanted.append(both[:, -1])
+            contrast += float(colors[:, channel].var())
+        if parts:
+            columns, target = np.concatenate(common), np.concatenate(wanted)
+            fit = np.linalg.lstsq(columns, target, rcond=1e-6)[0]
+            rest += float(((columns @ fit - target) ** 2).sum())
     return math.sqrt(rest / contrast) if contrast > 0 else 1.0
+
+
+def _columns(surface: Surface, axis: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return colours [P, 3], and the functions that fit a time alone [P, LIGHT] and all times together. [P, K]"""
+    smooth = _smooth(surface.directions)
+    light, shade = smooth[:, :LIGHT], smooth[:, LIGHT:]
+    if axis is not None:
+        heights = surface.directions @ rotations.rotate(surface.turn, axis)
+        shade = np.concatenate([shade, _interpolation(heights)], axis=1)
+    return np.maximum(surface.colors, DARKEST), light, shade
 
 
 def _smooth(d: np.ndarray) -> np.ndarray:

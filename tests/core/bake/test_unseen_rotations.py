@@ -52,6 +52,11 @@ def patched(d):
     return draw.uniform(0.1, 0.9, (14, 3))[(d @ (seeds / np.linalg.norm(seeds, axis=1, keepdims=True)).T).argmax(1)]
 
 
+def coarse(d):
+    """Colours that change so slowly that at one time they could be shade."""
+    return 0.5 + 0.15 * np.sin(2 * d @ np.array([[1.0, 0.3, 0.0], [0.2, 0.8, 0.5], [0.0, -0.6, 1.0]]) + [0.5, 1.0, 2.0])
+
+
 @pytest.mark.parametrize("cut", [0.0, 0.3])
 def test_a_plain_ball_shows_no_rotation(cut):
     found = unseen_rotations.find(surfaces((1, 1, 1), plain, cut=cut))
@@ -97,3 +102,9 @@ def test_without_spin_the_axis_and_the_centre_move_as_before():
     pointed = [rotations.rotate(p[:, :4], np.broadcast_to(AXIS, (9, 3))) for p in (poses, found)]
     np.testing.assert_allclose(pointed[1], pointed[0], atol=1e-12)
     assert np.abs(found[:, 1:4] @ AXIS).max() < 1e-12
+
+
+def test_coarse_texture_is_seen_once_it_turns():
+    moving = surfaces((1, 1, 1), coarse)
+    assert unseen_rotations.find(moving) is None
+    assert unseen_rotations.find(moving[:1] * 4) is not None
