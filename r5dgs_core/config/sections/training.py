@@ -48,7 +48,7 @@ class TrainSection:
     probe_views: int = 5
     shading: bool = True
     shadows: bool = True
-    repair: bool = False
+    repair: bool = True
 
 
 @dataclass(frozen=True)
