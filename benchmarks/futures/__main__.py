@@ -4,6 +4,7 @@
 
     accuracy  error, confidence band, events and run time of the fit, for each kind of motion
     rendered  tracks and predictions of scenes that are rendered, trained and baked
+    textures  textures of a ball that count as seen
 
 Results: docs/results/predicted_motion.md.
 """

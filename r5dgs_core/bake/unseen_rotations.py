@@ -80,13 +80,13 @@ def find(surfaces: Sequence[Surface]) -> Unseen | None:
         return None
     lengths, axes = found  # ascending
     if lengths[0] >= ROUND * lengths[2]:
-        texture = _texture(surfaces, None)
+        texture = texture_share(surfaces, None)
         return Unseen(np.eye(3), texture) if texture <= TEXTURE else None
     pairs = lengths[:2] / lengths[1:]
     axis = axes[:, 2 if pairs[0] > pairs[1] else 0]
     if pairs.max() < ROUND:
         return None
-    texture = _texture(surfaces, axis)
+    texture = texture_share(surfaces, axis)
     return Unseen(axis[None], texture) if texture <= TEXTURE else None
 
 
@@ -116,7 +116,7 @@ def _ellipsoid(surfaces: Sequence[Surface]) -> tuple[np.ndarray, np.ndarray] | N
     return np.sqrt(np.maximum(values, 0.0)), axes
 
 
-def _texture(surfaces: Sequence[Surface], axis: np.ndarray | None) -> float:
+def texture_share(surfaces: Sequence[Surface], axis: np.ndarray | None) -> float:
     """Return the share of the contrast that shade, and colours by the height along an axis, do not explain.
 
     Shade is one smooth function of the direction at all times, but the brightness of the light and its direction may

@@ -34,6 +34,7 @@ PROGRAMS = {
     "training.network_playback": ("{field}", "--turns", "1"),
     "training.curve": ("{data}", "--iterations", "10", *SHORT),
     "raster.workloads": ("--workloads", "W0"),
+    "futures.textures": ("--seeds", "1"),
     "words": ("--encoder", "{encoder}"),
 }
 LONG = (  # more than five seconds each
@@ -41,6 +42,7 @@ LONG = (  # more than five seconds each
     "association.synthetic",
     "extrapolation.appearance",
     "extrapolation.modes",
+    "futures.textures",
     "raster.first_frame",
     "training.curve",
     "training.held_out_times",
