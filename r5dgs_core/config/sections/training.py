@@ -76,7 +76,8 @@ class InitSection:
         shadow_points: Gaussians per shadow.
         sweep_depths: Depths per ray that the plane sweep compares.
         opacity: Initial opacity of objects and background.
-        shading: Length of the initial shading vectors of objects with tracks, which point outwards as on a lit ball.
+        shading: Length of the shading vectors of objects with tracks until all times take part; they point outwards, as
+            on a lit ball.
         min_mask_pixels: Minimum size of a mask that is used to locate an object, as a share of the image's pixels.
     """
 

@@ -156,9 +156,17 @@ class TracksRepresentation(Representation):
                 shifts[row, knot] = shifts[row, near] + torch.from_numpy(path[knot] - path[near]).float()
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
-        """Fold learned rotations into the base rotations every `REBASE_EVERY` steps."""
+        """Fold learned rotations into the base rotations every `REBASE_EVERY` steps; end the shading of a ball.
+
+        The assumed shading helps the rotations while times enter. It is then removed, because past t_max it would
+        extrapolate what the images have not shown.
+        """
         if iteration % REBASE_EVERY == 0:
             self.tracks.rebase()
+        config = self._config.train
+        if config.representation == TRACKS and iteration == self._config.curriculum.steps(config.iterations)[1]:
+            with torch.no_grad():
+                gaussians.shading.zero_()
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tracks by ``tracks.NAME``, the light direction, and the residuals if there are any."""
