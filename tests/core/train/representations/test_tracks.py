@@ -30,7 +30,9 @@ def truth(t):
 def make(measured, absent=None, first=3, path=None):
     """One body that starts at knot ``first``; its path is known from masks where ``measured``, straight elsewhere."""
     count = len(TIMES)
-    tracks = initialize.FirstTracks(TIMES, np.zeros((2, 3)), np.zeros((2, count, 3)), np.array([1]), None, np.zeros(3), np.array([0.0, 0, 1]))
+    tracks = initialize.FirstTracks(
+        TIMES, np.zeros((2, 3)), np.zeros((2, count, 3)), np.array([1]), None, np.zeros(3), np.array([0.0, 0, 1])
+    )
     centers = np.asarray(path if path is not None else [truth(t)[0] for t in TIMES])[None]
     places = triangulation.ObjectPositions(
         np.array([1]),
