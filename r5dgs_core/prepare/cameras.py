@@ -12,6 +12,7 @@ import numpy as np
 from .. import errors
 from ..capture.calibration import reading
 from ..capture.calibration.calibration import CalibratedCamera, CalibratedFrame, Calibration
+from ..capture.reconstruction import gauge
 from . import camera_source, frame_times, names, source_files
 from .camera_source import FRAME_RATE, CameraSource
 
@@ -44,20 +45,28 @@ class Camera:
         return self.poses[int(np.searchsorted(self.usable, index))].camera_to_world
 
 
-def open_all(source: Path, calibration_path: Path | None, rate: float | None) -> tuple[list[Camera], Calibration]:
+def open_all(
+    source: Path,
+    calibration_path: Path | None,
+    rate: float | None,
+    up: str | None = None,
+    meters_per_unit: float | None = None,
+) -> tuple[list[Camera], Calibration]:
     """Open the cameras of a source and their calibration.
 
     Args:
         source: Folder of videos or frames, or one video.
         calibration_path: File or folder of the calibration; that in the source's folder if None.
         rate: Frames per second of recordings without usable times, or None.
+        up: Up of the world that replaces that of the calibration (`gauge.upright`), or None.
+        meters_per_unit: Scale of the world that replaces that of the calibration, or None.
 
     Raises:
         DatasetError: A file is missing or damaged, or the calibration does not fit the cameras.
         BackendError: A package is missing.
     """
     source = Path(source)
-    calibration = _calibration(source, calibration_path)
+    calibration = _adjusted(_calibration(source, calibration_path), up, meters_per_unit)
     opened: list[tuple[CameraSource, CalibratedCamera]]
     try:
         files = source_files.find(source)
@@ -69,11 +78,22 @@ def open_all(source: Path, calibration_path: Path | None, rate: float | None) ->
         opened = [(_of_calibration(camera, calibration, rate), camera) for camera in listed]
     else:
         opened = [(camera_source.open_camera(camera, rate), matched[camera.name]) for camera in files]
+    sources = _timed(source, [one for one, _ in opened], rate)
+    return [_with_poses(one, camera) for one, (_, camera) in zip(sources, opened, strict=True)], calibration
+
+
+def open_sources(source: Path, rate: float | None) -> list[CameraSource]:
+    """Open the recordings of a source without a calibration."""
+    files = source_files.find(Path(source))
+    return _timed(Path(source), [camera_source.open_camera(camera, rate) for camera in files], rate)
+
+
+def _timed(source: Path, sources: list[CameraSource], rate: float | None) -> list[CameraSource]:
+    """Return recordings with the times of ``timestamps.csv``, if there is one."""
     folder = source if source.is_dir() else source.parent
     if (folder / frame_times.FILE).is_file() and rate is None:
-        sources = frame_times.apply([one for one, _ in opened], folder / frame_times.FILE)
-        opened = [(one, camera) for one, (_, camera) in zip(sources, opened, strict=True)]
-    return [_with_poses(one, camera) for one, camera in opened], calibration
+        return frame_times.apply(sources, folder / frame_times.FILE)
+    return sources
 
 
 def _calibration(source: Path, path: Path | None) -> Calibration:
@@ -83,9 +103,15 @@ def _calibration(source: Path, path: Path | None) -> Calibration:
     if reading.find_calibration(folder) is None:
         raise errors.DatasetError(
             f"{folder}: expected the cameras' calibration among the recordings, found none. Remedy: name its file or "
-            "folder with --calibration (docs/user/your_data.md lists the formats)"
+            "folder with --calibration (docs/reference/calibrations.md lists the formats)"
         )
     return reading.read_calibration(folder)
+
+
+def _adjusted(calibration: Calibration, up: str | None, meters_per_unit: float | None) -> Calibration:
+    if up is not None:
+        calibration = gauge.upright(calibration, up)
+    return calibration if meters_per_unit is None else replace(calibration, meters_per_unit=meters_per_unit)
 
 
 def _matched(calibration: Calibration, recordings: Sequence[str]) -> dict[str, CalibratedCamera]:

@@ -11,6 +11,7 @@ from .cameras import Camera
 from .clock import Offset
 from .data_splits import HoldOut, Timeline
 from .frame_choice import Choice, Window
+from .unknown_cameras import UnknownCameras
 
 IMAGES = "images"
 
@@ -31,6 +32,9 @@ class Request:
         offsets: Known offsets of clocks by camera, seconds.
         rate: Frames per second of recordings without usable times.
         overwrite: Replace a data set that was prepared with other settings.
+        unknown: What is known about cameras without a calibration.
+        up: Up of the world (`gauge.upright`), or None for that of the calibration.
+        meters_per_unit: Length of a unit of the world, or None for that of the calibration.
     """
 
     source: Path
@@ -44,6 +48,9 @@ class Request:
     offsets: dict[str, float] = field(default_factory=dict)
     rate: float | None = None
     overwrite: bool = False
+    unknown: UnknownCameras = field(default_factory=UnknownCameras)
+    up: str | None = None
+    meters_per_unit: float | None = None
 
 
 @dataclass(frozen=True)

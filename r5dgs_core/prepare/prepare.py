@@ -14,7 +14,7 @@ from typing import Any
 from .. import errors, folder_lock
 from ..capture.calibration.calibration import Calibration
 from ..data import images
-from . import cameras, capture_file, clocks, data_splits, frame_choice, image_size, record, rectify
+from . import cameras, capture_file, clocks, data_splits, frame_choice, image_size, record, rectify, unknown_cameras
 from .cameras import Camera
 from .frame_choice import Choice
 from .plan import IMAGES, Plan, Request
@@ -40,8 +40,21 @@ def prepare(request: Request, progress: Progress) -> Plan:
         raise errors.ConfigError(
             f"--out {request.out}: is among the recordings; name a folder outside {request.source}"
         )
+    file = request.calibration
+    if unknown_cameras.missing(request.source, file):
+        with folder_lock.hold(out):
+            file = unknown_cameras.reconstruct(
+                request.source,
+                out,
+                request.unknown,
+                request.up,
+                rate=request.rate,
+                again=request.overwrite,
+                progress=progress,
+            )
     progress({"event": "read", "text": "recordings and calibration"})
-    opened, calibration = cameras.open_all(request.source, request.calibration, request.rate)
+    up = request.up if file == request.calibration else None  # a reconstruction is upright
+    opened, calibration = cameras.open_all(request.source, file, request.rate, up, request.meters_per_unit)
     with folder_lock.hold(out):
         known = _begin(request, opened, calibration, out)
         plan = _plan(request, opened, calibration, known, progress)
@@ -56,7 +69,8 @@ def _begin(request: Request, opened: list[Camera], calibration: Calibration, out
     """Return the record of a run with the same input, or None; with ``overwrite``, remove that of another run."""
     present = capture_file.read(out)
     if present is None:
-        foreign = [path.name for path in out.iterdir() if path.name != folder_lock.LOCK_FILE]
+        own = {folder_lock.LOCK_FILE, unknown_cameras.FILE}
+        foreign = [path.name for path in out.iterdir() if path.name not in own]
         if foreign:
             raise errors.DatasetError(
                 f"{out}: expected an empty folder or a prepared data set, found {foreign[0]}; name another folder"

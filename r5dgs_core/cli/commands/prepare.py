@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ...prepare.plan import Plan
 
 NAME = "prepare"
-SHORT = "make a data set of videos or frames of calibrated cameras"
+SHORT = "make a data set of videos or frames"
 LONG = (
     "Make a data set of videos or folders of frames, one per camera: choose frames, compare clocks, undistort, make\n"
     "masks, and check the capture. Run the same command again to continue an interrupted one."
@@ -30,8 +30,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     p.add_argument("source", type=Path, help="folder with a video or a folder of frames per camera, or one video")
     p.add_argument("--out", type=Path, required=True, metavar="DATA", help="data set folder to write")
-    calibration = "file or folder of the cameras' calibration (default: found in the source)"
-    p.add_argument("--calibration", type=Path, metavar="FILE", help=calibration)
+    _add_cameras(p)
     start = "first time, in seconds from the first time at which all cameras record (default: 0)"
     p.add_argument("--start", type=options.not_negative, default=0.0, metavar="S", help=start)
     p.add_argument("--end", type=options.positive, metavar="S", help="last time in seconds (default: the last frame)")
@@ -52,6 +51,23 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--model", type=Path, metavar="DIR", help="folder of the weights of sam2")
     p.add_argument("--overwrite", action="store_true", help="replace a data set that was prepared with other settings")
     options.add_progress(p)
+
+
+def _add_cameras(p: argparse.ArgumentParser) -> None:
+    calibration = "file or folder of the cameras' calibration (default: found in the source, else reconstructed)"
+    p.add_argument("--calibration", type=Path, metavar="FILE", help=calibration)
+    board = "board that is carried through the views, to find the cameras with; see docs/reference/prepare.md"
+    p.add_argument("--board", metavar="KIND:COLUMNSxROWS:LENGTH:DETAIL:MARKERS", help=board)
+    p.add_argument("--lenses", type=Path, metavar="FILE", help="calibration whose lenses, but not poses, are used")
+    p.add_argument("--shared-lens", action="store_true", help="all cameras have the same lens and zoom")
+    moving = "this camera moves; may be repeated (a single camera always does)"
+    p.add_argument("--moving", action="append", default=[], metavar="CAMERA", help=moving)
+    distance = "distance between two cameras without a calibration, in metres"
+    p.add_argument("--distance", nargs=3, metavar=("CAMERA", "CAMERA", "M"), help=distance)
+    scale = "metres per unit of the cameras' world (default: that of the calibration)"
+    p.add_argument("--scale", type=options.positive, metavar="M", help=scale)
+    up = "up of the world: cameras, plane, board or a vector x,y,z (default: that of the calibration, else cameras)"
+    p.add_argument("--up", metavar="UP", help=up)
 
 
 def _add_hold_out(p: argparse.ArgumentParser) -> None:
@@ -87,6 +103,15 @@ def run(args: argparse.Namespace) -> None:
         offsets=_offsets(args.offset),
         rate=args.rate,
         overwrite=args.overwrite,
+        up=args.up,
+        meters_per_unit=args.scale,
+        unknown={
+            "board": args.board,
+            "moving": tuple(args.moving),
+            "shared_lens": args.shared_lens,
+            "lenses": args.lenses,
+            "distance": _distance(args.distance),
+        },
         masks=args.masks,
         model=args.model,
     )
@@ -98,6 +123,7 @@ def run_prepare(
     *,
     window: dict[str, Any] | None = None,
     hold_out: dict[str, Any] | None = None,
+    unknown: dict[str, Any] | None = None,
     masks: str = "none",
     model: Path | None = None,
     progress_kind: str = "none",
@@ -110,6 +136,7 @@ def run_prepare(
         out: Folder of the data set.
         window: Fields of `prepare.frame_choice.Window`.
         hold_out: Fields of `prepare.data_splits.HoldOut`.
+        unknown: Fields of `prepare.unknown_cameras.UnknownCameras`.
         masks: Folder of masks of the frames, "sam2" or "none".
         model: Folder of the SAM2 weights; that of the user's settings if None.
         progress_kind: Form of progress output (`progress.make`).
@@ -123,7 +150,7 @@ def run_prepare(
     if window.get("end") is not None and window["end"] <= window.get("start", 0.0):
         raise errors.UsageError(f"--end {window['end']:g}: expected a time after --start {window.get('start', 0.0):g}")
     input_paths.check_source(source)
-    from ...prepare import data_splits, frame_choice, plan, prepare
+    from ...prepare import data_splits, frame_choice, plan, prepare, unknown_cameras
     from ...progress import make
 
     request = plan.Request(
@@ -131,6 +158,7 @@ def run_prepare(
         out,
         window=frame_choice.Window(**window),
         hold_out=data_splits.HoldOut(**(hold_out or {})),
+        unknown=unknown_cameras.UnknownCameras(**(unknown or {})),
         **fields,
     )
     with make(progress_kind) as progress:
@@ -206,3 +234,13 @@ def _offsets(given: Sequence[str]) -> dict[str, float]:
         if not mark or not name:
             raise errors.UsageError(f"--offset {text}: expected a camera and milliseconds, such as cam0=12.5")
     return found
+
+
+def _distance(given: Sequence[str] | None) -> tuple[str, str, float] | None:
+    """Convert the arguments of --distance."""
+    if given is None:
+        return None
+    try:
+        return given[0], given[1], float(given[2])
+    except ValueError as error:
+        raise errors.UsageError(f"--distance: expected metres after two cameras, found {given[2]!r}") from error

@@ -182,9 +182,9 @@ def test_the_calibration_of_other_cameras_is_refused(capture, tmp_path):
     assert not (tmp_path / "data").exists()
 
 
-def test_a_missing_calibration_is_named_with_the_option(capture, tmp_path):
+def test_cameras_that_cannot_be_reconstructed_are_named_with_the_options(capture, tmp_path):
     shutil.copy(capture / "cam0.mp4", tmp_path)
-    with pytest.raises(errors.DatasetError, match="expected the cameras' calibration.*--calibration"):
+    with pytest.raises(errors.DatasetError, match="cam0.*Remedy: .*--board.*--calibration"):
         prepared(tmp_path, tmp_path.with_name("out"))
 
 

@@ -8,7 +8,18 @@ from types import ModuleType
 
 # Modules of this folder; the first that detects its files reads the path.
 MODULES = (
-    *("caliscope", "pose2sim", "anipose", "qualisys", "opencv_yaml", "panoptic", "nerfies", "nerfstudio", "llff"),
+    *(
+        "r5dgs_json",
+        "caliscope",
+        "pose2sim",
+        "anipose",
+        "qualisys",
+        "opencv_yaml",
+        "panoptic",
+        "nerfies",
+        "nerfstudio",
+        "llff",
+    ),
     "colmap",
 )
 
