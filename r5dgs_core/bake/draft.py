@@ -18,6 +18,7 @@ from ..scene.scene import MotionGroup, Scene
 from ..train import checkpoint, checkpoint_content, run_folder
 from ..train.normalization import Normalization
 from ..train.observed_motion import ObservedMotion
+from ..train.refinement import refined_dataset
 
 
 @dataclass(frozen=True)
@@ -27,14 +28,17 @@ class Context:
     Attributes:
         run: The run folder.
         state: Its last checkpoint.
-        dataset: The data set, without names if the objects were discovered.
+        dataset: The data set, with the corrections of the run's cameras; without names if the objects were
+            discovered.
         norm: Training coordinates to world coordinates.
+        given: The data set with the given cameras.
     """
 
     run: run_folder.Run
     state: checkpoint.Checkpoint
     dataset: Dataset
     norm: Normalization
+    given: Dataset
 
     @property
     def config(self) -> Config:
@@ -48,6 +52,15 @@ class Context:
     @property
     def tensors(self) -> dict[str, Tensor]:
         return self.state.tensors
+
+    def cameras(self, points: np.ndarray) -> dict[str, Any]:
+        """Return the record of the refinement of the cameras; empty if none was tried.
+
+        Args:
+            points: Points of the scene, world. [N, 3]
+        """
+        found = refined_dataset.corrections(self.given, self.tensors, self.norm)
+        return refined_dataset.record(self.given, self.tensors, found, points)
 
     @property
     def discovered(self) -> bool:

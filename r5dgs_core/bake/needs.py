@@ -15,6 +15,7 @@ from ..config.sections.needs import NeedsSection
 from ..motion import rotations
 from ..scene.scene import Classifier, MotionGroup
 from ..train.observed_motion import RegroupCounts
+from . import camera_needs
 from .draft import Context, Draft, Need
 
 STILL_QUAT = rotations.identity()
@@ -51,7 +52,8 @@ def apply(draft: Draft, context: Context) -> Draft:
         wanted=context.wanted,
     )
     on = {need.name: need.on for need in table}
-    scene = dataclasses.replace(scene, needs=(*(need.row() for need in table), *draft.parts))
+    cameras = camera_needs.rows(context.cameras(scene.gaussians.means), context.config)
+    scene = dataclasses.replace(scene, needs=(*(need.row() for need in (*table, *cameras)), *draft.parts))
     if not on["shading"]:
         scene = dataclasses.replace(scene, shading=None)
     if cloud.identities is not None and on["classifier"]:

@@ -29,6 +29,8 @@ def apply(draft: Draft, context: Context) -> Draft:
         },
         **_on_training_views(draft, context),
     }
+    if cameras := context.cameras(draft.scene.gaussians.means):
+        record["cameras"] = cameras
     cleaned = label_cleanup.changes_of(context.tensors)
     if cleaned is not None:
         record["label_hygiene"] = cleaned

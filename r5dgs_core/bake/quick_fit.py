@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from ..scene.scene import Scene
@@ -10,7 +12,7 @@ from . import assemble, read_checkpoint, simplify_motion
 
 
 def scene_of(run: run_folder.Run) -> Scene:
-    """Return a scene with the motion past t_max fitted to the trained poses alone.
+    """Return a scene with the motion past t_max fitted to the trained poses alone, and the record of its cameras.
 
     Compared with `bake.bake`, slight motion is not checked against the images, and the errors of the poses are unknown.
 
@@ -23,4 +25,5 @@ def scene_of(run: run_folder.Run) -> Scene:
     context = read_checkpoint.open_context(run, None)
     draft = assemble.draft(read_checkpoint.observe(context), context)
     observed = np.stack([group.observed for group in draft.observed.motion.groups])
-    return simplify_motion.simplify(draft.scene, observed, None, context.wanted).scene
+    scene = simplify_motion.simplify(draft.scene, observed, None, context.wanted).scene
+    return dataclasses.replace(scene, provenance={"cameras": context.cameras(scene.gaussians.means)})

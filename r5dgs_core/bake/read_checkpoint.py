@@ -12,6 +12,7 @@ from ..errors import CheckpointError
 from ..motion import rotations
 from ..train import checkpoint, run_folder
 from ..train.normalization import Normalization
+from ..train.refinement import refined_dataset
 from ..train.representations import registry
 from .draft import Cloud, Context, ObservedScene, is_discovered
 
@@ -27,7 +28,9 @@ def open_context(run: run_folder.Run, dataset: Dataset | None) -> Context:
     state = checkpoint.load(run.folder)
     if is_discovered(state):
         dataset = dataclasses.replace(dataset, object_names={}, object_aliases={})
-    return Context(run, state, dataset, Normalization(np.array(state.origin) - dataset.origin, state.scale))
+    norm = Normalization(np.array(state.origin) - dataset.origin, state.scale)
+    refined = refined_dataset.apply(dataset, refined_dataset.corrections(dataset, state.tensors, norm))
+    return Context(run, state, refined, norm, dataset)
 
 
 def observe(context: Context) -> ObservedScene:

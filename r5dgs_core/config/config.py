@@ -18,7 +18,15 @@ from .sections.densification import DensifyDefaultSection, DensifyMcmcSection, D
 from .sections.identity import IdentitySection
 from .sections.motion import DiscoverySection, FieldSection, ResidualSection
 from .sections.needs import NeedsSection
-from .sections.training import CurriculumSection, DataSection, InitSection, LossSection, RatesSection, TrainSection
+from .sections.training import (
+    CurriculumSection,
+    DataSection,
+    InitSection,
+    LossSection,
+    RatesSection,
+    RefineSection,
+    TrainSection,
+)
 
 _MAX_BYTES = 1 << 20  # maximum size of a configuration file
 
@@ -33,6 +41,7 @@ class Config:
     rates: RatesSection = dataclasses.field(default_factory=RatesSection)
     losses: LossSection = dataclasses.field(default_factory=LossSection)
     field: FieldSection = dataclasses.field(default_factory=FieldSection)
+    refine: RefineSection = dataclasses.field(default_factory=RefineSection)
     curriculum: CurriculumSection = dataclasses.field(default_factory=CurriculumSection)
     densify: DensifySection = dataclasses.field(default_factory=DensifySection)
     densify_default: DensifyDefaultSection = dataclasses.field(default_factory=DensifyDefaultSection)

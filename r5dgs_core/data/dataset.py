@@ -273,8 +273,12 @@ def load_rgba(view: View) -> np.ndarray:
 
 
 def load_image(view: View, background: np.ndarray | None = None) -> np.ndarray:
-    """Load the image of a view composited on a colour (sRGB [3], white if None). [H, W, 3] float32"""
-    return images.composite(load_rgba(view), background)
+    """Load the image of a view composited on a colour (sRGB [3], white if None). [H, W, 3] float32
+
+    The colours of a view with a correction are converted to those of the scene, and then not limited to 0 to 1.
+    """
+    image = images.composite(load_rgba(view), background)
+    return image if view.correction is None else view.correction.unseen(image)
 
 
 def load_mask(view: View) -> np.ndarray | None:

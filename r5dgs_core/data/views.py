@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import errors, findings
-from ..scene import cameras
+from ..scene import camera_correction, cameras
 from . import images, masks, transforms
 from .layouts.raw_dataset import RawDataset
 from .splits import SPLITS
@@ -29,6 +29,8 @@ class View:
         mask_colors: Object id of each packed colour, if masks are coded by colour.
         mask_unknown: Value of unknown pixels in the mask file.
         mask_video: Video within which the mask's ids are valid; "" if they are valid in the whole scene.
+        correction: Correction of the calibrated camera that ``camera`` and ``t`` contain, or None. The image is loaded
+            in the scene's colours.
     """
 
     name: str
@@ -40,6 +42,7 @@ class View:
     mask_colors: dict[int, int] | None = None
     mask_unknown: int = masks.UNKNOWN
     mask_video: str = ""
+    correction: camera_correction.Correction | None = None
 
 
 def make_views(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,14 @@ from ..errors import ConfigError
 from ..playback import scene_player
 from ..render import scene_renderer
 from ..scene import predictability
+from ..scene.camera_correction import Correction
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
-from . import ground_truth_poses, metrics, miou
+from . import alignment, ground_truth_poses, metrics, miou
 
 METRICS = (
     "psnr",
+    "psnr_aligned",
     "psnr_pooled",
     "psnr_objects",
     "ssim",
@@ -70,6 +72,7 @@ def evaluate(
     background: np.ndarray | None = None,
     backend: str = "auto",
     train: dict[str, Any] | None = None,
+    align: bool | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Measure a scene on the held-out views of a data set.
@@ -82,6 +85,7 @@ def evaluate(
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
         backend: Rasterizer.
         train: Cost of training: "seconds", "iterations", "gaussians".
+        align: True to measure with aligned cameras, too (`alignment`); None if the training has refined its cameras.
         progress: Called with the number of measured images and the total.
 
     Returns:
@@ -93,6 +97,10 @@ def evaluate(
     done = 0
     result: dict[str, Any] = {"scene": scene.name, "splits": {}, "objects": object_errors(scene, dataset.ground_truth)}
     result["horizon"] = predictability.horizon(scene)
+    corrections = None
+    if scene.provenance.get("cameras", {}).get("refined") if align is None else align:
+        held_out = [view for split in splits for view in dataset.views(split)]
+        corrections = alignment.corrections(scene, held_out, background, backend)
     for split in splits:
         result["splits"][split] = {}
         views = dataset.views(split)
@@ -110,6 +118,7 @@ def evaluate(
                 scene_player.Player(scene, mode).frame,
                 background=background,
                 backend=backend,
+                corrections=corrections,
                 measured=count,
             )
     given = train if train is not None else scene.provenance.get("train", {})
@@ -128,6 +137,7 @@ def measure_views(
     *,
     background: np.ndarray | None = None,
     backend: str = "auto",
+    corrections: Mapping[str, Correction] | None = None,
     measured: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
     """Measure pictures of a scene whose Gaussians are moved by a function.
@@ -138,6 +148,7 @@ def measure_views(
         move: Returns the scene's Gaussians from a time and an origin.
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
         backend: Rasterizer.
+        corrections: Correction of each camera by its name, for ``psnr_aligned``; None leaves that out.
         measured: Called after each image.
 
     Returns:
@@ -152,10 +163,22 @@ def measure_views(
     for view in views:
         rendering = render_timed(scene, view.camera, view.t, move, backend=backend)
         later = is_later(scene, view.t)
-        tally.add(rendering, datasets.load_image(view, background), datasets.load_mask(view), later)
+        truth = datasets.load_image(view, background)
+        tally.add(rendering, truth, datasets.load_mask(view), later)
+        if corrections is not None:
+            tally.add_aligned(_aligned(scene, view, corrections[view.camera.name], move, backend), truth)
         if measured is not None:
             measured()
     return tally.result()
+
+
+def _aligned(scene: Scene, view: datasets.View, correction: Correction, move: Move, backend: str) -> np.ndarray:
+    """Return the picture of a corrected camera in that camera's colours, rounded to 8 bits. [H, W, 3]"""
+    camera = correction.camera(view.camera)
+    color = scene_renderer.render_frame(
+        scene, move(view.t + correction.time, camera.center), camera, backend=backend
+    ).color
+    return images.to_uint8(correction.seen(color)).astype(np.float32) / np.float32(255.0)
 
 
 def write(evaluation: dict[str, Any], path: Path) -> Path:
@@ -288,9 +311,12 @@ class _Tally:
         self.values["ms_motion"].append(rendering.ms_motion)
         self.values["ms_raster"].append(rendering.ms_raster)
 
+    def add_aligned(self, picture: np.ndarray, truth: np.ndarray) -> None:
+        self.values["psnr_aligned"].append(metrics.psnr(picture, truth))
+
     def result(self) -> dict[str, Any]:
         out: dict[str, Any] = dict.fromkeys(METRICS)
-        for name in ("psnr", "psnr_objects", "ssim", "ssim_objects", "flip"):
+        for name in ("psnr", "psnr_aligned", "psnr_objects", "ssim", "ssim_objects", "flip"):
             out[name] = _mean(self.values[name])
         for name in ("ms_motion", "ms_raster"):
             out[name] = float(np.median(self.values[name])) if self.values[name] else None

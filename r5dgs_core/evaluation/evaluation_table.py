@@ -15,6 +15,7 @@ from . import miou
 # Rows of the tables: key in METRICS, label, column name in tables of several modes ("" = omitted), number format.
 _SHOWN = (
     ("psnr", "PSNR, mean over images (dB)", "PSNR", "{:.2f}"),
+    ("psnr_aligned", "PSNR with aligned cameras (dB)", "aligned", "{:.2f}"),
     ("psnr_pooled", "PSNR of the pooled error (dB)", "", "{:.2f}"),
     ("psnr_objects", "PSNR on object pixels (dB)", "objects", "{:.2f}"),
     ("ssim", "SSIM", "SSIM", "{:.4f}"),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import terminal
-from ..scene import predictability, quality
+from ..scene import camera_correction, predictability, quality
 from ..scene.motion_words import motion_of
 from ..scene.scene import Scene
 
@@ -33,6 +33,7 @@ def summary(scene: Scene, path: Path | None = None) -> str:
         *(f"  {terminal.printable(item.name)}: {motion}{_band(scene, outlooks[item.id])}" for item, motion in moving),
         f"quality    {quality.measure(scene, path).text()}",
         *_loss_of_baking(scene),
+        *(f"cameras    {text}" for text in camera_correction.sizes(scene.provenance.get("cameras", {})).values()),
     ]
     return "\n".join(lines)
 

@@ -10,9 +10,11 @@ from typing import Any
 import torch
 
 from ..config import training_needs
+from ..data.dataset import Dataset
 from ..scene.splats import to_opacities
 from . import checkpoint_content, view_psnr
 from .identity import identity_training, label_cleanup, label_votes
+from .refinement import refined_dataset
 from .representations.fused_posing import PosedSplats
 from .train_views import TrainView
 from .trainer import Trainer
@@ -81,12 +83,19 @@ def final_tensors(trainer: Trainer, progress: Progress) -> dict[str, torch.Tenso
         extra |= {"labels": labels, "object_ids": torch.arange(count + 1), checkpoint_content.DISCOVERED_LABELS: labels}
     with torch.no_grad():
         shown = view_psnr.training_psnr(
-            trainer.dataset,
+            _refined(trainer),
             trainer.behind,
             lambda view: trainer.render(trainer.normalization.camera(view.camera), view.t).numpy(),
         )
     extra[checkpoint_content.TRAIN_PSNR] = torch.tensor(shown, dtype=torch.float64)
     return extra
+
+
+def _refined(trainer: Trainer) -> Dataset:
+    """Return the data set with the corrections of the run's cameras."""
+    tensors = trainer.refinement.tensors()
+    found = refined_dataset.corrections(trainer.dataset, tensors, trainer.normalization)
+    return refined_dataset.apply(trainer.dataset, found)
 
 
 def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dict[str, torch.Tensor]:

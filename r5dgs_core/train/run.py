@@ -25,6 +25,7 @@ from ..render import warm_up
 from ..time_left import Phase, TimedProgress
 from . import checkpoint, checkpoint_content, finish, interrupt, learning_curves, run_folder, step_log, view_psnr
 from .identity import packed_masks
+from .refinement import trial
 from .representations.representation import TRACKS
 from .trainer import Trainer
 
@@ -249,6 +250,7 @@ def take_step(trainer: Trainer, decision: int | None, progress: Progress) -> Non
         from . import pose_repair  # a scene at rest does not load the tracks
 
         pose_repair.after_step(trainer, entered)
+    trial.after_step(trainer)
     if trainer.iteration == decision:
         from . import residual_trial
 
@@ -314,9 +316,8 @@ def _save(session: _Session, *, finished: bool, extra: dict[str, torch.Tensor] |
     if checkpoint_content.DISCOVERED_LABELS in tensors:  # objects found after the run count as observed at all times
         shape = len(tensors["object_ids"]) - 1, len(trainer.times)
         state = dataclasses.replace(state, observed=torch.ones(shape, dtype=torch.bool))
-    values = {
-        name: t for name, t in tensors.items() if t.is_floating_point() and name != checkpoint_content.RESIDUAL_GAINS
-    }
+    unknown = (checkpoint_content.RESIDUAL_GAINS, checkpoint_content.CAMERA_GAINS)
+    values = {name: t for name, t in tensors.items() if t.is_floating_point() and name not in unknown}
     bad = [name for name, tensor in values.items() if not tensor.isfinite().all()]
     if bad:
         raise TrainingError(

@@ -29,6 +29,8 @@ from .densification import densifier
 from .densification import registry as densification
 from .identity import joint_identity, packed_masks
 from .initialization import run_start
+from .refinement import rig
+from .refinement.refinement import RefinedViews, Refinement
 from .representations import fused_posing, registry, still
 
 TARGET_BYTES = 1 << 30  # maximum size of the cache of training images as floats
@@ -59,7 +61,7 @@ class Trainer:
         self.config = config = training_needs.resolve(config)
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         self.behind = train_views.behind(dataset, config)
-        self.views = train_views.load(dataset, self.normalization, self.behind)
+        self.views: Sequence[train_views.TrainView] = train_views.load(dataset, self.normalization, self.behind)
         self.discovered_masks = None if discovered_masks is None else packed_masks.pack(discovered_masks)
         shown = self.views if discovered_masks is None else train_views.with_masks(self.views, discovered_masks)
         motion = registry.configured(config, at_rest=still.applies(self.views, config))
@@ -90,6 +92,9 @@ class Trainer:
         self.optimizer = self.make_optimizer()
         self.densifier = densification.make(config, self._conditions(), len(self.gaussians))
         self._targets: dict[int, Tensor] = {}
+        spacing = float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
+        self.refinement = Refinement(rig.of(self.views), spacing, config.train.iterations)
+        self.given_views, self.views = self.views, RefinedViews(self.views, self.refinement)
 
     def _conditions(self) -> densifier.Conditions:
         white = self.behind is not None and bool((self.behind == 1).all())
@@ -137,14 +142,17 @@ class Trainer:
             group["lr"] = self.rates.at(group["name"], self.iteration)
         stats = RasterStats()
         try:
-            image, features, splats = self._draw_all(view, stats)
+            image, features, splats = self._draw_all(view, self.given_views[index].camera, stats)
         except ValueError as error:
             optimizers.check_finite(self.params, 0.0, place)
             raise TrainingError(
                 f"{place}: cannot be drawn: {error}; the last checkpoint is kept. "
                 "Remedy: lower the learning rates (--set rates.NAME=VALUE) or look at that view's camera"
             ) from error
-        loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
+        self.refinement.watch(splats)
+        target = self._target(index)
+        image = self.refinement.shade(image, target, index)
+        loss = losses.photometric(image, target, self.config.losses.ssim)
         penalties = [self.motion.penalty(self.gaussians, self.iteration, self._labels)]
         penalties.append(self.densifier.penalty(self.gaussians))
         if self.identity is not None:
@@ -157,6 +165,7 @@ class Trainer:
         value = float(loss.detach())
         if not (math.isfinite(value) and optimizers.has_finite_gradients(self.optimizer)):
             optimizers.check_finite(self.params, value, place)
+        self.refinement.update(index, view, splats, self.iteration, lambda t: self.splats(view.camera, t))
         self._hide_harmonics()
         self._freeze_single_view_centres()
         self.optimizer.step()
@@ -175,11 +184,14 @@ class Trainer:
             gradient[self.frozen] = 0.0
 
     def _draw_all(
-        self, view: train_views.TrainView, stats: RasterStats
+        self, view: train_views.TrainView, behind: Camera, stats: RasterStats
     ) -> tuple[Tensor, Tensor | None, fused_posing.PosedSplats]:
-        """Render a training view: image, blended encodings (None if rendered separately) and splats."""
+        """Render a training view: image, blended encodings (None if rendered separately) and splats.
+
+        The sky is that of the camera ``behind``, so that it need not be computed again for each correction.
+        """
         splats = self.splats(view.camera, view.t, self.generator)
-        colors, background = splats.colors, self.background.image(view.camera)
+        colors, background = splats.colors, self.background.image(behind)
         together = self.identity is not None and self.identity.with_geometry
         if self.identity is not None and together:
             colors, background = self.identity.channels(self.gaussians, colors, background)
@@ -195,8 +207,8 @@ class Trainer:
         ).image
         return (image[..., :3].contiguous(), image[..., 3:], splats) if together else (image, None, splats)
 
-    def render(self, camera: Camera, t: float) -> Tensor:
-        """Render a camera in normalised coordinates at a time. [H, W, 3]"""
+    def render(self, camera: Camera, t: float, behind: Camera | None = None) -> Tensor:
+        """Render a camera in normalised coordinates at a time, with the sky of another camera if given. [H, W, 3]"""
         splats = self.splats(camera, t)
         return rasterize_splats(
             splats.means,
@@ -205,7 +217,7 @@ class Trainer:
             splats.opacities,
             splats.colors,
             camera,
-            self.background.image(camera),
+            self.background.image(camera if behind is None else behind),
         ).image
 
     def splats(self, camera: Camera, t: float, draw: torch.Generator | None = None) -> fused_posing.PosedSplats:
@@ -258,7 +270,7 @@ class Trainer:
         tensors["generator"] = self.generator.get_state()
         if len(self.frozen) == len(self.gaussians):
             tensors[checkpoint_content.FROZEN] = self.frozen
-        tensors |= self.densifier.tensors()
+        tensors |= self.densifier.tensors() | self.refinement.tensors()
         tensors |= optimizers.tensors(self.optimizer)
         x, y, z = (float(v) for v in self.dataset.origin + self.normalization.origin)
         return Checkpoint(
@@ -293,6 +305,7 @@ class Trainer:
         if any(len(t) != len(self.gaussians) for n, t in tensors.items() if n.startswith("gradients.")):
             raise CheckpointError(f"the checkpoint's 'gradients.*': expected {len(self.gaussians)} rows each")
         self.densifier.restore(tensors)
+        self.refinement.restore(tensors)
         self.frozen = tensors.get(checkpoint_content.FROZEN, torch.zeros(0, dtype=torch.bool))
         self.optimizer = self.make_optimizer()
         optimizers.restore(self.optimizer, tensors)

@@ -71,7 +71,7 @@ def training_psnr(
 
 def _load(view: datasets.View, behind: np.ndarray | None) -> np.ndarray:
     """Return the image of a view on the run's background. [H, W, 3] uint8"""
-    return np.round(datasets.load_image(view, behind) * 255).astype(np.uint8)
+    return np.round(np.clip(datasets.load_image(view, behind), 0, 1) * 255).astype(np.uint8)
 
 
 def psnr_8_bit(image: np.ndarray, target: np.ndarray) -> float:

@@ -23,6 +23,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--data", type=Path, metavar="DIR", help="data set (default: the run's own)")
     kinds = f"playback mode, one of {', '.join(modes.every())} (default: rigid); may be repeated"
     p.add_argument("--mode", action="append", metavar="MODE", help=kinds)
+    aligned = "align the held-out cameras to the scene for psnr_aligned (default: if training has refined its cameras)"
+    p.add_argument("--align", action="store_true", default=None, help=aligned)
     p.add_argument("--json", type=Path, metavar="FILE", help="file to write instead of evaluation.json")
     options.add_threads(p)
     options.add_progress(p)
@@ -30,7 +32,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
-    given = {"modes": args.mode or ["rigid"], "json_path": args.json, "threads": args.threads}
+    given = {"modes": args.mode or ["rigid"], "align": args.align, "json_path": args.json, "threads": args.threads}
     run_evaluate(args.target, args.data, **given, progress_kind=args.progress)
 
 
@@ -41,6 +43,7 @@ def run_evaluate(
     *,
     modes: list[str],
     json_path: Path | None,
+    align: bool | None = None,
     threads: int | None = None,
     progress_kind: str = "none",
 ) -> dict[str, Any]:
@@ -51,6 +54,7 @@ def run_evaluate(
         data: Data set; the one that the run was trained on if None.
         modes: Playback modes.
         json_path: File to write instead.
+        align: As for `evaluate.evaluate`.
         threads: Threads of the kernels; see `options.use_threads`.
         progress_kind: Form of progress output (`progress.make`).
 
@@ -82,6 +86,7 @@ def run_evaluate(
             dataset,
             modes=modes,
             train=scene.provenance.get("train"),
+            align=align,
             progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
         )
     path = json_path or default

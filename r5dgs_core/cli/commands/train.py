@@ -52,7 +52,7 @@ def run_train(
     settings = options.training_settings(out, config_path, overrides, preset=preset, resume=resume)
     inputs.check_dataset(data)
     from ...bake import quick_fit
-    from ...scene import predictability
+    from ...scene import camera_correction, predictability
     from ...train import interrupt, run
 
     options.use_threads(threads)
@@ -60,9 +60,12 @@ def run_train(
         trained = run.train(data, out, settings, resume=resume, overwrite=overwrite, progress=progress)
         with interrupt.at_once(f"{out} is trained; stopped while its motion was fitted"):
             progress({"event": "prepare", "text": "motion past the last observed time"})
-            lines = predictability.warnings(quick_fit.scene_of(trained))
+            scene = quick_fit.scene_of(trained)
+        lines = predictability.warnings(scene)
+        refined = [f"cameras: {text}" for text in camera_correction.sizes(scene.provenance["cameras"]).values()]
         if progress_kind == "json":
-            for line in lines:
-                progress({"event": "warning", "text": line})
+            for event, texts in (("cameras", refined), ("warning", lines)):
+                for line in texts:
+                    progress({"event": event, "text": line})
     if progress_kind == "auto":
-        terminal.print_lines(lines)
+        terminal.print_lines([*refined, *lines])

@@ -24,6 +24,10 @@ class NeedsSection:
         residuals: Residual motion of non-rigid objects.
         regrouping: Assignment of a field's Gaussians to the group that explains their motion best, instead of the group
             of their object.
+        camera_poses: Refinement of the cameras' poses.
+        focal_lengths: Refinement of their focal lengths.
+        time_offsets: Refinement of the offsets of their clocks.
+        camera_colours: Refinement of the gain and offset of their colours.
     """
 
     tracks: str = "auto"
@@ -35,3 +39,7 @@ class NeedsSection:
     classifier: str = "auto"
     residuals: str = "auto"
     regrouping: str = "auto"
+    camera_poses: str = "auto"
+    focal_lengths: str = "auto"
+    time_offsets: str = "auto"
+    camera_colours: str = "auto"

@@ -160,6 +160,19 @@ class LossSection:
 
 
 @dataclass(frozen=True)
+class RefineSection:
+    """Refinement of the cameras (`train/refinement`).
+
+    Attributes:
+        threshold: Minimum gain of a part of the corrections on pixels to which it was not fitted, dB.
+        threshold_time: The same for time offsets, which change only what moves.
+    """
+
+    threshold: float = 0.25
+    threshold_time: float = 0.06
+
+
+@dataclass(frozen=True)
 class CurriculumSection:
     """Order in which observed times enter training; runs of fewer than 2000 steps shorten the schedule in proportion.
 

@@ -8,7 +8,7 @@ Notation: N Gaussians, C classes: class 0 is the background, class k the k-th ob
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ from .label_votes import class_map
 
 
 def train_encodings(
-    views: list[TrainView],
+    views: Sequence[TrainView],
     pose: Callable[[TrainView], PosedSplats],
     classes: dict[int, int],
     labels: Tensor,

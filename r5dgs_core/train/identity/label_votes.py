@@ -5,7 +5,7 @@ Notation: N Gaussians, C classes: class 0 is the background, class k the k-th ob
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ VOTE_VIEWS = 80
 
 
 def votes(
-    views: list[TrainView], pose: Callable[[TrainView], PosedSplats], classes: dict[int, int], count: int
+    views: Sequence[TrainView], pose: Callable[[TrainView], PosedSplats], classes: dict[int, int], count: int
 ) -> Tensor:
     """Return the contribution of each Gaussian to the mask pixels of each class.
 

@@ -5,15 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r5dgs_core.bake import bake, needs
+from r5dgs_core.bake import bake, camera_needs, needs
 from r5dgs_core.bake.draft import Need
 from r5dgs_core.config import config, training_needs
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError
 from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
+from r5dgs_core.scene.camera_correction import Correction
 from r5dgs_core.scene.scene import MotionGroup
 from r5dgs_core.train import checkpoint, observed_motion, run
+from r5dgs_core.train.refinement.refinement import PARTS
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
@@ -127,19 +129,20 @@ def test_the_tiny_scene_needs_the_features_that_it_shows(baked):
 EVERYTHING = {"travel": 1.0, "turn": 1.0, "shading": 0.1, "sky": 9, "bases": 4, "shadow": True, "bent": 3}
 EVERYTHING["moves"] = observed_motion.RegroupCounts(3, moving=9)
 NAMES = [field.name for field in dataclasses.fields(config.NeedsSection)]
+MEASURED = [name for name in NAMES if name not in PARTS]  # by baking; the others are decided by training
 
 
 def test_every_row_of_the_table_can_be_overridden():
-    assert list(table()) == NAMES
+    assert list(table()) == MEASURED
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", MEASURED)
 def test_overrides_of_the_user_win_over_the_measured_value_and_are_marked(name):
     measured, decided = table(**EVERYTHING)[name], table(**EVERYTHING, wanted={name: "off"})[name]
     assert (measured["decision"], decided["decision"]) == ("on", "off")
     assert decided["value"] == measured["value"] and decided["reason"].startswith("set off by the user")
-    others = [table(**EVERYTHING, wanted={name: "off"})[other] == table(**EVERYTHING)[other] for other in NAMES]
-    assert others == [other != name for other in NAMES]
+    others = [table(**EVERYTHING, wanted={name: "off"})[other] == table(**EVERYTHING)[other] for other in MEASURED]
+    assert others == [other != name for other in MEASURED]
 
 
 @pytest.mark.parametrize("name", ["tracks", "rotation"])
@@ -223,3 +226,16 @@ def test_the_table_lists_regrouped_gaussians():
         assert part in row["reason"]
     assert table(moves=observed_motion.RegroupCounts(moving=60))["regrouping"]["decision"] == "off"
     assert table()["regrouping"]["decision"] == "off"
+
+
+def test_refined_cameras_have_rows_with_gain_and_size():
+    gains = {"camera_poses": 1.5, "focal_lengths": 0.0, "time_offsets": None, "camera_colours": 0.1}
+    corrections = {"left": Correction(rotvec=np.full(3, 0.01)).to_dict()}
+    record = {"refined": ["camera_poses"], "gains_db": gains, "corrections": corrections, "pixels": {"left": 0.7}}
+    rows = {need.name: need.row() for need in camera_needs.rows(record, config.Config())}
+    assert list(rows) == list(PARTS)
+    assert rows["camera_poses"]["decision"] == "on" and rows["camera_poses"]["value"] == 1.5
+    assert "moved by 0.7 (at most 0.7) px" in rows["camera_poses"]["reason"]
+    assert rows["camera_colours"]["decision"] == "off" and rows["camera_colours"]["threshold"] == 0.25
+    assert rows["time_offsets"]["reason"] == "not examined"
+    assert {need.reason for need in camera_needs.rows({}, config.Config())} == {"not examined"}

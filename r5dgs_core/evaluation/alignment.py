@@ -1,0 +1,75 @@
+"""Alignment of held-out cameras to a scene before it is measured.
+
+A training that refines its cameras fits the scene to the refined ones. A held-out camera is off by as much as the
+others were, so it is corrected by the same few parameters (pose, focal length, time, colours), fitted to its own images
+with the scene fixed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..data import dataset as datasets
+from ..playback import scene_player
+from ..render import camera_fit, scene_renderer
+from ..scene import camera_correction, cameras
+from ..scene.camera_correction import Correction
+from ..scene.cameras import Camera
+from ..scene.sampling import spread
+from ..scene.scene import Scene
+
+IMAGES = 6  # maximum number of images of a camera for the fit
+TIME = 0.1  # change of time in the fit, as a share of the spacing of the observed times
+
+
+def corrections(
+    scene: Scene,
+    views: Sequence[datasets.View],
+    background: np.ndarray | None,
+    backend: str = "auto",
+) -> dict[str, Correction]:
+    """Return a correction for each camera of some views by its name.
+
+    Cameras that the training has refined keep their correction. Others are fitted to images up to ``t_max``, as later
+    ones also contain errors of the prediction, or to later ones if there are no others.
+
+    Args:
+        scene: The scene.
+        views: Held-out views.
+        background: Colour behind transparent pixels. [3]
+        backend: Rasterizer.
+    """
+    stored = scene.provenance.get("cameras", {}).get("corrections", {})
+    found = {name: camera_correction.from_dict(values) for name, values in stored.items()}
+    player = scene_player.Player(scene)
+
+    def draw(camera: Camera, t: float) -> np.ndarray:
+        frame = player.frame(t, camera.center)
+        return scene_renderer.render_frame(scene, frame, camera, backend=backend).color
+
+    for name in dict.fromkeys(view.camera.name for view in views):
+        if name not in found:
+            mine = [view for view in views if view.camera.name == name]
+            early = [view for view in mine if view.t <= scene.t_max] or mine
+            found[name] = _fitted(scene, spread(early, IMAGES), background, draw)
+    return found
+
+
+def _fitted(
+    scene: Scene, views: Sequence[datasets.View], background: np.ndarray | None, draw: camera_fit.Draw
+) -> Correction:
+    """Return the correction that explains the images of a camera best."""
+    shots = [camera_fit.Shot(view.camera, view.t, datasets.load_image(view, background)) for view in views]
+    times = scene.tracks.times
+    spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    units = camera_fit.Units(_depth(scene, views[0].camera), TIME * spacing)
+    which = camera_fit.columns(pose=True, focal=True, time=len(times) > 1, color=True)
+    return camera_fit.fit(draw, shots, units, which, Correction())
+
+
+def _depth(scene: Scene, camera: Camera) -> float:
+    """Return the median depth of the Gaussians in front of a camera."""
+    _, depth = cameras.project(camera, scene.gaussians.means.astype(np.float64))
+    return float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0

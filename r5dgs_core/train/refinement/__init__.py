@@ -1,0 +1,1 @@
+"""Refinement of the cameras in training: poses, focal lengths, clocks and colours."""

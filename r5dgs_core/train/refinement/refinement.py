@@ -1,0 +1,333 @@
+"""Corrections of the cameras, trained together with the Gaussians.
+
+The picture of a step is drawn by the corrected camera. A small motion of the camera is the opposite motion of all
+Gaussians, so the gradients by their means, rotations and sizes give those by pose and focal length; two more sets of
+posed Gaussians, slightly earlier and later, give the one by time. Each pose and each lens has its own moments of Adam,
+as most steps do not show it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import overload
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...scene.camera_correction import POSE, Correction
+from ..representations.fused_posing import PosedSplats
+from ..train_views import TrainView
+from . import gauge
+from .rig import Rig
+
+PARTS = ("camera_poses", "focal_lengths", "time_offsets", "camera_colours")  # rows of the needs table
+BETAS, EPS = (0.9, 0.99), 1e-12
+REACH = 8.0  # path that the steps of a parameter allow, in its units
+LOWEST, HIGHEST = 0.02, 0.15  # limits of a parameter's first step, units
+LAST = 0.05  # last step relative to the first
+SMOOTH = 0.02  # share by which a moving camera's correction approaches the mean of its neighbours, per step
+TIME_UNIT = 0.02  # unit of time offsets, spacings of the observed times
+TIME_STEP = 0.1  # half distance of the differences by time, spacings of the observed times
+COLOR_UNIT = 0.02  # unit of gains and offsets
+PREFIX = "refine."
+
+
+@dataclasses.dataclass
+class _Rows:
+    """Rows of one kind of parameter, with their moments of Adam.
+
+    Attributes:
+        values: Corrections in their own units. [R, ...]
+        first, second: Moments. [R, ...]
+        counts: Steps taken by each row. [R]
+    """
+
+    values: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    counts: np.ndarray
+
+    @classmethod
+    def zeros(cls, *shape: int) -> _Rows:
+        """Return rows without correction."""
+        return cls(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape[0]))
+
+    def change(self, row: int, gradient: np.ndarray, rate: float) -> np.ndarray:
+        """Update the moments of a row with a gradient; return the step."""
+        self.counts[row] += 1
+        for moment, beta, value in ((self.first, BETAS[0], gradient), (self.second, BETAS[1], gradient**2)):
+            moment[row] = beta * moment[row] + (1 - beta) * value
+        mean, square = (
+            m[row] / (1 - b ** self.counts[row]) for m, b in zip((self.first, self.second), BETAS, strict=True)
+        )
+        return -rate * mean / (np.sqrt(square) + EPS)
+
+
+class Refinement:
+    """Corrections of all cameras of a run, in normalised coordinates.
+
+    Args:
+        rig: Poses and lenses of the views.
+        spacing: Typical spacing of the observed times.
+        steps: Steps of the whole run.
+
+    Attributes:
+        parts: Parts that are trained, from `PARTS`; empty before the decision or if no camera needs a correction.
+        gains: Gain of each part on held-out pixels, dB, in the order of `PARTS`; None before the decision. [4]
+    """
+
+    def __init__(self, rig: Rig, spacing: float, steps: int):
+        self.rig = rig
+        self.parts: frozenset[str] = frozenset()
+        self.gains: np.ndarray | None = None
+        self._spacing, self._steps, self._begin = spacing, steps, 0
+        self._poses = _Rows.zeros(rig.poses, 6)
+        self._focal = _Rows.zeros(rig.lenses, 1)
+        self._time = _Rows.zeros(rig.lenses, 1)
+        self._color = _Rows.zeros(rig.lenses, 3, 2)  # gain - 1 and offset of each channel
+        self._units = np.zeros((rig.poses, 6, 6))
+        self._gauge: gauge.Gauge | None = None
+        self._color_leaf: Tensor | None = None
+        self._neighbours = {
+            int(r): (int(a), int(b)) for path in rig.paths for a, r, b in zip(path, path[1:], path[2:], strict=False)
+        }
+
+    @property
+    def active(self) -> bool:
+        """True if any part is trained."""
+        return bool(self.parts)
+
+    def begin(
+        self, parts: Sequence[str], points: np.ndarray, iteration: int, changes: Mapping[int, np.ndarray]
+    ) -> None:
+        """Begin to train some parts, or continue with further ones.
+
+        Args:
+            parts: From `PARTS`.
+            points: Points of the scene, for the units of the poses. [N, 3]
+            iteration: The step.
+            changes: Change of the correction of some poses, as for `Correction.plus`; each [COUNT].
+        """
+        if not self.active:
+            self._begin = iteration
+            chosen = points[:: max(1, len(points) // gauge.POINTS)]
+            self._units = np.stack([gauge.pixel_units(camera, chosen) for camera in self.rig.cameras])
+            self._gauge = gauge.Gauge(self.rig.cameras, self._units)
+        self.parts = frozenset(parts)
+        shared = np.bincount(self.rig.lens_of_pose[list(changes)], minlength=self.rig.lenses)
+        for row, change in changes.items():
+            lens = self.rig.lens_of_pose[row]
+            new = Correction().plus(change)
+            self._poses.values[row] += change[POSE]
+            self._focal.values[lens] += new.log_focal / shared[lens]
+            self._time.values[lens] += new.time / shared[lens]
+            color = np.stack([np.diag(new.gain) - 1, new.offset], axis=1)
+            self._color.values[lens] += color / shared[lens]
+        self._fix()
+
+    def correction(self, row: int) -> Correction:
+        """Return the correction of a pose, normalised coordinates."""
+        lens = int(self.rig.lens_of_pose[row])
+        pose, color = self._poses.values[row], self._color.values[lens]
+        return Correction(
+            pose[:3].copy(),
+            pose[3:].copy(),
+            float(self._focal.values[lens, 0]),
+            float(self._time.values[lens, 0]),
+            np.diag(1 + color[:, 0]),
+            color[:, 1].copy(),
+        )
+
+    def view(self, index: int, given: TrainView) -> TrainView:
+        """Return a training view with its corrected camera and time."""
+        if not self.active:
+            return given
+        correction = self.correction(int(self.rig.pose_of[index]))
+        return dataclasses.replace(given, camera=correction.camera(given.camera), t=given.t + correction.time)
+
+    def shade(self, image: Tensor, target: Tensor, index: int) -> Tensor:
+        """Return the picture in the colours of a view's camera; differentiable in both.
+
+        Colours that are saturated in the image may be brighter in the picture.
+
+        Args:
+            image: The picture. [H, W, 3]
+            target: The image. [H, W, 3]
+            index: The view.
+        """
+        if "camera_colours" not in self.parts:
+            return image
+        leaf = torch.from_numpy(self._color.values[self.rig.lens_of[index]]).to(image)
+        self._color_leaf = leaf.requires_grad_(torch.is_grad_enabled())
+        shaded = image + image * leaf[:, 0] + leaf[:, 1]
+        return torch.where((target >= 1) & (shaded > 1), target, shaded)
+
+    def watch(self, splats: PosedSplats) -> None:
+        """Keep the gradients of the splats of a step."""
+        if self.active:
+            for tensor in (splats.means, splats.quats, splats.scales):
+                if tensor.requires_grad:
+                    tensor.retain_grad()
+
+    @torch.no_grad()
+    def update(
+        self, index: int, view: TrainView, splats: PosedSplats, iteration: int, pose: Callable[[float], PosedSplats]
+    ) -> None:
+        """Update the corrections of a view's camera after the backward pass of a step.
+
+        Args:
+            index: The view.
+            view: The view as it was drawn.
+            splats: Its splats, with gradients.
+            iteration: The step.
+            pose: Returns the splats at another time.
+        """
+        if not self.active or splats.means.grad is None:
+            return
+        row, lens = int(self.rig.pose_of[index]), int(self.rig.lens_of[index])
+        by_pose, by_focal = camera_gradient(view, splats, self._poses.values[row, 3:])
+        if "camera_poses" in self.parts:
+            step = self._poses.change(row, self._units[row].T @ by_pose, self._rate(self._poses, iteration))
+            self._poses.values[row] += self._units[row] @ step
+            self._smooth(row)
+        if "focal_lengths" in self.parts:
+            unit = 2 / view.camera.width
+            step = self._focal.change(lens, np.array([by_focal * unit]), self._rate(self._focal, iteration))
+            self._focal.values[lens] += unit * step
+        if "time_offsets" in self.parts:
+            unit, h = TIME_UNIT * self._spacing, TIME_STEP * self._spacing
+            by_time = _time_gradient(splats, pose(view.t - h), pose(view.t + h)) / (2 * h)
+            step = self._time.change(lens, np.array([by_time * unit]), self._rate(self._time, iteration))
+            self._time.values[lens] += unit * step
+        if self._color_leaf is not None and self._color_leaf.grad is not None:
+            gradient = self._color_leaf.grad.cpu().numpy().astype(np.float64)
+            self._color.values[lens] += COLOR_UNIT * self._color.change(
+                lens, gradient, self._rate(self._color, iteration)
+            )
+        self._color_leaf = None
+        self._fix()
+
+    def _rate(self, rows: _Rows, iteration: int) -> float:
+        """Return the step of Adam in units of a parameter; it decays until the end of the run."""
+        left = max(1, self._steps - self._begin)
+        first = min(max(REACH * len(rows.values) / left, LOWEST), HIGHEST)
+        return first * LAST ** min(1.0, max(0.0, (iteration - self._begin) / left))
+
+    def _smooth(self, row: int) -> None:
+        if row in self._neighbours:
+            before, after = self._neighbours[row]
+            values = self._poses.values
+            values[row] += SMOOTH * (0.5 * (values[before] + values[after]) - values[row])
+
+    def _fix(self) -> None:
+        """Keep what the images do not determine: the similarity of the world, and the means of the other parts."""
+        if self._gauge is not None and "camera_poses" in self.parts:
+            self._poses.values = self._gauge.fix(self._poses.values)
+        for rows in (self._focal, self._time, self._color):
+            rows.values -= rows.values.mean(0)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the state by ``refine.NAME``; empty before the decision."""
+        if self.gains is None:
+            return {}
+        named = {
+            "gains": self.gains,
+            "on": np.array([part in self.parts for part in PARTS]),
+            "begin": np.array(self._begin),
+        }
+        if self.active:
+            named["units"] = self._units
+            for name, rows in self._kinds().items():
+                named |= {f"{name}.{field}": value for field, value in vars(rows).items()}
+        return {PREFIX + name: torch.from_numpy(np.array(value)) for name, value in named.items()}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Restore the state from `tensors`."""
+        named = {n.removeprefix(PREFIX): t.numpy().copy() for n, t in tensors.items() if n.startswith(PREFIX)}
+        self.parts, self.gains, self._gauge = frozenset(), named.get("gains"), None
+        for rows in self._kinds().values():
+            rows.__dict__.update(vars(_Rows.zeros(*rows.values.shape)))
+        if self.gains is None:
+            return
+        self._begin = int(named["begin"])
+        self.parts = frozenset(part for part, on in zip(PARTS, named["on"], strict=True) if on)
+        if self.active:
+            self._units = named["units"]
+            self._gauge = gauge.Gauge(self.rig.cameras, self._units)
+            for name, rows in self._kinds().items():
+                rows.__dict__.update({field: named[f"{name}.{field}"] for field in vars(rows)})
+
+    def _kinds(self) -> dict[str, _Rows]:
+        return {"poses": self._poses, "focal": self._focal, "time": self._time, "color": self._color}
+
+
+def camera_gradient(view: TrainView, splats: PosedSplats, shift: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the gradient of a loss by the pose correction and the log focal length of the camera.
+
+    Sizes of the Gaussians in the image change with the focal length as with their own sizes.
+
+    Args:
+        view: The view as drawn.
+        splats: Its splats, with gradients of means, quats and scales.
+        shift: Shift of the camera's present correction, the fixed point of its rotation. [3]
+
+    Returns:
+        Gradient by rotation and shift in the camera's axes [6], and by the log focal length.
+    """
+    like = splats.means
+    assert like.grad is not None
+    camera = torch.from_numpy(view.camera.T_cam_world).to(like)
+    rotation = camera[:3, :3]
+    p, by_p = like @ rotation.T + camera[:3, 3], like.grad @ rotation.T
+    by_shift = by_p.sum(0, dtype=torch.float64)
+    lever = p - torch.from_numpy(np.asarray(shift)).to(like)
+    by_turn = torch.linalg.cross(lever, by_p).sum(0, dtype=torch.float64)
+    focal = (p[:, :2] * by_p[:, :2]).sum(dtype=torch.float64)
+    if splats.quats.grad is not None:
+        w, v, gw, gv = splats.quats[:, :1], splats.quats[:, 1:], splats.quats.grad[:, :1], splats.quats.grad[:, 1:]
+        spun = 0.5 * (w * gv - gw * v + torch.linalg.cross(v, gv)).sum(0, dtype=torch.float64)
+        by_turn = by_turn + rotation.to(torch.float64) @ spun
+    if splats.scales.grad is not None:
+        focal = focal + (splats.scales * splats.scales.grad).sum(dtype=torch.float64)
+    numbers = torch.cat([by_turn, by_shift, focal[None]]).cpu().numpy()
+    return numbers[:6], float(numbers[6])
+
+
+def _time_gradient(splats: PosedSplats, before: PosedSplats, after: PosedSplats) -> float:
+    """Return the change of the loss from the splats of an earlier to those of a later time, to first order."""
+    total = 0.0
+    for name in ("means", "quats"):
+        gradient = getattr(splats, name).grad
+        if gradient is not None:
+            total += float((gradient * (getattr(after, name) - getattr(before, name))).sum(dtype=torch.float64))
+    return total if math.isfinite(total) else 0.0
+
+
+class RefinedViews(Sequence[TrainView]):
+    """Training views with the present corrections of their cameras.
+
+    Args:
+        given: Views as in the data set.
+        refinement: The corrections.
+    """
+
+    def __init__(self, given: Sequence[TrainView], refinement: Refinement):
+        self.given = given
+        self._refinement = refinement
+
+    def __len__(self) -> int:
+        return len(self.given)
+
+    @overload
+    def __getitem__(self, index: int) -> TrainView: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[TrainView]: ...
+
+    def __getitem__(self, index: int | slice) -> TrainView | Sequence[TrainView]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return self._refinement.view(range(len(self))[index], self.given[index])

@@ -1,0 +1,160 @@
+"""Corrections of cameras: their gradients, their gauge, and a run that recovers wrong cameras and resumes exactly."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.raster import rasterize_splats
+from r5dgs_core.scene.camera_correction import Correction
+from r5dgs_core.train import run
+from r5dgs_core.train.refinement import refined_dataset, refinement, trial
+from r5dgs_core.train.refinement.refinement import PARTS
+from r5dgs_core.train.representations.fused_posing import PosedSplats
+from r5dgs_core.train.trainer import Trainer
+from tests.support import tiny_datasets
+
+pytestmark = pytest.mark.heavy
+
+STEPS = ("train.iterations=160", "needs.residuals=off", "train.probe_every=0")
+
+
+def jittered(data, sizes, seed=0):
+    """The data set with wrong cameras: rotations (rad) and colours (gain)."""
+    rng, turn, gain = np.random.default_rng(seed), sizes.get("turn", 0.0), sizes.get("gain", 0.0)
+    given = datasets.read(data.root)
+    wrong = {name: Correction(rotvec=rng.normal(0, turn, 3)) for name in {v.camera.name for v in given.train}}
+    gains = {name: 1 + gain * rng.choice([-1, 1], 3) for name in sorted(wrong)}
+    train = tuple(dataclasses.replace(v, camera=wrong[v.camera.name].camera(v.camera)) for v in given.train)
+    return dataclasses.replace(given, train=train), gains
+
+
+def train(dataset, *overrides, gains=None, stop=None):
+    trainer = Trainer(dataset, tiny_datasets.settings(*STEPS, *overrides))
+    if gains is not None:
+        for index, view in enumerate(trainer.given_views):
+            image = np.clip(np.round(view.image * gains[view.camera.name]), 0, 255).astype(np.uint8)
+            trainer.given_views[index] = dataclasses.replace(view, image=image)
+    while not trainer.done and trainer.iteration != stop:
+        run.take_step(trainer, None, lambda event: None)
+    return trainer
+
+
+def offsets(dataset, trainer, truth):
+    """Distances of images of points in the training cameras from those in the true ones, px. [V]"""
+    found = refined_dataset.corrections(dataset, trainer.refinement.tensors(), trainer.normalization)
+    refined = refined_dataset.apply(dataset, found)
+    points = np.random.default_rng(0).normal([0, 0, 0.4], 0.5, (200, 3))
+    result = []
+    for view, true in zip(refined.train, truth.train, strict=True):
+        change = Correction()  # of the true camera
+        before = refined_dataset.cameras.project(view.camera, points)[0]
+        after = refined_dataset.cameras.project(change.camera(true.camera), points)[0]
+        result.append(np.sqrt(((before - after) ** 2).sum(1).mean()))
+    return np.array(result)
+
+
+@pytest.fixture(scope="module")
+def wrong(tiny):
+    return jittered(tiny, {"turn": 0.015})
+
+
+@pytest.fixture(scope="module")
+def refined(wrong):
+    return train(wrong[0])
+
+
+def test_gradients_of_the_camera_are_those_of_the_picture():
+    rng = np.random.default_rng(3)
+    camera = tiny_datasets.orbit_camera(0.4, 48, 36)
+    n = 60
+    means = torch.from_numpy(rng.normal([0, 0, 0.45], 0.4, (n, 3)))
+    quats, scales = torch.from_numpy(rng.normal(size=(n, 4))), torch.from_numpy(rng.uniform(0.1, 0.3, (n, 3)))
+    colors, weights = torch.from_numpy(rng.uniform(size=(n, 3))), torch.from_numpy(rng.normal(size=(36, 48, 3)))
+    weights = weights.cumsum(0).cumsum(1) / 100
+    opacities = torch.full((n,), 0.5, dtype=torch.float64)
+    quats = quats / quats.norm(dim=1, keepdim=True)
+    splats = PosedSplats(*(t.requires_grad_(True) for t in (means, quats, scales)), opacities, colors)
+
+    def loss(correction):
+        seen = correction.camera(camera)
+        image = rasterize_splats(means, quats, scales, opacities, colors, seen, backend="reference").image
+        return (image * weights).sum()
+
+    loss(Correction()).backward()
+    view = dataclasses.make_dataclass("View", ["camera"])(camera)
+    with torch.no_grad():
+        by_pose, by_focal = refinement.camera_gradient(view, splats, np.zeros(3))
+        step = 1e-5
+        numeric = [
+            float(loss(Correction().plus(step * unit)) - loss(Correction().plus(-step * unit))) / (2 * step)
+            for unit in np.eye(20)[:7]
+        ]
+    np.testing.assert_allclose(by_pose, numeric[:6], rtol=0.05, atol=0.02 * np.abs(numeric[:6]).max())
+    assert by_focal == pytest.approx(numeric[6], rel=0.1)
+
+
+def test_wrong_poses_are_found_and_corrected(tiny, wrong, refined):
+    assert "camera_poses" in refined.refinement.parts
+    truth = datasets.read(tiny.root)
+    untouched = train(wrong[0], *(f"needs.{part}=off" for part in PARTS))
+    assert offsets(wrong[0], refined, truth).mean() < 0.7 * offsets(wrong[0], untouched, truth).mean()
+
+
+def test_right_cameras_are_left_alone_and_the_run_is_the_same(tiny):
+    dataset = datasets.read(tiny.root)
+    tried = train(dataset)
+    assert tried.refinement.gains is not None and not tried.refinement.active
+    plain = train(dataset, *(f"needs.{part}=off" for part in PARTS)).state()
+    for name, tensor in plain.tensors.items():
+        assert torch.equal(tensor, tried.state().tensors[name]), name
+
+
+def test_wrong_colours_are_found_and_corrected(tiny):
+    dataset, gains = jittered(tiny, {"gain": 0.15})
+    trainer = train(dataset, gains=gains)
+    assert "camera_colours" in trainer.refinement.parts
+    names = trainer.refinement.rig.names
+    found = np.stack([np.diag(trainer.refinement.correction(row).gain) for row in range(len(names))])
+    true = np.stack([gains[name] for name in names])
+    assert np.abs(found / found.mean(0) - true / true.mean(0)).mean() < 0.5 * np.abs(true / true.mean(0) - 1).mean()
+
+
+def test_a_restored_run_continues_exactly(wrong, refined):
+    half = train(wrong[0], stop=90)
+    resumed = Trainer(wrong[0], half.config)
+    resumed.restore(half.state())
+    while not resumed.done:
+        run.take_step(resumed, None, lambda event: None)
+    expected, found = refined.state().tensors, resumed.state().tensors
+    assert expected.keys() == found.keys() and any(name.startswith("refine.") for name in expected)
+    for name, tensor in expected.items():
+        assert torch.equal(tensor, found[name]), name
+
+
+def test_means_of_focal_lengths_clocks_and_colours_stay(refined):
+    held = refined.refinement
+    corrections = [held.correction(row) for row in range(held.rig.poses)]
+    np.testing.assert_allclose(np.mean([c.gain for c in corrections], 0), np.eye(3), atol=1e-9)
+    assert np.mean([c.time for c in corrections]) == pytest.approx(0, abs=1e-12)
+    assert np.mean([c.log_focal for c in corrections]) == pytest.approx(0, abs=1e-12)
+
+
+def test_views_have_the_corrected_cameras(refined):
+    row = int(refined.refinement.rig.pose_of[3])
+    expected = refined.refinement.correction(row).camera(refined.given_views[3].camera)
+    np.testing.assert_array_equal(refined.views[3].camera.T_cam_world, expected.T_cam_world)
+    assert len(refined.views[:4]) == 4
+
+
+def test_cameras_are_never_examined_if_everything_is_switched_off():
+    config = tiny_datasets.settings(*STEPS, *(f"needs.{part}=off" for part in PARTS))
+    assert trial.steps(config) == ()
+    assert all(0 < step < 160 for step in trial.steps(tiny_datasets.settings(*STEPS)))
+
+
+def test_a_part_set_on_is_refined_without_need(tiny):
+    trainer = train(datasets.read(tiny.root), "needs.time_offsets=on", "needs.camera_poses=off", stop=80)
+    assert "time_offsets" in trainer.refinement.parts
