@@ -121,13 +121,18 @@ def evaluate(
                 corrections=corrections,
                 measured=count,
             )
+    result["train"] = _cost(scene, train)
+    return result
+
+
+def _cost(scene: Scene, train: dict[str, Any] | None) -> dict[str, Any]:
+    """Return the cost of training, as given or else as recorded in the scene."""
     given = train if train is not None else scene.provenance.get("train", {})
-    result["train"] = {
+    return {
         "seconds": given.get("seconds"),
         "iterations": given.get("iterations"),
         "gaussians": given.get("gaussians", len(scene.gaussians.means)),
     }
-    return result
 
 
 def measure_views(

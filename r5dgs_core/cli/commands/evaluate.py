@@ -89,11 +89,10 @@ def run_evaluate(
             align=align,
             progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
         )
-    path = json_path or default
     if progress_kind != "json":
         terminal.console().print(evaluation_table.make(result))
         terminal.print_lines(predictability.warnings(scene))
-    evaluate.write(result, path)
+    path = evaluate.write(result, json_path or default)
     if progress_kind != "json":
         print(f"written: {path}")
     return result
