@@ -26,6 +26,7 @@ from .refinement import PARTS
 
 log = logging.getLogger(__name__)
 
+SHORTEST = 100  # steps of a run whose cameras are examined; shorter ones explain too little of the images
 FOLLOW_UPS = 8  # number of examinations of refined parts while times enter
 ROUNDS = 3  # number of examinations once all times have entered
 POSES, VIEWS = 12, 3  # maximum number of poses that are examined, and of views of each
@@ -35,12 +36,14 @@ _COLUMNS: dict[str, str] = dict(zip(PARTS, ("pose", "focal", "time", "color"), s
 
 
 def steps(config: Config) -> tuple[int, ...]:
-    """Return the steps after which the cameras are examined; none if the user has switched all parts off.
+    """Return the steps after which the cameras are examined.
+
+    There are none in runs of less than `SHORTEST` steps, or if the user has switched all parts off.
 
     The first is before other times than the first one enter: Gaussians that have seen little training have not yet
     adapted to wrong cameras.
     """
-    if all(getattr(config.needs, part) == "off" for part in PARTS):
+    if config.train.iterations < SHORTEST or all(getattr(config.needs, part) == "off" for part in PARTS):
         return ()
     begin, full = config.curriculum.steps(config.train.iterations)
     every = max(1, full - begin)

@@ -153,6 +153,7 @@ def test_views_have_the_corrected_cameras(refined):
 def test_cameras_are_never_examined_if_everything_is_switched_off():
     config = tiny_datasets.settings(*STEPS, *(f"needs.{part}=off" for part in PARTS))
     assert trial.steps(config) == ()
+    assert trial.steps(tiny_datasets.settings("train.iterations=99")) == ()
     assert all(0 < step < 160 for step in trial.steps(tiny_datasets.settings(*STEPS)))
 
 
