@@ -1,1 +1,1 @@
-"""Object masks: creation with SAM2, reading of existing ones, and mask folders."""
+"""Object masks: creation with SAM2 or SAM3, reading of existing ones, and mask folders."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -28,13 +28,13 @@ class MaskBackend(Protocol):
         name: Name of the backend.
         numbering: Scope of its ids, `mask_notes.SCENE` or `mask_notes.VIDEO`.
         made_with: Inputs and settings that the masks depend on; JSON types.
-        own_names: The ``objects.json`` for ids that differ from the data set's, or None.
+        own_names: Names of ids that differ from the data set's, as an ``objects.json`` or by id, or None.
     """
 
     name: str
     numbering: str
     made_with: dict[str, Any]
-    own_names: Path | None
+    own_names: Path | Mapping[int, str] | None
 
     def label(self, video: videos.Video, room: Path, report: Report) -> Iterator[np.ndarray | None]:
         """Yield the object ids of each image of a video, in order; None for images without a mask.
@@ -189,13 +189,14 @@ def _made(notes: mask_notes.MaskNotes, folder: Path, kept: int, count: _Count) -
     )
 
 
-def _write_names(notes: mask_notes.MaskNotes, own_names: Path | None, folder: Path) -> None:
+def _write_names(notes: mask_notes.MaskNotes, own_names: Path | Mapping[int, str] | None, folder: Path) -> None:
     """Write ``objects.json``, so that names of the data set's ids are not applied to the folder's own ids."""
     path = folder / OBJECTS
     ids = sorted({object_id for video in notes.videos.values() for object_id in video.ids})
-    made = json.dumps({str(object_id): f"object {object_id}" for object_id in ids}, indent=1) + "\n"
+    names = own_names if isinstance(own_names, Mapping) else {}
+    made = json.dumps({str(object_id): names.get(object_id, f"object {object_id}") for object_id in ids}, indent=1)
     try:
-        atomic_files.write(path, made.encode() if own_names is None else own_names.read_bytes())
+        atomic_files.write(path, own_names.read_bytes() if isinstance(own_names, Path) else f"{made}\n".encode())
     except OSError as error:
         raise errors.DatasetError(f"{path}: cannot be written: {error}") from error
 

@@ -43,14 +43,14 @@ class Sam2:
     """
 
     def __init__(self, folder: Path, device: str = "cpu"):
-        self.device = _device(device)
+        self.device = device_of(device)
         folder = Path(folder)
         transformers = _transformers()
         _check(folder)
         weights = encoder_base.weights_of(folder)
-        with _quiet(transformers):
-            self.video = _load(transformers.Sam2VideoModel, folder).to(self.device)
-            self.image = _load(transformers.Sam2Model, folder).to(self.device)
+        with quiet(transformers):
+            self.video = load(transformers.Sam2VideoModel, folder).to(self.device)
+            self.image = load(transformers.Sam2Model, folder).to(self.device)
         size = self.video.config.image_size
         self.size = int(size if isinstance(size, int) else max(size))
         self.name = folder.resolve().name
@@ -65,7 +65,8 @@ class Sam2:
         return (tensor - mean) / deviation
 
 
-def _device(name: str) -> torch.device:
+def device_of(name: str) -> torch.device:
+    """Return the device of ``--device``; BackendError if it is unknown or missing."""
     try:
         device = torch.device(name)
     except RuntimeError as error:
@@ -104,7 +105,7 @@ def _check(folder: Path) -> None:
         raise errors.BackendError(f"{path}: expected a model of type {KIND!r}, found {kind!r}{remedy}")
 
 
-def _load(kind: Any, folder: Path) -> Any:
+def load(kind: Any, folder: Path) -> Any:
     """Load one network for inference, with all weights from the folder."""
     try:
         model, found = kind.from_pretrained(
@@ -120,7 +121,7 @@ def _load(kind: Any, folder: Path) -> Any:
 
 
 @contextlib.contextmanager
-def _quiet(transformers: Any) -> Iterator[None]:
+def quiet(transformers: Any) -> Iterator[None]:
     """Silence the library's progress bars and its warning that one folder serves two networks."""
     log = transformers.utils.logging
     level, bars = log.get_verbosity(), log.is_progress_bar_enabled()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -23,6 +24,14 @@ from .videos import Video
 HEAVY = ("maskmem_features", "maskmem_pos_enc")  # the network's memory of an image, a megabyte per object
 
 
+class Network(Protocol):
+    """Network with its own input size."""
+
+    def pixels(self, image: np.ndarray) -> Tensor:
+        """Convert an RGB image [H, W, 3] uint8 to network input. [1, 3, S, S]"""
+        ...
+
+
 class Frames(Mapping):
     """Images of a video as network input, read on demand; the last one is cached.
 
@@ -31,7 +40,7 @@ class Frames(Mapping):
         video: The video.
     """
 
-    def __init__(self, model: Sam2, video: Video):
+    def __init__(self, model: Network, video: Video):
         self._model, self._video = model, video
         self._last: tuple[int, Tensor] | None = None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 from ... import errors, user_settings
 from .. import inputs, options
 
+log = logging.getLogger(__name__)
+
 if TYPE_CHECKING:
     from ...data.dataset import Dataset
     from ...data.views import View
@@ -19,22 +22,25 @@ if TYPE_CHECKING:
 
 NAME = "masks"
 SHORT = "make or check the masks of the training images"
-LONG = "Make object masks with SAM2, convert masks of another program, or check the masks of a data set."
+LONG = "Make object masks with SAM2 or SAM3, convert masks of another program, or check the masks of a data set."
 EXAMPLE = "DATA --backend sam2 --model SAM2_FOLDER"
 PAGE = "user/masks.md"
 
-BACKENDS = ("precomputed", "blender", "sam2")
+BACKENDS = ("precomputed", "blender", "sam2", "sam3")
+MODELS = ("sam2", "sam3")  # backends that run networks
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     p.add_argument("data", type=Path, help="data set folder")
-    made = "source of the masks: precomputed (a folder; default), blender (a captured data set) or sam2"
+    made = "source of the masks: precomputed (a folder; default), blender (a captured data set), sam2 or sam3"
     p.add_argument("--backend", default="precomputed", metavar="NAME", help=made)
     source = "folder of the masks (precomputed), or captured data set (blender)"
     p.add_argument("--from", dest="source", type=Path, metavar="FOLDER", help=source)
-    model = "folder of the SAM2 weights (default: sam2 of 'r5dgs config --user')"
+    model = "folder of the weights of sam2 (default: that of 'r5dgs config --user') or sam3"
     p.add_argument("--model", type=Path, metavar="DIR", help=model)
+    words = 'objects that sam3 searches for, one phrase per object, such as "mug, red apple"'
+    p.add_argument("--words", metavar="WORDS", help=words)
     p.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: DATA/object_mask)")
     key_frames = "images per video in which sam2 searches for all objects (default: 3)"
     p.add_argument("--key-frames", type=int, metavar="N", help=key_frames)
@@ -46,7 +52,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--stability", type=float, metavar="SHARE", help=stability)
     max_area = "maximum area of an object as a share of the image; larger masks are background (default: 0.4)"
     p.add_argument("--max-area", type=float, metavar="SHARE", help=max_area)
-    p.add_argument("--device", metavar="NAME", help="device that runs sam2: cpu (default) or cuda")
+    p.add_argument("--device", metavar="NAME", help="device that runs sam2 or sam3: cpu (default) or cuda")
     unknown = "mask value of pixels whose object is unknown, for example 255"
     p.add_argument("--unknown", type=int, metavar="VALUE", help=unknown)
     p.add_argument("--overwrite", action="store_true", help="replace existing masks")
@@ -65,7 +71,8 @@ class Options:
 
     Attributes:
         backend: Source of the masks, from `BACKENDS`.
-        model: Folder of the SAM2 weights; that of the user's settings if None.
+        model: Folder of the weights; for SAM2, that of the user's settings if None.
+        words: Phrases that SAM3 searches for, separated by commas.
         source: Folder of masks (``precomputed``) or of a captured data set (``blender``); the data set itself if None.
         out: Folder to write; ``DATA/object_mask`` if None.
         key_frames: Images per video in which ``sam2`` searches for all objects.
@@ -80,6 +87,7 @@ class Options:
 
     backend: str = "precomputed"
     model: Path | None = None
+    words: str | None = None
     source: Path | None = None
     out: Path | None = None
     key_frames: int | None = None
@@ -124,7 +132,7 @@ def run_masks(data: Path, *, progress_kind: str = "none", **fields: Any) -> Mask
     dataset = datasets.read(data, view_masks.NO_MASKS, min_registered=0.0)
     folder = dataset.root / datasets.MASKS if given.out is None else Path(given.out)
     maker = _maker(dataset, given)
-    in_place = given.backend != "sam2" and maker.folder.resolve() == folder.resolve()
+    in_place = given.backend not in MODELS and maker.folder.resolve() == folder.resolve()
     if in_place:
         _check_unknown(given.unknown, folder)
     with make(progress_kind) as progress:
@@ -146,6 +154,13 @@ def _maker(dataset: Dataset, given: Options) -> Any:
         keys = {} if given.key_frames is None else {"key_frames": given.key_frames}
         segment = sam2_segments.SegmentSettings(**given.segmentation())  # type: ignore[arg-type]
         return sam2_masks.Sam2Masks(Sam2(given.model, given.device or "cpu"), segment, sam2_masks.TrackSettings(**keys))
+    if given.backend == "sam3":
+        from ...masks import sam3_masks
+        from ...masks.sam3_model import LICENCE, Sam3
+
+        assert given.model is not None
+        log.info("the weights of SAM3 are under %s; read it", LICENCE)
+        return sam3_masks.Sam3Masks(Sam3(given.model, given.device or "cpu"), phrases(given.words))
     from ...data import dataset as datasets
     from ...masks import mask_folders
 
@@ -153,6 +168,17 @@ def _maker(dataset: Dataset, given: Options) -> Any:
         return mask_folders.CapturedMasks(given.source or dataset.root, dataset.train)
     source = given.source or dataset.root / datasets.MASKS
     return mask_folders.PrecomputedMasks(source, dataset.train, given.unknown)
+
+
+def phrases(words: str | None) -> list[str]:
+    """Split ``--words`` at its commas. Raises UsageError if there is no phrase, or one occurs twice."""
+    found = [" ".join(phrase.split()) for phrase in (words or "").split(",") if phrase.strip()]
+    if not found:
+        raise errors.UsageError('--backend sam3: name the objects with --words, such as --words "mug, red apple"')
+    twice = next((phrase for k, phrase in enumerate(found) if phrase in found[:k]), None)
+    if twice is not None:
+        raise errors.UsageError(f"--words: {twice!r} occurs twice; a phrase names one object")
+    return found
 
 
 def _make(
@@ -201,9 +227,16 @@ def _check(given: Options) -> None:
                 "--backend sam2: name the folder of the model with --model DIR, or once with "
                 "'r5dgs config --user set sam2 DIR' (docs/user/masks.md)"
             )
-        misplaced = {"--from": given.source, "--unknown": given.unknown}
+        misplaced = {"--from": given.source, "--unknown": given.unknown, "--words": given.words}
+    elif given.backend == "sam3":
+        if given.model is None:
+            raise errors.UsageError(
+                "--backend sam3: name the folder of the model with --model DIR (docs/user/masks.md)"
+            )
+        phrases(given.words)
+        misplaced = {"--from": given.source, "--unknown": given.unknown, **tuned}
     else:
-        misplaced = {"--model": given.model, "--device": given.device, **tuned}
+        misplaced = {"--model": given.model, "--device": given.device, "--words": given.words, **tuned}
         if given.backend == "blender":
             misplaced["--unknown"] = given.unknown
     for option, value in misplaced.items():

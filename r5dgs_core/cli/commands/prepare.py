@@ -22,7 +22,7 @@ LONG = (
 )
 EXAMPLE = "VIDEOS --calibration calibration.toml --out DATA"
 PAGE = "user/your_data.md"
-MODELS = ("sam2",)
+MODELS = ("sam2", "sam3")
 SYNC = ("auto", "audio", "motion", "none")
 
 
@@ -46,9 +46,11 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     offset = "known offset of a camera's clock in milliseconds, which is added to its times; may be repeated"
     p.add_argument("--offset", action="append", default=[], metavar="CAMERA=MS", help=offset)
     _add_hold_out(p)
-    masks = "masks: a folder with a mask per frame (CAMERA/FRAME.png), sam2 or none (default)"
-    p.add_argument("--masks", default="none", metavar="FOLDER|sam2|none", help=masks)
-    p.add_argument("--model", type=Path, metavar="DIR", help="folder of the weights of sam2")
+    masks = "masks: a folder with a mask per frame (CAMERA/FRAME.png), sam2, sam3 or none (default)"
+    p.add_argument("--masks", default="none", metavar="FOLDER|sam2|sam3|none", help=masks)
+    p.add_argument("--model", type=Path, metavar="DIR", help="folder of the weights of sam2 or sam3")
+    words = 'objects that sam3 searches for, one phrase per object, such as "mug, red apple"'
+    p.add_argument("--words", metavar="WORDS", help=words)
     p.add_argument("--overwrite", action="store_true", help="replace a data set that was prepared with other settings")
     options.add_progress(p)
 
@@ -114,6 +116,7 @@ def run(args: argparse.Namespace) -> None:
         },
         masks=args.masks,
         model=args.model,
+        words=args.words,
     )
 
 
@@ -126,6 +129,7 @@ def run_prepare(
     unknown: dict[str, Any] | None = None,
     masks: str = "none",
     model: Path | None = None,
+    words: str | None = None,
     progress_kind: str = "none",
     **fields: Any,
 ) -> Plan:
@@ -137,8 +141,9 @@ def run_prepare(
         window: Fields of `prepare.frame_choice.Window`.
         hold_out: Fields of `prepare.data_splits.HoldOut`.
         unknown: Fields of `prepare.unknown_cameras.UnknownCameras`.
-        masks: Folder of masks of the frames, "sam2" or "none".
-        model: Folder of the SAM2 weights; that of the user's settings if None.
+        masks: Folder of masks of the frames, "sam2", "sam3" or "none".
+        model: Folder of the weights; for SAM2, that of the user's settings if None.
+        words: Phrases that SAM3 searches for, separated by commas.
         progress_kind: Form of progress output (`progress.make`).
         **fields: Further fields of `prepare.plan.Request`.
 
@@ -149,7 +154,9 @@ def run_prepare(
     window = window or {}
     if window.get("end") is not None and window["end"] <= window.get("start", 0.0):
         raise errors.UsageError(f"--end {window['end']:g}: expected a time after --start {window.get('start', 0.0):g}")
-    input_paths.check_source(source)
+    for path in (source, fields.get("calibration")):
+        if path is not None:
+            input_paths.check_source(Path(path))
     from ...prepare import data_splits, frame_choice, plan, prepare, unknown_cameras
     from ...progress import make
 
@@ -172,18 +179,21 @@ def run_prepare(
             progress({"event": "prepared", "path": str(out)})
     if progress_kind == "auto":
         terminal.print_lines(summary(made))
-    _make_masks(made, masks, model, progress_kind)
+    _make_masks(made, masks, {"model": model, "words": words}, progress_kind)
     return made
 
 
-def _make_masks(plan: Plan, masks: str, model: Path | None, progress_kind: str) -> None:
+def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: str) -> None:
     """Write the masks of the images."""
     from . import masks as masks_command
 
     if masks == "none":
         return
     if masks in MODELS:
-        masks_command.run_masks(plan.request.out, backend=masks, model=model, progress_kind=progress_kind)
+        overwrite = plan.request.overwrite
+        masks_command.run_masks(
+            plan.request.out, backend=masks, overwrite=overwrite, progress_kind=progress_kind, **given
+        )
         return
     from ...prepare import source_masks
     from ...progress import make
