@@ -447,7 +447,6 @@ NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, fo
     ["import", "nowhere", "--out", "x.r5dgs"],
     ["import", "nowhere", "--out", "x.r5dgs", "--world", "maya"],
     ["check", "nowhere"],
-    ["prepare", "nowhere", "--out", "data"],
     ["prepare", ".", "--out", "data", "--calibration", "nowhere"],
     ["prepare", ".", "--out", "data", "--offset", "cam0"],
     ["prepare", ".", "--out", "data", "--start", "3", "--end", "2"],
