@@ -7,7 +7,7 @@ FOLDER/objects.json        names of the ids, optional
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ class SourceMasks:
     """
 
     name = "frames"
-    own_names: Path | None = None
+    own_names: Path | Mapping[int, str] | None = None
 
     def __init__(self, folder: Path, plan: Plan):
         self.folder, self._plan = Path(folder), plan

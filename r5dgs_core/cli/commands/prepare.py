@@ -152,11 +152,7 @@ def run_prepare(
         Interrupted: Ctrl-C; finished images are kept.
     """
     window = window or {}
-    if window.get("end") is not None and window["end"] <= window.get("start", 0.0):
-        raise errors.UsageError(f"--end {window['end']:g}: expected a time after --start {window.get('start', 0.0):g}")
-    for path in (source, fields.get("calibration")):
-        if path is not None:
-            input_paths.check_source(Path(path))
+    _check(window, source, fields.get("calibration"))
     from ...prepare import data_splits, frame_choice, plan, prepare, unknown_cameras
     from ...progress import make
 
@@ -181,6 +177,15 @@ def run_prepare(
         terminal.print_lines(summary(made))
     _make_masks(made, masks, {"model": model, "words": words}, progress_kind)
     return made
+
+
+def _check(window: dict[str, Any], source: Path, calibration: Path | None) -> None:
+    """Raise UsageError for a window that ends before it starts, or DatasetError for a missing path."""
+    if window.get("end") is not None and window["end"] <= window.get("start", 0.0):
+        raise errors.UsageError(f"--end {window['end']:g}: expected a time after --start {window.get('start', 0.0):g}")
+    for path in (source, calibration):
+        if path is not None:
+            input_paths.check_source(Path(path))
 
 
 def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: str) -> None:
