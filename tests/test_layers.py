@@ -204,7 +204,13 @@ HEAVY = {
     *("safetensors", "open_clip"),
 }
 # Modules of `raster/` and `render/` that compute in torch. All others draw without it.
-TORCH_MODULES = {"raster.cpu.autograd", "raster.cuda", "raster.reference", "raster.torch_backend"}
+TORCH_MODULES = {
+    "raster.cpu.autograd",
+    "raster.cuda",
+    "raster.cuda_projection",
+    "raster.reference",
+    "raster.torch_backend",
+}
 TORCH_TIER = {"torch", "numba", "gsplat", "transformers", "torchvision", "safetensors", "open_clip"}
 
 

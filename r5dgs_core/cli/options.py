@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from .. import errors, input_paths
 from ..config import config
+from ..config.sections.training import DEVICES
 
 _KEYS = {  # options that set one key of the configuration
     "iterations": "train.iterations",
@@ -38,8 +40,17 @@ def add_settings(p: argparse.ArgumentParser) -> None:
     p.add_argument("--iterations", type=at_least(1), metavar="N", help=steps)
     cap = "maximum number of Gaussians, from the first step on; same as densify.max_gaussians"
     p.add_argument("--max-gaussians", type=at_least(0), metavar="N", help=cap)
+    device = "device of the training: cpu, cuda, cuda:N or auto; same as train.device (default: auto)"
+    p.add_argument("--device", type=device_name, metavar="NAME", help=device)
     add_threads(p)
     add_progress(p)
+
+
+def device_name(text: str) -> str:
+    """Convert an argument to the name of a device."""
+    if not re.fullmatch(DEVICES, text):
+        raise argparse.ArgumentTypeError(f"expected auto, cpu, cuda or cuda:N, got {text!r}")
+    return text
 
 
 def add_overrides(p: argparse.ArgumentParser, form: str, meaning: str) -> None:
@@ -108,6 +119,7 @@ def training(args: argparse.Namespace) -> dict[str, Any]:
         "preset": args.preset,
         "resume": args.resume,
         "overwrite": args.overwrite,
+        "device": args.device,
         "threads": args.threads,
         "progress_kind": args.progress,
     }

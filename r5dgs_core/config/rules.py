@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any, get_type_hints
 
@@ -12,7 +13,7 @@ from .sections.densification import STRATEGIES
 from .sections.identity import IDENTITY_TRAINING, INCLUDE_SELF
 from .sections.motion import FIELD_SIZES, MOVERS, VARIANTS
 from .sections.needs import NEEDS, NeedsSection
-from .sections.training import BACKGROUNDS, CURRICULA, PLACEMENTS, REPRESENTATIONS, RIGID_FORMS
+from .sections.training import BACKGROUNDS, CURRICULA, DEVICES, PLACEMENTS, REPRESENTATIONS, RIGID_FORMS
 
 
 def _check_writable(name: str, value: object) -> None:
@@ -87,6 +88,7 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "data.min_registered": _SHARE,
     "train.iterations": _AT_LEAST_1,
     "train.seed": (lambda value: value < 2**63 - 1, "less than 2^63 - 1"),
+    "train.device": (lambda value: re.fullmatch(DEVICES, value) is not None, "auto, cpu, cuda or cuda:N"),
     "train.representation": (lambda value: value in REPRESENTATIONS, " or ".join(REPRESENTATIONS)),
     "field.variant": (lambda value: value in VARIANTS, " or ".join(VARIANTS)),
     "field.size": (lambda value: value in FIELD_SIZES, " or ".join(FIELD_SIZES)),

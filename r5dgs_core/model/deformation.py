@@ -91,12 +91,12 @@ class DeformationField(nn.Module):
         with torch.no_grad():
             self.head.bias.copy_(torch.tensor([0.0, 0, 0, 1, 0, 0, 0, 0, 0, 0]))
 
-    def forward(self, means: Tensor, t: float, chunk: int = 65536) -> Deltas:
+    def forward(self, means: Tensor, t: float | Tensor, chunk: int = 65536) -> Deltas:
         """Return the deltas of Gaussians at a time.
 
         Args:
             means: Canonical centres. [N, 3]
-            t: Scene time.
+            t: Scene time, a number or a tensor [].
             chunk: Number of Gaussians per evaluation; bounds the memory.
         """
         time = self._time_features(means, t)
@@ -104,8 +104,8 @@ class DeformationField(nn.Module):
         quats = out[:, 3:7]
         return Deltas(out[:, :3], quats / quats.norm(dim=-1, keepdim=True).clamp(min=1e-8), out[:, 7:])
 
-    def _time_features(self, means: Tensor, t: float) -> Tensor:
-        time = encoding.encode(means.new_tensor([t]), self.shape.time_bands)
+    def _time_features(self, means: Tensor, t: float | Tensor) -> Tensor:
+        time = encoding.encode(encoding.times(means, 1, t)[:, 0], self.shape.time_bands)
         if self.time_network is not None:
             first, second = self.time_network
             time = second(F.relu(first(time)))

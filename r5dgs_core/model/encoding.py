@@ -22,10 +22,18 @@ def encode(x: Tensor, bands: int) -> Tensor:
 
     Source: NeRF (Mildenhall et al. 2020), Eq. 4, in the form of Deformable 3D Gaussians.
     """
+    if x.device.type != "cpu":  # few large operations; on a CPU the many small ones are as fast
+        angles = x[..., None, :] * torch.exp2(torch.arange(bands, dtype=x.dtype, device=x.device))[:, None]
+        return torch.cat([x, torch.stack([angles.sin(), angles.cos()], -2).flatten(-3)], dim=-1)
     parts = [x]
     for k in range(bands):
         parts += [torch.sin(2.0**k * x), torch.cos(2.0**k * x)]
     return torch.cat(parts, dim=-1)
+
+
+def times(like: Tensor, count: int, t: float | Tensor) -> Tensor:
+    """Return a column of ``count`` times, a number or a tensor [], with dtype and device of another tensor."""
+    return t.to(like.dtype).expand(count, 1) if isinstance(t, Tensor) else like.new_full((count, 1), t)
 
 
 def encoded_size(channels: int, bands: int) -> int:

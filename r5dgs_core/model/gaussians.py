@@ -45,6 +45,10 @@ class Gaussians:
             return params[name]
         raise AttributeError(name)
 
+    def to(self, device: torch.device) -> Gaussians:
+        """Return the Gaussians on a device."""
+        return Gaussians({n: t.detach().to(device) for n, t in self.params.items()}, self.motion_ids.to(device))
+
     def add(self, name: str, values: Tensor) -> None:
         """Add a parameter [N, ...]. Call it before the optimizer is created."""
         _check(name, values, len(self))
@@ -61,8 +65,11 @@ class Gaussians:
 
     def keep(self, optimizer: torch.optim.Optimizer | None, mask: Tensor) -> None:
         """Keep the rows for which ``mask`` [N] is True, including the optimizer's state."""
-        self.motion_ids = self.motion_ids[mask]
-        self._rebuild(optimizer, lambda _, tensor: tensor[mask], lambda _, moment: moment[mask])
+        rows = torch.nonzero(mask)[:, 0]
+        if len(rows) == len(mask):
+            return
+        self.motion_ids = self.motion_ids[rows]
+        self._rebuild(optimizer, lambda _, tensor: tensor[rows], lambda _, moment: moment[rows])
 
     def _rebuild(self, optimizer, change_param, change_moment) -> None:
         for name, old in list(self.params.items()):

@@ -61,11 +61,12 @@ class ResidualField:
         self._share = nodes.new_ones(len(nodes), 1, 1)  # 1 / length of each node's body
         for body, (length, _) in zip(self.bodies, sizes, strict=True):
             self._share[owners == body] = 1 / length
-        self._members: tuple[Tensor, Tensor, Tensor] | None = None
+        # Groups of the Gaussians and version of that tensor, then the result of `_members_of`.
+        self._members: tuple[Tensor, int, Tensor, Tensor, Tensor] | None = None
 
     def only(self, bodies: list[int]) -> ResidualField:
         """Return the field of some of its bodies."""
-        kept = torch.isin(self.owners, torch.tensor(bodies, dtype=torch.int64))
+        kept = torch.isin(self.owners, self.owners.new_tensor(bodies))
         return ResidualField(self.nodes[kept], self.owners[kept], self.values.detach()[:, kept].clone())
 
     def change(
@@ -74,7 +75,7 @@ class ResidualField:
         quats: Tensor,
         opacities: Tensor,
         motion_ids: Tensor,
-        weights: dict[int, float],
+        weights: dict[int, float] | Tensor,
     ) -> Change:
         """Return the change of the members at a time; differentiable in the values and ``quats``.
 
@@ -83,24 +84,26 @@ class ResidualField:
             quats: Their rotations wxyz, any positive norm. [N, 4]
             opacities: Weights of the members in the rigid motion that is removed. [N]
             motion_ids: Their motion groups. [N] int64
-            weights: Weights of the knots at that time.
+            weights: Weights of the knots at that time, or one knot as an int64 tensor [1].
         """
-        index, there = self._members_of(motion_ids)
-        if not bool(there.any()):
+        index, there, kept = self._members_of(motion_ids)
+        if len(kept) == 0:
             none = means.new_zeros(0, 3)
             return Change(motion_ids.new_zeros(0), none, means.new_zeros(0, 4), none)
-        mixed = torch.zeros_like(self.values[0])
-        for s, weight in weights.items():
-            mixed = mixed + weight * self.values[s]
+        if isinstance(weights, Tensor):
+            mixed = self.values.index_select(0, weights)[0]
+        else:
+            mixed = torch.zeros_like(self.values[0])
+            for s, weight in weights.items():
+                mixed = mixed + weight * self.values[s]
         x, share = means.detach()[index], opacities.detach()[index] * there
         offsets, slopes = self._blend(x, mixed[self._slots])
         middle = x - _mean(x, share)
         shift, spin = _rigid_part(middle, offsets, share)
         offsets = offsets - shift - torch.linalg.cross(spin[:, None].expand_as(middle), middle)
         slopes = slopes - _cross_matrix(spin)[:, None]
-        kept = torch.nonzero(there.flatten())[:, 0]
         where = index.flatten()[kept]
-        gradient = slopes.flatten(0, 1)[kept] + torch.eye(3, dtype=means.dtype)
+        gradient = slopes.flatten(0, 1)[kept] + torch.eye(3, dtype=means.dtype, device=means.device)
         stretched = gradient @ rotations.quats_to_rotmats(rotations.normalize(quats[where]))
         growth = 0.5 * torch.log((stretched**2).sum(-2).clamp(min=1e-4))
         return Change(where, offsets.flatten(0, 1)[kept], _turn(gradient), growth)
@@ -118,11 +121,14 @@ class ResidualField:
             total = total + roughness * ((scaled[2:] - 2 * scaled[1:-1] + scaled[:-2]) ** 2).mean()
         return total
 
-    def _members_of(self, motion_ids: Tensor) -> tuple[Tensor, Tensor]:
-        """Members of each body, padded, and the mask of valid entries. [F, n]"""
-        if self._members is None or not torch.equal(self._members[0], motion_ids):
-            self._members = (motion_ids.clone(), *_padded(motion_ids, self.bodies))
-        return self._members[1:]
+    def _members_of(self, motion_ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Members of each body, padded, the mask of valid entries [F, n], and the valid entries of both, flattened."""
+        known = self._members
+        if known is None or known[0] is not motion_ids or known[1] != motion_ids._version:
+            index, there = _padded(motion_ids, self.bodies)
+            kept = torch.nonzero(there.flatten())[:, 0]
+            self._members = known = (motion_ids, motion_ids._version, index, there, kept)
+        return known[2:]
 
     def _blend(self, x: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Offsets [F, n, 3] of members at x and their gradients, one column per axis of x, [F, n, 3, 3]."""
@@ -141,7 +147,8 @@ def _padded(ids: Tensor, bodies: list[int]) -> tuple[Tensor, Tensor]:
     """Rows with each body's id, padded with zeros, and the mask of valid entries. [F, largest count]"""
     found = [torch.nonzero(ids == body)[:, 0] for body in bodies]
     most = max((len(rows) for rows in found), default=0)
-    index, there = torch.zeros(len(bodies), most, dtype=torch.int64), torch.zeros(len(bodies), most, dtype=torch.bool)
+    index = ids.new_zeros(len(bodies), most, dtype=torch.int64)
+    there = torch.zeros_like(index, dtype=torch.bool)
     for k, rows in enumerate(found):
         index[k, : len(rows)], there[k, : len(rows)] = rows, True
     return index, there
@@ -160,7 +167,7 @@ def spread(
         count: Maximum number of nodes per body.
         knots: Number of knots S.
     """
-    nodes, owners = [means.new_zeros(0, 3)], [torch.zeros(0, dtype=torch.int64)]
+    nodes, owners = [means.new_zeros(0, 3)], [motion_ids.new_zeros(0, dtype=torch.int64)]
     for body in bodies:
         members = motion_ids == body
         seen = members & (opacities > SEEN_OPACITY)
@@ -172,7 +179,7 @@ def spread(
         points = points[reach <= 1.5 * reach.quantile(0.9)]  # outliers would take nodes from the body
         chosen = _far_apart(points, middle, min(count, len(points)))
         nodes.append(points[chosen])
-        owners.append(torch.full((len(chosen),), body, dtype=torch.int64))
+        owners.append(motion_ids.new_full((len(chosen),), body, dtype=torch.int64))
     place = torch.cat(nodes)
     return ResidualField(place, torch.cat(owners), means.new_zeros(knots, len(place), 4, 3))
 
@@ -184,7 +191,7 @@ def _far_apart(points: Tensor, start: Tensor, count: int) -> Tensor:
     while len(chosen) < count:
         chosen.append(int(distance.argmax()))
         distance = torch.minimum(distance, (points - points[chosen[-1]]).norm(dim=1))
-    return torch.tensor(chosen)
+    return torch.tensor(chosen, device=points.device)
 
 
 def _lengths(nodes: Tensor) -> tuple[float, float]:
@@ -213,10 +220,11 @@ def _rigid_part(middle: Tensor, offsets: Tensor, weights: Tensor) -> tuple[Tenso
     shift = _mean(offsets, weights)
     squares = (weights[..., None] * middle).mT @ middle
     trace = squares.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
-    one = torch.eye(3, dtype=middle.dtype)
+    one = torch.eye(3, dtype=middle.dtype, device=middle.device)
     inertia = one * trace - squares + (1e-6 * trace + 1e-12) * one  # regularised: a line does not determine its spin
     moment = (weights[..., None] * torch.linalg.cross(middle, offsets - shift)).sum(1)
-    return shift, (torch.linalg.inv(inertia) @ moment[..., None])[..., 0]
+    inverse, _ = torch.linalg.inv_ex(inertia)  # does not wait for a GPU, as it does not check
+    return shift, (inverse @ moment[..., None])[..., 0]
 
 
 def _cross_matrix(w: Tensor) -> Tensor:

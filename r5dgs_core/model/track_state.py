@@ -18,7 +18,7 @@ def tensors_of(tracks: Tracks) -> dict[str, Tensor]:
     named["tracks.times"] = torch.from_numpy(tracks.times)
     for name in ("centers", "base_quats", "casters", "plane_normal"):
         named[f"tracks.{name}"] = getattr(tracks, name)
-    if not torch.equal(tracks.owners, torch.arange(tracks.bodies)):
+    if not torch.equal(tracks.owners, torch.arange(tracks.bodies, device=tracks.owners.device)):
         named[OWNERS] = tracks.owners
     return named
 
@@ -26,7 +26,7 @@ def tensors_of(tracks: Tracks) -> dict[str, Tensor]:
 def tracks_of(tensors: Mapping[str, Tensor]) -> Tracks:
     """Restore tracks from the named tensors of a checkpoint."""
     tracks = Tracks(
-        tensors["tracks.times"].numpy(),
+        tensors["tracks.times"].cpu().numpy(),
         tensors["tracks.centers"],
         tensors["tracks.translations"].clone(),
         tensors["tracks.base_quats"].clone(),

@@ -44,14 +44,26 @@ class Tracks:
         self.times = np.asarray(times, np.float64)
         self.centers = centers
         self.base_quats = base_quats
-        self.casters = casters if casters is not None else torch.zeros(0, dtype=torch.int64)
-        self.plane_normal = plane_normal if plane_normal is not None else torch.tensor([0.0, 0.0, 1.0])
-        self.owners = owners if owners is not None else torch.arange(len(centers))
+        self.casters = casters if casters is not None else torch.zeros(0, dtype=torch.int64, device=centers.device)
+        self.plane_normal = plane_normal if plane_normal is not None else centers.new_tensor([0.0, 0.0, 1.0])
+        self.owners = owners if owners is not None else torch.arange(len(centers), device=centers.device)
+        self._spacings = torch.from_numpy(np.diff(self.times)).float().to(centers.device)
+        self._moving = torch.ones(len(centers), 1, device=centers.device)
+        self._moving[0] = 0.0
         self.params: dict[str, Tensor] = {
             "translations": translations.detach().requires_grad_(True),
             "rotvecs": torch.zeros_like(translations).requires_grad_(True),
-            "slope": torch.zeros(3).requires_grad_(True),
+            "slope": centers.new_zeros(3, dtype=torch.float32).requires_grad_(True),
         }
+
+    def to(self, device: torch.device) -> Tracks:
+        """Return the tracks on a device."""
+        translations = self.params["translations"].detach()
+        fixed = (self.centers, translations, self.base_quats, self.casters, self.plane_normal, self.owners)
+        moved = Tracks(self.times, *(tensor.to(device) for tensor in fixed))
+        for name, parameter in self.params.items():
+            moved.params[name] = parameter.detach().to(device).requires_grad_(True)
+        return moved
 
     @property
     def bodies(self) -> int:
@@ -72,7 +84,7 @@ class Tracks:
         n = self.plane_normal
         slope = self.params["slope"]
         in_plane = slope - (slope @ n) * n
-        return torch.eye(3) - torch.outer(n, n) + torch.outer(in_plane, n)
+        return torch.eye(3, device=n.device) - torch.outer(n, n) + torch.outer(in_plane, n)
 
     def knot_weights(self, t: float) -> dict[int, float]:
         """Weights of the knots at a time: 1 at a knot, constant outside the range, else those of playback's curve.
@@ -93,9 +105,9 @@ class Tracks:
         )
         return {int(s): float(w) for s, w in zip(window, weights, strict=True) if w != 0.0}
 
-    def poses(self, t: float) -> GroupPoses:
-        """Return the poses of all groups at a time, differentiable."""
-        weights = self.knot_weights(t)
+    def poses(self, t: float | Tensor) -> GroupPoses:
+        """Return the poses of all groups at a time, or at the knot that an int64 tensor [1] names, differentiable."""
+        weights = {t: 1.0} if isinstance(t, Tensor) else self.knot_weights(t)
         quats, displacements = self._knot(next(iter(weights)))
         if len(weights) > 1:
             mixed, moved, previous = torch.zeros_like(quats), torch.zeros_like(displacements), quats
@@ -107,19 +119,17 @@ class Tracks:
             displacements = moved
         if len(self.casters):
             followed = displacements[self.casters] @ self.follow_matrix().T
-            still = torch.zeros(len(self.casters), 4)
+            still = quats.new_zeros(len(self.casters), 4)
             still[:, 0] = 1.0
             quats = torch.cat([quats, still])
             displacements = torch.cat([displacements, followed])
         return GroupPoses(quats, rotations.quats_to_rotmats(quats), displacements)
 
-    def _knot(self, s: int) -> tuple[Tensor, Tensor]:
-        moving = torch.ones(self.bodies, 1)
-        moving[0] = 0.0
-        quats = rotations.multiply(
-            rotations.rotvecs_to_quats(self.params["rotvecs"][:, s] * moving), self.base_quats[:, s]
-        )
-        return quats, self.params["translations"][:, s] * moving
+    def _knot(self, s: int | Tensor) -> tuple[Tensor, Tensor]:
+        three = (self.params["rotvecs"], self.base_quats, self.params["translations"])
+        rotvecs, base, moves = (x.index_select(1, s)[:, 0] if isinstance(s, Tensor) else x[:, s] for x in three)
+        quats = rotations.multiply(rotations.rotvecs_to_quats(rotvecs * self._moving), base)
+        return quats, moves * self._moving
 
     def knot_quats(self) -> Tensor:
         """Rotations of the bodies at all knots. [B, S, 4]"""
@@ -128,7 +138,7 @@ class Tracks:
     @torch.no_grad()
     def rebase(self) -> None:
         """Fold the learned rotation vectors into the base rotations and reset them to zero."""
-        self.base_quats = rotations.normalize(self.knot_quats()).detach()
+        self.base_quats.copy_(rotations.normalize(self.knot_quats()).detach())
         self.params["rotvecs"].zero_()
 
     def roughness(
@@ -149,8 +159,8 @@ class Tracks:
         """
         first, last = (0, len(self.times) - 1) if entered is None else entered
         if last - first < 2 or self.bodies < 2:
-            return torch.zeros(())
-        step = torch.from_numpy(np.diff(self.times)).float()
+            return self.centers.new_zeros(())
+        step = self._spacings
         mean_step = step.mean()
         step = step[first:last][None, :, None]
         here = slice(first, last + 1)
@@ -171,4 +181,4 @@ class Tracks:
                 flat = middle.dim() == 2
                 weighted = middle[..., None] * second if flat else (middle @ second[..., None])[..., 0]
             squares.append((second * weighted).sum())
-        return sum(squares, torch.zeros(())) / (3 * (self.bodies - 1) * (len(self.times) - 2))
+        return sum(squares, step.new_zeros(())) / (3 * (self.bodies - 1) * (len(self.times) - 2))

@@ -66,15 +66,15 @@ class TRD(nn.Module):
             signs = torch.randint(0, 2, (6,), generator=generator) * 2.0 - 1
             self.head.bias.copy_(torch.cat([torch.zeros(6), 0.1 * signs]))
 
-    def forward(self, positions: Tensor, t: float, chunk: int = 65536) -> MotionState:
+    def forward(self, positions: Tensor, t: float | Tensor, chunk: int = 65536) -> MotionState:
         """Return the motion state of Gaussians.
 
         Args:
             positions: Centres at time ``t``. [N, 3]
-            t: Scene time.
+            t: Scene time, a number or a tensor [].
             chunk: Number of Gaussians per evaluation; bounds the memory.
         """
-        inputs = torch.cat([positions, positions.new_full((len(positions), 1), t)], dim=-1)
+        inputs = torch.cat([positions, encoding.times(positions, len(positions), t)], dim=-1)
         out = encoding.in_chunks(self._run, inputs, chunk)
         rates = out[:, 6:] * out[:, 6:].abs() / 10
         return MotionState(out[:, :3], out[:, 3:6], rates[:, :3], rates[:, 3:])

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
+from typing import Any
 
 import numpy as np
 
@@ -38,7 +39,7 @@ def rk2(
     w: Array,  # [..., 3]
     a: Array,  # [..., 3]
     e: Array,  # [..., 3]
-    duration: float,
+    duration: Any,
     step: float,
 ) -> tuple[Array, Array]:
     """Integrate points by the midpoint rule and rotations by exponentials of the midpoint spin: TRACE's integrator.
@@ -53,7 +54,7 @@ def rk2(
         w: Angular velocity, rad per unit. [..., 3]
         a: Rate of v. [..., 3]
         e: Rate of w. [..., 3]
-        duration: Signed duration.
+        duration: Signed duration; a tensor [] is one step.
         step: Longest step; the last one is shorter.
 
     Returns:
@@ -62,7 +63,8 @@ def rk2(
     Source: TRACE's explicit midpoint rule.
     """
     quats = rotations.rotvecs_to_quats(0 * points)
-    steps = step_sizes(duration, step)
+    one_step = rotations.array_namespace(duration) is not np
+    steps: list = [duration] if one_step else step_sizes(duration, step)
     if steps and rotations.array_namespace(points, w) is np:
         rates = np.linalg.norm(np.stack(np.broadcast_arrays(w, w + e * duration)), axis=-1)
         if not abs(steps[0]) * rates.max(initial=0.0) <= MAX_TURN:

@@ -27,6 +27,11 @@ def device_of(values: Array) -> str:
     return "cpu" if isinstance(values, np.ndarray) else str(values.device)
 
 
+def takes_kernels(values: Array) -> bool:
+    """Return True if numba kernels process the values: arrays, and tensors on the CPU. Others have twins in torch."""
+    return device_of(values) == "cpu"
+
+
 def is_float32(values: Array) -> bool:
     """Return True for float32 values of native byte order."""
     return str(values.dtype).removeprefix("torch.") == "float32"

@@ -39,14 +39,14 @@ class ViewPoses:
     """Eyes of view-dependent colours, in the frames of the coefficients.
 
     Attributes:
-        eyes: Eye of each pose in the frame of the means. [P, 3] float64
-        maps: Map of each pose from directions to the frame of the coefficients. [P, 3, 3] float64
-        ids: Pose of each Gaussian; empty if all have the first. [N] or [0] int64
+        eyes: Eye of each pose in the frame of the means. [P, 3] float64, or a tensor on a GPU
+        maps: Map of each pose from directions to the frame of the coefficients. [P, 3, 3] float64, or such a tensor
+        ids: Pose of each Gaussian; empty if all have the first. [N] or [0] int64, or such a tensor
     """
 
-    eyes: np.ndarray
-    maps: np.ndarray
-    ids: np.ndarray
+    eyes: Array
+    maps: Array
+    ids: Array
 
 
 class Backend:

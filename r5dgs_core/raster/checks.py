@@ -19,26 +19,29 @@ _RANGES: dict[str, tuple[float, float, str]] = {
 }
 
 
-def check_splats(means, quats, scales, opacities, channels, camera, background, labels) -> None:
-    """Raise ValueError or TypeError for the first input with an invalid type, shape, dtype, device or value."""
+def check_splats(means, quats, scales, opacities, channels, camera, background, labels, *, values=True) -> None:
+    """Raise ValueError or TypeError for the first input with an invalid type, shape, dtype, device or value.
+
+    Without ``values``, values are not read, which takes time if they are on a GPU.
+    """
     inputs = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "channels": channels}
     xp = array_namespace(*inputs.values())
-    for name, values in inputs.items():
-        check_kind(name, values, xp)
-        if not is_float(values):
+    for name, given in inputs.items():
+        check_kind(name, given, xp)
+        if not is_float(given):
             remedy = f"{name}.astype('float32')" if xp is np else f"{name}.float()"
-            raise ValueError(f"{name}: expected floating-point values, got {values.dtype}; remedy: {remedy}")
+            raise ValueError(f"{name}: expected floating-point values, got {given.dtype}; remedy: {remedy}")
     n = len(means) if means.ndim else 0
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
-    for name, values in inputs.items():
+    for name, given in inputs.items():
         expected = shapes.get(name, (n, channels.shape[-1] if channels.ndim == 2 and channels.shape[-1] else "D >= 1"))
-        if tuple(values.shape) != expected:
+        if tuple(given.shape) != expected:
             wanted = str(expected).replace("'", "")
-            raise ValueError(f"{name}: expected shape {wanted}, got {tuple(values.shape)}")
-        if values.dtype != means.dtype or device_of(values) != device_of(means):
+            raise ValueError(f"{name}: expected shape {wanted}, got {tuple(given.shape)}")
+        if given.dtype != means.dtype or device_of(given) != device_of(means):
             raise ValueError(
-                f"{name}: expected {means.dtype} on {device_of(means)}, like the means, got {values.dtype} on "
-                f"{device_of(values)}; remedy: convert it, or the means"
+                f"{name}: expected {means.dtype} on {device_of(means)}, like the means, got {given.dtype} on "
+                f"{device_of(given)}; remedy: convert it, or the means"
             )
     cameras.check(camera)
     if background is not None:
@@ -46,8 +49,10 @@ def check_splats(means, quats, scales, opacities, channels, camera, background, 
         inputs["background"] = like(background, means, means.dtype)
     if labels is not None:
         _check_labels(labels, means)
-    for name, values in inputs.items():
-        _check_values(name, values, *_RANGES.get(name, (-math.inf, math.inf, "")))
+    if not values:
+        return
+    for name, given in inputs.items():
+        _check_values(name, given, *_RANGES.get(name, (-math.inf, math.inf, "")))
 
 
 def check_appearance(means: Any, camera: Camera, colors: Any, features: Any, background: Any) -> None:

@@ -1,8 +1,9 @@
-"""Rasterizer for NVIDIA GPUs: float64 projection in torch, float32 blending by gsplat kernels (Apache-2.0).
+"""Rasterizer for NVIDIA GPUs: projection in torch or by gsplat, blending by gsplat kernels (Apache-2.0).
 
-Only three functions of gsplat are used: `isect_tiles` and `isect_offset_encode` list the Gaussians of each tile,
-`rasterize_to_pixels` blends them. The projection is that of the reference, so that both backends draw the same
-Gaussians in the same order: gsplat's projection lacks skew and a configurable clamp, and culls and sorts in float32.
+Four functions of gsplat are used: `isect_tiles` and `isect_offset_encode` list the Gaussians of each tile,
+`rasterize_to_pixels` blends them, and `fully_fused_projection` projects them if `RasterSettings.exact` is False.
+Otherwise the projection is that of the reference, so that both backends draw the same Gaussians in the same order:
+gsplat's projection lacks skew and a configurable clamp, and culls and sorts in float32.
 
 gsplat is imported on the first call. Its thresholds are compile-time constants; `Kernels` records them, and
 `check_settings` rejects settings that differ.
@@ -15,60 +16,24 @@ import functools
 import logging
 import math
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from .. import errors, extras
 from ..scene.cameras import Camera
-from . import reference
+from .arrays import Array
+from .backend import Backend
+from .cuda_projection import TILE, Kernels, Projected, project
 from .settings import RasterSettings, RasterStats, SplatImage
-from .torch_backend import TorchBackend
+from .torch_backend import ArrayAdapter, TorchBackend
 
 log = logging.getLogger(__name__)
 
-TILE = 16  # px; gsplat tunes its kernels for this size
 # Compiled into gsplat 1.5 and 1.6. More than 32 channels need more shared memory than some GPUs have.
 CHANNEL_COUNTS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)
 OLDEST_GSPLAT = (1, 5)  # first version with one radius per axis
 ALPHA_MAX_SLACK = 0.01  # accepted difference of alpha_max, with a warning
-
-
-@dataclass(frozen=True)
-class Kernels:
-    """Functions of gsplat, and the thresholds compiled into them.
-
-    Attributes:
-        isect_tiles: Returns pairs of tile and Gaussian, sorted by tile and depth.
-        isect_offset_encode: Returns the first pair of each tile.
-        rasterize_to_pixels: Returns blended channels and alpha, differentiable.
-        version: gsplat version, for messages.
-        alpha_min: Contributions below this are dropped.
-        alpha_max: Cap on contributions.
-        transmittance_min: A pixel is finished before its transmittance reaches this.
-    """
-
-    isect_tiles: Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
-    isect_offset_encode: Callable[..., torch.Tensor]
-    rasterize_to_pixels: Callable[..., tuple[torch.Tensor, torch.Tensor]]
-    version: str
-    alpha_min: float
-    alpha_max: float
-    transmittance_min: float
-
-
-@dataclass(frozen=True)
-class _Projected:
-    """Gaussians that touch the image, near to far, in gsplat's layout, and the tiles that they touch."""
-
-    means2d: torch.Tensor  # [V, 2] px
-    conics: torch.Tensor  # [V, 3] inverse covariance: xx, xy, yy
-    opacities: torch.Tensor  # [V]
-    tile_starts: torch.Tensor  # [1, tiles high, tiles wide] first pair of each tile
-    pairs: torch.Tensor  # [P] Gaussian of each pair
-    width: int
-    height: int
 
 
 def why_unavailable(device: torch.device, dtype: torch.dtype) -> str | None:
@@ -124,7 +89,12 @@ def find_kernels() -> Kernels | str:
             f"{torch.version.cuda} with nvcc and set CUDA_HOME, or a gsplat wheel with compiled kernels"
         )
     return Kernels(
-        gsplat.isect_tiles, gsplat.isect_offset_encode, gsplat.rasterize_to_pixels, version, **_read_thresholds()
+        gsplat.isect_tiles,
+        gsplat.isect_offset_encode,
+        gsplat.rasterize_to_pixels,
+        gsplat.fully_fused_projection,
+        version,
+        **_read_thresholds(),
     )
 
 
@@ -156,7 +126,7 @@ def check_settings(settings: RasterSettings, kernels: Kernels, opacities: torch.
     wanted, there = settings.alpha_max, kernels.alpha_max
     if math.isclose(wanted, there, rel_tol=1e-6) or not len(opacities):
         return
-    if opacities.detach().max().item() <= min(wanted, there):
+    if settings.exact and opacities.detach().max().item() <= min(wanted, there):
         return
     if abs(wanted - there) > ALPHA_MAX_SLACK:
         raise errors.BackendError(_cannot_meet("alpha_max", wanted, there, kernels))
@@ -179,31 +149,7 @@ def _warn_once(message: str) -> None:
     log.warning(message)
 
 
-def _tile_lists(
-    means2d: torch.Tensor,  # [V, 2]
-    extent: torch.Tensor,  # [V, 2]
-    camera: Camera,
-    kernels: Kernels,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """List the Gaussians of each tile: first pair of each tile [1, tiles high, tiles wide], Gaussian of each pair [P].
-
-    gsplat gets the box of each alpha_min ellipse, clipped to the image, which keeps its numbers small. Depths are
-    replaced by ranks, which float32 does not round together. Ranks beyond 2^24 (16.7 million) may be equal, but the
-    sort is stable.
-    """
-    size = means2d.new_tensor([camera.width, camera.height])
-    low, high = (means2d - extent).clamp_min(0), torch.minimum(means2d + extent, size)
-    radii = torch.ceil(0.5 * (high - low)).clamp_min(1).int()
-    ranks = torch.arange(len(means2d), dtype=torch.float32, device=means2d.device)
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    if not len(means2d):
-        return ranks.new_zeros((1, tiles_y, tiles_x), dtype=torch.int32), ranks.int()
-    centers = (0.5 * (low + high)).float()
-    _, keys, pairs = kernels.isect_tiles(centers[None], radii[None], ranks[None], TILE, tiles_x, tiles_y)
-    return kernels.isect_offset_encode(keys, 1, tiles_x, tiles_y), pairs
-
-
-def _blend(splats: _Projected, values: torch.Tensor, kernels: Kernels) -> tuple[torch.Tensor, torch.Tensor]:
+def _blend(splats: Projected, values: torch.Tensor, kernels: Kernels) -> tuple[torch.Tensor, torch.Tensor]:
     """Blend values [V, D] front to back: weighted sums [H, W, D] and alpha [H, W]."""
     if not len(values):
         # An empty sum is zero and keeps the result connected to the inputs' graph.
@@ -233,7 +179,7 @@ def _blend(splats: _Projected, values: torch.Tensor, kernels: Kernels) -> tuple[
 
 @torch.no_grad()
 def _heaviest(
-    splats: _Projected,
+    splats: Projected,
     labels: torch.Tensor,  # [V]
     alpha: torch.Tensor,  # [H, W]
     kernels: Kernels,
@@ -255,28 +201,6 @@ def _heaviest(
     return torch.where(alpha >= settings.id_alpha_min, ids, -1)
 
 
-def _fill_stats(
-    stats: RasterStats, means2d: torch.Tensor, cov: torch.Tensor, order: torch.Tensor, means: torch.Tensor
-) -> None:
-    """Write visibility and radii now, and the norm of the screen-space gradient in the backward pass."""
-
-    def spread(rows: torch.Tensor) -> torch.Tensor:
-        """Scatter rows of the visible Gaussians to all Gaussians, zero elsewhere. [N]"""
-        return means.new_zeros(len(means)).index_copy_(0, order, rows.to(means.dtype))
-
-    with torch.no_grad():
-        longest = reference.radii(cov)
-        stats.visible = spread(torch.ones_like(longest)) > 0
-        stats.radii = spread(longest)
-        stats.grad_norm = torch.zeros_like(stats.radii)
-    if means2d.requires_grad:
-
-        def keep_norm(grad):
-            stats.grad_norm = spread(grad.norm(dim=1))
-
-        means2d.register_hook(keep_norm)
-
-
 class CudaBackend(TorchBackend):
     """gsplat's kernels, for float32 tensors on a GPU."""
 
@@ -285,6 +209,10 @@ class CudaBackend(TorchBackend):
     def hardware(self) -> str:
         """See `Backend.hardware`."""
         return torch.cuda.get_device_name()
+
+    def for_inputs(self, like: Array) -> Backend:
+        """See `Backend.for_inputs`; arrays are copied to the current GPU."""
+        return ArrayAdapter(self, "cuda") if isinstance(like, np.ndarray) else self
 
     def suits(self, like: torch.Tensor) -> bool:
         """See `Backend.suits`."""
@@ -312,27 +240,8 @@ class CudaBackend(TorchBackend):
         if isinstance(kernels, str):
             raise errors.BackendError(f"rasterizer 'cuda': {kernels}")
         check_settings(settings, kernels, opacities)
-        with torch.no_grad():
-            projected = reference.project(means.double(), quats.double(), scales.double(), camera, settings)
-            means2d, axes, z = projected
-            cov, _ = reference.covariances(axes, settings.dilation)
-            order, extent = reference.visible_rows(means2d, cov, z, opacities.double(), camera, settings)
-            tile_starts, pairs = _tile_lists(means2d[order], extent[order], camera, kernels)
-        if torch.is_grad_enabled() and any(t.requires_grad for t in (means, quats, scales)):
-            # Project only visible Gaussians with gradients: the graph of a float64 projection dominates the memory.
-            seen = (means[order].double(), quats[order].double(), scales[order].double())
-            means2d, axes, z = reference.project(*seen, camera, settings)
-        else:
-            means2d, axes, z = (t[order] for t in projected)
-        cov, determinant = reference.covariances(axes, settings.dilation)
-        if stats is not None:
-            _fill_stats(stats, means2d, cov, order, means)
-
-        inverse = torch.stack([cov[:, 1, 1], -cov[:, 0, 1], cov[:, 0, 0]], 1) / determinant[:, None]
-        splats = _Projected(
-            means2d.float(), inverse.float(), opacities[order], tile_starts, pairs, camera.width, camera.height
-        )
-        blended, alpha = _blend(splats, torch.cat([channels[order], z[:, None].float()], 1), kernels)
+        splats = project(means, quats, scales, opacities, camera, settings, kernels, stats)
+        blended, alpha = _blend(splats, torch.cat([splats.of(channels), splats.depths[:, None]], 1), kernels)
         covered = alpha > 0
         depth = torch.where(covered, blended[..., -1] / torch.where(covered, alpha, 1), 0)
         image = blended[..., :-1]
@@ -340,7 +249,7 @@ class CudaBackend(TorchBackend):
             image = image + (1 - alpha)[..., None] * background
         ids = None
         if labels is not None:
-            ids = _heaviest(splats, labels.to(order.device)[order], alpha, kernels, settings)
+            ids = _heaviest(splats, splats.of(labels.to(means.device)), alpha, kernels, settings)
         return SplatImage(image, alpha, depth, ids)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..scene.cameras import Camera
 from ..scene.splats import to_opacities
 from . import backends, checks, shade
-from .arrays import Array, array_namespace, like
+from .arrays import Array, array_namespace, like, takes_kernels
 from .settings import RasterSettings, RasterStats, RenderOutput, SplatImage
 
 
@@ -60,7 +60,8 @@ def rasterize_splats(
     settings = settings or RasterSettings()
     if not isinstance(settings, RasterSettings):
         raise TypeError(f"settings: expected RasterSettings, got {type(settings).__name__}")
-    checks.check_splats(means, quats, scales, opacities, channels, camera, background, labels)
+    inputs = means, quats, scales, opacities, channels
+    checks.check_splats(*inputs, camera, background, labels, values=settings.exact or takes_kernels(means))
     chosen = backends.choose(backend, means)
     if background is not None:
         background = like(background, means, means.dtype)

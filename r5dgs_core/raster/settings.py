@@ -25,6 +25,8 @@ class RasterSettings:
         transmittance_min: A pixel is finished before the contribution that would reduce its transmittance to this, with
             the defaults the second one at ``alpha_max``; see `finished_at`. At least 1e-30, as pixels are float32.
         id_alpha_min: Pixels with less alpha than this get id -1. In [0, 1].
+        exact: Project, cull and sort in float64, and check the values of all inputs. Only backend "cuda" can omit
+            this, which is several times faster and never waits for the results; the other backends ignore it.
     """
 
     near_plane: float = 0.01
@@ -34,6 +36,7 @@ class RasterSettings:
     alpha_max: float = 0.99
     transmittance_min: float = 1e-4
     id_alpha_min: float = 0.5
+    exact: bool = True
 
     @property
     def finished_at(self) -> float:
@@ -73,11 +76,16 @@ class RasterStats:
         radii: Three standard deviations along the long axis of the projected Gaussian, px, 0 if not visible. [N]
         grad_norm: Norm of the gradient by the projected centre, per px of this view; set by the backward pass, 0 if not
             visible. [N]
+        capacity: Given by the caller to backend "cuda" with ``exact=False``: largest number of pairs of Gaussian and
+            tile that are drawn, so that nothing waits for their number; 0 for no limit.
+        pairs: Number of these pairs before the limit, if ``capacity`` is given; set by the call. [] int64
     """
 
     visible: Array | None = None
     radii: Array | None = None
     grad_norm: Array | None = None
+    capacity: int = 0
+    pairs: Array | None = None
 
     def fill(self, radii: Array) -> None:
         """Set all statistics before a backward pass, from the radii. [N]"""

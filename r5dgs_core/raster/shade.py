@@ -12,14 +12,14 @@ import numpy as np
 from ..scene import spherical_harmonics
 from ..scene.cameras import Camera
 from . import backends
-from .arrays import Array, array_namespace, to_host
+from .arrays import Array, array_namespace, like, takes_kernels, to_host
 from .backend import ViewPoses
 
 
 def seen_colors(
     means: Array,  # [N, 3]
     sh: Array,  # [N, K, 3] or [N, 1, 3]
-    eyes: np.ndarray,  # [3] or [P, 3]
+    eyes: Array,  # [3] or [P, 3]
     *,
     rest: Array | None = None,  # [N, K - 1, 3]
     view_maps: np.ndarray | None = None,  # [P, 3, 3]
@@ -35,7 +35,7 @@ def seen_colors(
     Args:
         means: Centres. [N, 3]
         sh: Coefficients in the order of `spherical_harmonics.basis`; only those of degree 0 if ``rest`` is given.
-        eyes: Eye of each pose in the frame of ``means``, or one for all. [P, 3] or [3]
+        eyes: Eye of each pose in the frame of ``means``, or one for all, array or tensor. [P, 3] or [3]
         rest: Coefficients of degree 1 and higher. [N, K - 1, 3]
         view_maps: Linear map of each pose from directions to the frame of the coefficients; the result is normalised.
             None for the identity. [P, 3, 3]
@@ -83,8 +83,16 @@ def sky(sh: np.ndarray, camera: Camera) -> np.ndarray:
     return backends.on_cpu().sky(sh, camera)
 
 
-def _poses(eyes: np.ndarray, view_maps: np.ndarray | None, pose_ids: Any, n: int) -> ViewPoses:
-    """Check and copy the arguments of `seen_colors` for ``n`` Gaussians."""
+def _poses(eyes: Array, view_maps: np.ndarray | None, pose_ids: Any, n: int) -> ViewPoses:
+    """Check and copy the arguments of `seen_colors` for ``n`` Gaussians; tensors on a GPU are used as they are."""
+    if not takes_kernels(eyes):
+        maps = array_namespace(eyes).eye(3, dtype=eyes.dtype, device=eyes.device)[None]
+        if view_maps is not None:
+            maps = like(np.asarray(view_maps).reshape(-1, 3, 3), eyes, eyes.dtype)
+        count = max(len(eyes), len(maps))
+        ids = np.empty(0, np.int64) if pose_ids is None else pose_ids
+        return ViewPoses(eyes.expand(count, 3), maps.expand(count, 3, 3), ids)
+    eyes = to_host(eyes)
     eyes = np.asarray(eyes, np.float64).reshape(-1, 3)
     maps = np.eye(3)[None] if view_maps is None else np.asarray(view_maps, np.float64).reshape(-1, 3, 3)
     count = max(len(eyes), len(maps))

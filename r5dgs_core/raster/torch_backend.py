@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ class TorchBackend(Backend):
 
     def for_inputs(self, like: Array) -> Backend:
         """See `Backend.for_inputs`."""
-        return _ArrayAdapter(self) if isinstance(like, np.ndarray) else self
+        return ArrayAdapter(self) if isinstance(like, np.ndarray) else self
 
     def seen_colors(
         self, means: Tensor, sh: Tensor, rest: Tensor | None, factor: Tensor | None, poses: ViewPoses
@@ -62,8 +63,8 @@ class TorchBackend(Backend):
 def seen_colors(means: Tensor, sh: Tensor, rest: Tensor | None, factor: Tensor | None, poses: ViewPoses) -> Tensor:
     """Implement `Backend.seen_colors` for tensors of any dtype and device, differentiable."""
     sh = sh if rest is None else torch.cat([sh, rest], 1)
-    ids = torch.as_tensor(poses.ids, device=means.device) if len(poses.ids) else slice(0, 1)
-    maps, eyes = (torch.as_tensor(a, dtype=means.dtype, device=means.device) for a in (poses.maps, poses.eyes))
+    ids = torch.as_tensor(poses.ids).to(means.device, non_blocking=True) if len(poses.ids) else slice(0, 1)
+    maps, eyes = (torch.as_tensor(a).to(means, non_blocking=True) for a in (poses.maps, poses.eyes))
     offsets = (maps[ids] @ (means - eyes[ids])[..., None])[..., 0]
     square = (offsets * offsets).sum(-1, keepdim=True)
     at_the_eye = square <= 0
@@ -73,49 +74,57 @@ def seen_colors(means: Tensor, sh: Tensor, rest: Tensor | None, factor: Tensor |
     return colors if factor is None else colors * factor[:, None]
 
 
-class _ArrayAdapter(Backend):
-    """Backend of tensors that takes and returns arrays, without gradients."""
+class ArrayAdapter(Backend):
+    """Backend of tensors that takes and returns arrays, without gradients.
 
-    def __init__(self, inner: TorchBackend):
+    Args:
+        inner: The backend.
+        device: Device of its tensors. "auto" never selects one that is not the CPU for arrays.
+    """
+
+    def __init__(self, inner: TorchBackend, device: str = "cpu"):
         self.name = inner.name  # type: ignore[misc]
         self._inner = inner
+        self._device = device
 
     def hardware(self) -> str:
         return self._inner.hardware()
 
     def suits(self, like: Array) -> bool:
-        return self._inner.suits(_tensor(like))
+        return self._device == "cpu" and self._inner.suits(self._tensor(like))
 
     def why_unavailable(self, like: Array) -> str | None:
-        return self._inner.why_unavailable(_tensor(like))
+        kind = torch.from_numpy(to_array(like[:0])).dtype
+        return self._inner.why_unavailable(SimpleNamespace(device=torch.device(self._device), dtype=kind))
 
     @torch.no_grad()
     def rasterize_splats(
         self, means, quats, scales, opacities, channels, camera, background, labels, settings, stats
     ) -> SplatImage:
+        inputs = (means, quats, scales, opacities, channels)
         found = self._inner.rasterize_splats(
-            _tensor(means), _tensor(quats), _tensor(scales), _tensor(opacities), _tensor(channels),
-            camera, _tensor(background), _tensor(labels), settings, stats,
-        )  # fmt: skip
+            *map(self._tensor, inputs), camera, self._tensor(background), self._tensor(labels), settings, stats
+        )
         _stats_to_arrays(stats)
-        return SplatImage(*(to_array(values) for values in (found.image, found.alpha, found.depth, found.ids)))
+        return SplatImage(*(_array(values) for values in (found.image, found.alpha, found.depth, found.ids)))
 
     @torch.no_grad()
     def seen_colors(self, means, sh, rest, factor, poses):
-        return to_array(self._inner.seen_colors(_tensor(means), _tensor(sh), _tensor(rest), _tensor(factor), poses))
+        return _array(self._inner.seen_colors(*map(self._tensor, (means, sh, rest, factor)), poses))
 
     def segment_weights(self, means, quats, scales, opacities, camera, segments, count, settings):
-        return self._inner.segment_weights(
-            _tensor(means), _tensor(quats), _tensor(scales), _tensor(opacities),
-            camera, _tensor(segments), count, settings,
-        )  # fmt: skip
+        inputs = map(self._tensor, (means, quats, scales, opacities))
+        return self._inner.segment_weights(*inputs, camera, self._tensor(segments), count, settings)
+
+    def _tensor(self, values: np.ndarray | None) -> Any:
+        return None if values is None else torch.from_numpy(to_array(values)).to(self._device)
 
 
-def _tensor(values: np.ndarray | None) -> Any:
-    return None if values is None else torch.from_numpy(to_array(values))
+def _array(values: Tensor | None) -> np.ndarray | None:
+    return None if values is None else to_array(values.cpu())
 
 
 def _stats_to_arrays(stats: RasterStats | None) -> None:
     """Turn the tensors of statistics into arrays."""
     if stats is not None:
-        stats.visible, stats.radii, stats.grad_norm = map(to_array, (stats.visible, stats.radii, stats.grad_norm))
+        stats.visible, stats.radii, stats.grad_norm = map(_array, (stats.visible, stats.radii, stats.grad_norm))

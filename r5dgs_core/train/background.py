@@ -30,20 +30,35 @@ class Background:
         self.params: dict[str, Tensor] = {"background": coefficients.detach().requires_grad_(learned)}
         self._bases: dict[tuple, Tensor] = {}
 
-    def image(self, camera: Camera) -> Tensor:
-        """Return the background of a camera: [3] if the colour is fixed, else [H, W, 3]."""
+    def to(self, device: torch.device) -> Background:
+        """Return the background on a device."""
+        return Background(self.params["background"].detach().to(device), self.learned)
+
+    def image(self, camera: Camera, basis: Tensor | None = None) -> Tensor:
+        """Return the background of a camera: [3] if the colour is fixed, else [H, W, 3].
+
+        Args:
+            camera: The camera.
+            basis: Harmonics of its pixels; those of `basis` if None. [H W, Kb]
+        """
         coefficients = self.params["background"]
         if not self.learned:
             return spherical_harmonics.dc_to_rgb(coefficients[0]).clamp(0, 1)
-        shape = (camera.height, camera.width, 3)
+        basis = self.basis(camera) if basis is None else basis
+        return (basis @ coefficients + 0.5).clamp(0, 1).reshape(camera.height, camera.width, 3)
+
+    def basis(self, camera: Camera) -> Tensor:
+        """Return the harmonics of a camera's pixels, cached. [H W, Kb]"""
+        coefficients, shape = self.params["background"], (camera.height, camera.width, 3)
         key = (*shape, camera.T_cam_world[:3, :3].tobytes(), camera.intrinsics.tobytes(), len(coefficients))
         if key not in self._bases:
             rays = torch.from_numpy(cameras.pixel_rays(camera).reshape(-1, 3).astype(np.float32))
             basis = spherical_harmonics.basis(rays, spherical_harmonics.degree_of(len(coefficients)))
+            basis = basis.to(coefficients.device)
             if sum(b.nbytes for b in self._bases.values()) + basis.nbytes > BASES_BYTES:
                 self._bases.clear()
             self._bases[key] = basis
-        return (self._bases[key] @ coefficients + 0.5).clamp(0, 1).reshape(shape)
+        return self._bases[key]
 
 
 def fixed(color: np.ndarray) -> Background:

@@ -36,7 +36,8 @@ def final_tensors(trainer: Trainer, progress: Progress) -> dict[str, torch.Tenso
     """Return labels, identity encodings and the training views' PSNR on the final geometry, by checkpoint names."""
     classes = {int(i): row for row, i in enumerate(trainer.object_ids)}
     group_classes = trainer.motion.group_classes(trainer.motion.tensors())
-    fallback = torch.from_numpy(group_classes)[trainer.gaussians.motion_ids]
+    device = trainer.gaussians.motion_ids.device
+    fallback = torch.from_numpy(group_classes)[trainer.gaussians.motion_ids.cpu()]
     extra: dict[str, torch.Tensor] = {"labels": fallback}
     if any(v.mask is not None for v in trainer.views):
 
@@ -52,9 +53,9 @@ def final_tensors(trainer: Trainer, progress: Progress) -> dict[str, torch.Tenso
             extra |= trainer.identity.outcome(trainer.gaussians)
         elif steps > 0:
 
-            def report(step: int, loss: float) -> None:
+            def report(step: int, loss: torch.Tensor) -> None:
                 if step % trainer.config.train.log_every == 0 or step == steps:
-                    progress({"event": "identity", "iteration": step, "iterations": steps, "loss": loss})
+                    progress({"event": "identity", "iteration": step, "iterations": steps, "loss": float(loss)})
 
             # A separate generator, so that a run resumed here draws the same numbers.
             draws = torch.Generator().manual_seed(trainer.config.train.seed + 1)
@@ -62,7 +63,7 @@ def final_tensors(trainer: Trainer, progress: Progress) -> dict[str, torch.Tenso
                 trainer.views,
                 pose,
                 classes,
-                extra["labels"],
+                extra["labels"].to(device),
                 trainer.config,
                 trainer.gaussians.means.detach(),
                 draws,
@@ -85,10 +86,10 @@ def final_tensors(trainer: Trainer, progress: Progress) -> dict[str, torch.Tenso
         shown = view_psnr.training_psnr(
             _refined(trainer),
             trainer.behind,
-            lambda view: trainer.render(trainer.normalization.camera(view.camera), view.t).numpy(),
+            lambda view: trainer.render(trainer.normalization.camera(view.camera), view.t).cpu().numpy(),
         )
     extra[checkpoint_content.TRAIN_PSNR] = torch.tensor(shown, dtype=torch.float64)
-    return extra
+    return {name: tensor.cpu() for name, tensor in extra.items()}
 
 
 def _refined(trainer: Trainer) -> Dataset:
@@ -100,11 +101,11 @@ def _refined(trainer: Trainer) -> Dataset:
 
 def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dict[str, torch.Tensor]:
     """Return the cleaned labels and the counts of changes, by their names in the checkpoint."""
-    given, ids = labels.numpy(), trainer.gaussians.motion_ids
-    params = {name: tensor.detach() for name, tensor in trainer.gaussians.params.items()}
-    tensors = {f"gaussians.{name}": tensor for name, tensor in params.items()} | trainer.motion.tensors()
+    given, tensors = labels.numpy(), trainer.state().tensors
+    params = {name: tensors[f"gaussians.{name}"] for name in trainer.gaussians.params}
+    ids = tensors["gaussians.motion_ids"]
     motion = trainer.motion.observed_motion(
-        tensors | {"gaussians.motion_ids": ids},
+        tensors,
         trainer.object_ids,
         trainer.places.shown,
         given,

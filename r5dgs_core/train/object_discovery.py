@@ -21,6 +21,7 @@ from ..config.config import Config
 from ..data.dataset import Dataset
 from ..motion import rotations
 from ..raster import rasterize_splats
+from ..raster.arrays import to_host
 from ..scene import visibility
 from ..scene.sampling import spread
 from . import motion_clusters
@@ -147,7 +148,7 @@ def _movers(trainer: Trainer) -> tuple[np.ndarray, np.ndarray]:
     motion, gaussians = trainer.motion, trainer.gaussians
     assert isinstance(motion, FieldRepresentation)
     rows = motion.movers(gaussians)
-    return rows.numpy(), torch.sigmoid(gaussians.opacity_logits[rows]).double().numpy()
+    return to_host(rows), to_host(torch.sigmoid(gaussians.opacity_logits[rows]).double())
 
 
 @torch.no_grad()
@@ -155,10 +156,9 @@ def _paths(trainer: Trainer, rows: np.ndarray) -> np.ndarray:
     """Return the positions of a field's Gaussians at the observed times. [R, S, 3]"""
     motion = trainer.motion
     assert isinstance(motion, FieldRepresentation)
-    means = trainer.gaussians.means[torch.from_numpy(rows)]
-    return (
-        torch.stack([means + motion.motion.deltas(means, float(t)).offsets for t in trainer.times], 1).double().numpy()
-    )
+    means = trainer.gaussians.means[torch.from_numpy(rows).to(trainer.gaussians.means.device)]
+    paths = torch.stack([means + motion.motion.deltas(means, float(t)).offsets for t in trainer.times], 1)
+    return to_host(paths.double())
 
 
 @torch.no_grad()
@@ -169,7 +169,7 @@ def without_unneeded_parts(trainer: Trainer, labels: np.ndarray) -> np.ndarray:
     `MIN_GAIN_DB` dB over the pixels that show it in at least one of the two renderings.
     """
     count = int(labels.max(initial=-1)) + 1
-    errors, parts_of = np.zeros((2, count)), torch.from_numpy(labels)
+    errors, parts_of = np.zeros((2, count)), torch.from_numpy(labels).to(trainer.gaussians.motion_ids)
     motion, gaussians = trainer.motion, trainer.gaussians
     assert isinstance(motion, FieldRepresentation)
     mean = gating.mean_state(motion.motion, gaussians.means, gaussians.log_scales, trainer.times)
@@ -209,7 +209,7 @@ def _drawn(trainer: Trainer, view: TrainView, splats: PosedSplats, parts_of: Ten
         labels=parts_of,
     )
     assert shown.ids is not None
-    truth = torch.from_numpy(view.image).float() / 255
+    truth = torch.from_numpy(view.image).to(splats.means.device).float() / 255
     return (shown.image - truth).square().mean(-1), shown.ids
 
 
@@ -217,10 +217,10 @@ def _drawn(trainer: Trainer, view: TrainView, splats: PosedSplats, parts_of: Ten
 def draw_masks(trainer: Trainer, labels: np.ndarray) -> list[np.ndarray]:
     """Render the masks of the training views: k + 1 for part k, 0 for the background. [H, W]"""
     kind = np.uint8 if labels.max() < 255 else np.uint16
-    result = []
+    result, parts_of = [], torch.from_numpy(labels).to(trainer.gaussians.motion_ids)
     for view in trainer.views:
-        _, ids = _drawn(trainer, view, trainer.splats(view.camera, view.t), torch.from_numpy(labels))
-        result.append(_without_specks((ids.numpy() + 1).clip(min=0).astype(kind)))
+        _, ids = _drawn(trainer, view, trainer.splats(view.camera, view.t), parts_of)
+        result.append(_without_specks((to_host(ids) + 1).clip(min=0).astype(kind)))
     return result
 
 

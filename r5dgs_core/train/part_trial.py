@@ -22,6 +22,7 @@ from ..model import track_state
 from ..model.residual_field import ResidualField
 from ..motion import rotations
 from ..motion.se3 import Pose
+from ..raster.arrays import to_host
 from ..scene import cameras, spherical_harmonics
 from . import part_clusters, registration, train_views
 from .checkpoint import Checkpoint
@@ -101,7 +102,7 @@ def error_of(trainer: Trainer, object_id: int, views: Sequence[int]) -> float:
             continue
         region = np.asarray(ndimage.binary_dilation(view.mask == object_id, iterations=registration.MARGIN), bool)
         truth = torch.from_numpy(view.image).float() / 255
-        squares = ((trainer.render(view.camera, view.t) - truth) ** 2).sum(-1).numpy().astype(np.float64)
+        squares = ((trainer.render(view.camera, view.t).cpu() - truth) ** 2).sum(-1).numpy().astype(np.float64)
         total += float(squares[region].sum())
     return total
 
@@ -176,8 +177,9 @@ class _Growth:
         if not first <= next_near <= final:
             return None
         self._motion.tracks.rebase()
-        times, quats = self._trainer.times, self._motion.tracks.base_quats[part].numpy().astype(np.float64)
-        moves = self._motion.tracks.params["translations"].detach()[part].numpy().astype(np.float64)
+        tracks = self._motion.tracks
+        times, quats = self._trainer.times, to_host(tracks.base_quats[part]).astype(np.float64)
+        moves = to_host(tracks.params["translations"][part]).astype(np.float64)
         share = (times[knot] - times[near]) / (times[near] - times[next_near])
         turn = rotations.quats_to_rotvecs(rotations.multiply(quats[near], rotations.conjugate(quats[next_near])))
         quat = rotations.multiply(rotations.rotvecs_to_quats(share * turn), quats[near])
@@ -186,24 +188,26 @@ class _Growth:
     def _join(self, first: int, final: int) -> None:
         """Move members to the part in which they and their neighbours cost least at the knots in training."""
         gaussians = self._trainer.gaussians
-        rows = np.flatnonzero(np.isin(gaussians.motion_ids.numpy(), self._parts))
-        points = gaussians.params["means"].detach().numpy()[rows].astype(np.float64)
-        weights = torch.sigmoid(gaussians.params["opacity_logits"].detach()).numpy()[rows]
+        groups = to_host(gaussians.motion_ids)
+        rows = np.flatnonzero(np.isin(groups, self._parts))
+        points = to_host(gaussians.params["means"])[rows].astype(np.float64)
+        weights = to_host(torch.sigmoid(gaussians.params["opacity_logits"].detach()))[rows]
         near = np.asarray(KDTree(points).query(points, k=min(NEIGHBOURS, len(points)))[1])
         share = weights[near] / weights[near].sum(1, keepdims=True)
         costs = np.einsum("rk,rkp->rp", share, self._costs(rows, points, first, final)[near])
-        own = np.searchsorted(self._parts, gaussians.motion_ids.numpy()[rows])
+        own = np.searchsorted(self._parts, groups[rows])
         best = costs.argmin(1)
         every = np.arange(len(rows))
         joins = costs[every, best] < JOINS * costs[every, own]
         ids = np.array(self._parts)[np.where(joins, best, own)]
-        gaussians.motion_ids[torch.from_numpy(rows)] = torch.from_numpy(ids).to(gaussians.motion_ids.dtype)
+        device = gaussians.motion_ids.device
+        gaussians.motion_ids[torch.from_numpy(rows).to(device)] = torch.from_numpy(ids).to(gaussians.motion_ids)
 
     def _costs(self, rows: np.ndarray, points: np.ndarray, first: int, final: int) -> np.ndarray:
         """Mean cost of members with the motion of each part: misses of the masks, or differences of colours. [R, P]"""
         tracks, found = self._motion.tracks, np.zeros((len(rows), len(self._parts)))
-        quats = rotations.normalize(tracks.knot_quats().detach().numpy().astype(np.float64))
-        moves, centers = tracks.params["translations"].detach().numpy(), tracks.centers.numpy()
+        quats = rotations.normalize(to_host(tracks.knot_quats()).astype(np.float64))
+        moves, centers = to_host(tracks.params["translations"]), to_host(tracks.centers)
         colors = self._colors(rows)
         for index in self._used:
             view, s = self._trainer.views[index], self._knots[index]
@@ -224,5 +228,5 @@ class _Growth:
 
     def _colors(self, rows: np.ndarray) -> np.ndarray:
         """Colours of some Gaussians. [R, 3]"""
-        sh: Tensor = self._trainer.gaussians.params["sh"].detach()[torch.from_numpy(rows), 0]
+        sh: Tensor = self._trainer.gaussians.params["sh"].detach().cpu()[torch.from_numpy(rows), 0]
         return spherical_harmonics.dc_to_rgb(sh).numpy().astype(np.float64)

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..motion import rotations
 from ..motion.se3 import Pose
+from ..raster.arrays import to_host
 from . import registration
 from .registration import BodyRegistration
 from .representations.tracks import TracksRepresentation
@@ -154,7 +155,7 @@ def _predictions(trainer: Trainer, body: int, knot: int, seen: np.ndarray) -> li
     if len(before) and len(after):
         pairs.insert(0, (before[0], after[0]))
     tracks, quats = _tracks(trainer).tracks, _quats(trainer, body)
-    own = tracks.params["translations"].detach().numpy()[body, knot].astype(np.float64)
+    own = to_host(tracks.params["translations"])[body, knot].astype(np.float64)
     nearest = [quats[side[0]] for side in (before, after) if len(side)][:1]
     return [(q, own) for q in [_between(tracks.times, quats, a, b, knot) for a, b in pairs] or nearest]
 
@@ -165,7 +166,7 @@ def _tracks(trainer: Trainer) -> TracksRepresentation:
 
 
 def _quats(trainer: Trainer, body: int) -> np.ndarray:
-    return rotations.normalize(_tracks(trainer).tracks.knot_quats().detach().numpy()[body].astype(np.float64))
+    return rotations.normalize(to_host(_tracks(trainer).tracks.knot_quats())[body].astype(np.float64))
 
 
 def _between(times: np.ndarray, quats: np.ndarray, a: int, b: int, s: int) -> np.ndarray:

@@ -17,6 +17,7 @@ from ..model.group_poses import GroupPoses
 from ..motion import rotations
 from ..motion.se3 import Pose
 from ..raster import rasterize_splats
+from ..raster.arrays import to_host
 from ..scene import cameras, sampling, spherical_harmonics
 from ..scene.cameras import Camera
 from . import train_views
@@ -59,7 +60,7 @@ class BodyRegistration:
         owner = int(motion.tracks.owners[body])
         self._radius = float(trainer.places.radii[owner - 1])
         object_id, params = int(trainer.object_ids[owner]), trainer.gaussians.params
-        rows = torch.from_numpy(np.flatnonzero(trainer.gaussians.motion_ids.numpy() == body))
+        rows = torch.nonzero(trainer.gaussians.motion_ids == body)[:, 0]
         names = ("means", "quats", "log_scales", "opacity_logits", "shading")
         self._shape = {name: params[name].detach()[rows] for name in names}
         self._shape["colors"] = spherical_harmonics.dc_to_rgb(params["sh"].detach()[rows, 0])
@@ -79,14 +80,17 @@ class BodyRegistration:
     @property
     def pose(self) -> Pose:
         """The body's pose in the tracks: unit wxyz [4] and displacement [3], float64."""
-        base, rotvec, shift = (x.numpy().astype(np.float64) for x in self._entries())
+        base, rotvec, shift = (to_host(x).astype(np.float64) for x in self._entries())
         return rotations.normalize(rotations.multiply(rotations.rotvecs_to_quats(rotvec), base)), shift
 
     def write_pose(self, pose: Pose) -> None:
         """Write a pose into the tracks."""
-        quat, shift = (torch.from_numpy(x).float() for x in pose)
-        for entry, value in zip(self._entries(), (quat, torch.zeros(3), shift), strict=True):
+        quat, shift = (self._tensor(x) for x in pose)
+        for entry, value in zip(self._entries(), (quat, torch.zeros_like(shift), shift), strict=True):
             entry.copy_(value)
+
+    def _tensor(self, values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(values).float().to(self._motion.light.device)
 
     def error(self, pose: Pose) -> float:
         """Mean squared error of the body's pixels."""
@@ -124,9 +128,9 @@ class BodyRegistration:
     @torch.no_grad()
     def _residuals(self, pose: Pose) -> np.ndarray:
         """Picture minus truth in the region of the body. [P] float64"""
-        quat, shift = (torch.from_numpy(x).float()[None] for x in pose)
+        quat, shift = (self._tensor(x)[None] for x in pose)
         placed = GroupPoses(quat, rotations.quats_to_rotmats(quat), shift)
-        group = torch.zeros(len(self._shape["means"]), dtype=torch.int64)
+        group = torch.zeros_like(self._shape["opacity_logits"], dtype=torch.int64)
         center, light = self._motion.tracks.centers[self._body][None], self._motion.light.detach()
         mine = fused_posing.pose(**self._shape, light=light, motion_ids=group, group_poses=placed, centers=center)
         found = []
@@ -136,7 +140,7 @@ class BodyRegistration:
             )
             behind = self._trainer.background.image(look.camera)
             drawn = rasterize_splats(means, quats, scales, opacities, colors, look.camera, behind).image
-            found.append((drawn.numpy() - look.truth)[look.region].ravel())
+            found.append((to_host(drawn) - look.truth)[look.region].ravel())
         return np.concatenate(found).astype(np.float64)
 
     @torch.no_grad()
@@ -152,9 +156,10 @@ class BodyRegistration:
 
     def _others_near(self, camera: Camera, splats: PosedSplats) -> torch.Tensor:
         """Rows of the Gaussians of other groups that reach a camera's picture."""
-        centers, scales = splats.means.numpy().astype(np.float64), splats.scales.amax(1).numpy()
-        other = self._trainer.gaussians.motion_ids.numpy() != self._body
-        return torch.from_numpy(np.flatnonzero(other & cameras.reached_by(camera, centers, scales)))
+        centers, scales = to_host(splats.means).astype(np.float64), to_host(splats.scales.amax(1))
+        other = to_host(self._trainer.gaussians.motion_ids) != self._body
+        rows = np.flatnonzero(other & cameras.reached_by(camera, centers, scales))
+        return torch.from_numpy(rows).to(splats.means.device)
 
 
 def views_at(trainer: Trainer, knot: int) -> list[train_views.TrainView]:
@@ -173,7 +178,7 @@ def errors(trainer: Trainer, knot: int, most: int) -> np.ndarray:
     ids = [int(i) for i in trainer.object_ids[1:]]
     sums, pixels = np.zeros(len(ids)), np.zeros(len(ids))
     for view in sampling.spread(views_at(trainer, knot), most):
-        squares = (trainer.render(view.camera, view.t).numpy() - view.image / 255.0) ** 2
+        squares = (to_host(trainer.render(view.camera, view.t)) - view.image / 255.0) ** 2
         for row, object_id in enumerate(ids):
             mine = view.mask == object_id
             if mine.sum() >= MIN_PIXELS:

@@ -124,11 +124,11 @@ def trial_steps(config: Config) -> int:
 
 def _try(trainer: Trainer, progress: Progress) -> Trial:
     """Train all bodies with residuals, and compare their errors with and without them."""
-    config, g, ids = trainer.config, trainer.gaussians, trainer.object_ids[1:]
-    opacities = torch.sigmoid(g.params["opacity_logits"].detach())
+    config, state, ids = trainer.config, trainer.state(), trainer.object_ids[1:]
+    means, motion_ids, logits = (state.tensors[f"gaussians.{n}"] for n in ("means", "motion_ids", "opacity_logits"))
     bodies = list(range(1, len(ids) + 1))
     field = residual_field.spread(
-        g.params["means"].detach(), g.motion_ids, opacities, bodies, config.residual.nodes, len(trainer.times)
+        means, motion_ids, torch.sigmoid(logits), bodies, config.residual.nodes, len(trainer.times)
     )
     unknown = np.full(len(ids), np.nan)
     draws = torch.Generator().manual_seed(config.train.seed + SEED_STEP)
@@ -137,7 +137,6 @@ def _try(trainer: Trainer, progress: Progress) -> Trial:
     nothing = Trial(field, unknown, np.zeros((2, len(ids))), held, used)
     if not field.bodies or not held:
         return nothing
-    state = trainer.state()
     trainer.restore(dataclasses.replace(state, tensors=state.tensors | residual.tensors_of(field)))
     steps = trial_steps(config)
     trainer.curriculum.queue = [used[k % len(used)] for k in range(steps)]
@@ -149,9 +148,9 @@ def _try(trainer: Trainer, progress: Progress) -> Trial:
     except TrainingError as error:
         log.warning("the trial of residuals failed, all bodies stay rigid: %s", error)
         return nothing
-    learned = residual.residual_of(trainer.state().tensors)
-    assert learned is not None
-    gains, errors = _gains(trainer, learned, held)
+    learned, trained = residual.residual_of(trainer.state().tensors), trainer.motion.residuals
+    assert learned is not None and trained is not None
+    gains, errors = _gains(trainer, trained, held)
     return Trial(learned, gains, errors, held, used)
 
 
@@ -198,4 +197,4 @@ def _squares(trainer: Trainer, field: ResidualField, index: int, truth: Tensor) 
     """Return the squared error of each pixel with ``field`` in place of the trial's field. [H, W] float64"""
     view = trainer.views[index]
     trainer.motion.residuals = field
-    return ((trainer.render(view.camera, view.t) - truth) ** 2).sum(-1).numpy().astype(np.float64)
+    return ((trainer.render(view.camera, view.t).cpu() - truth) ** 2).sum(-1).numpy().astype(np.float64)

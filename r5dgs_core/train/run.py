@@ -23,7 +23,17 @@ from ..data import memory
 from ..errors import CheckpointError, Interrupted, TrainingError
 from ..render import warm_up
 from ..time_left import Phase, TimedProgress
-from . import checkpoint, checkpoint_content, finish, interrupt, learning_curves, run_folder, step_log, view_psnr
+from . import (
+    checkpoint,
+    checkpoint_content,
+    devices,
+    finish,
+    interrupt,
+    learning_curves,
+    run_folder,
+    step_log,
+    view_psnr,
+)
 from .identity import packed_masks
 from .refinement import trial
 from .representations.representation import TRACKS
@@ -44,6 +54,7 @@ def train(
     *,
     resume: bool = False,
     overwrite: bool = False,
+    device: str | None = None,
     resume_command: str | None = None,
     progress: Progress | None = None,
 ) -> run_folder.Run:
@@ -56,6 +67,7 @@ def train(
         resume: Continue from the last checkpoint. Does nothing if training is finished.
         overwrite: Start again if the folder contains a run. Its files are kept until training is ready for the first
             step.
+        device: Device for this session, as ``train.device``, which it replaces; a run may be resumed on another device.
         resume_command: Command that resumes this run, for messages; by default a call of ``r5dgs train``.
         progress: Called with a dictionary per event (docs/reference/run_folder.md#progress). If it is a
             `TimedProgress`, its estimate of the time left also counts phases that the caller has added.
@@ -69,7 +81,9 @@ def train(
         TrainingError: A value is no longer finite, or no Gaussians are left.
         Interrupted: SIGINT or SIGTERM was received; the run can be resumed.
     """
-    request = _Request(dataset_root, Path(folder), config, resume, overwrite, resume_command)
+    if device is not None:
+        config = config.replace(**{"train.device": device})
+    request = _Request(dataset_root, Path(folder), config, resume, overwrite, device, resume_command)
     with contextlib.ExitStack() as stack:
 
         def claim() -> None:
@@ -89,6 +103,7 @@ class _Request:
     config: Config
     resume: bool
     overwrite: bool
+    device: str | None
     resume_command: str | None
 
 
@@ -137,8 +152,12 @@ def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]
     if replaces:
         kept = f"{folder} is unchanged; repeat the same command to start again"
     with interrupt.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
-        progress({"event": "prepare", "text": "kernels"})
-        warm_up.warm_up()
+        device = devices.select(run.config.train.device)
+        if device.type == devices.CPU:
+            progress({"event": "prepare", "text": "kernels"})
+            warm_up.warm_up()
+        else:
+            progress({"event": "prepare", "text": f"training on {devices.title(device)}"})
         found = _found_masks(dataset, run.config, state, progress)
         progress({"event": "prepare", "text": "images, objects, background"})
         trainer = Trainer(dataset, run.config, found)
@@ -190,6 +209,8 @@ def _open(request: _Request, dataset: datasets.Dataset) -> tuple[run_folder.Run,
             replaces,
         )
     run = run_folder.open_run(folder)
+    if request.device is not None:
+        run = dataclasses.replace(run, config=run.config.replace(**{"train.device": request.device}))
     state = None if checkpoint.newest_file(folder) is None else checkpoint.load(folder, mend=True)
     if run.digest != dataset.digest and state is None:  # no step has used the other data yet
         run = run_folder.create_run(folder, dataset, run.config)

@@ -7,7 +7,6 @@ depends on, so a resumed run gives the same numbers as an uninterrupted one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,10 +18,10 @@ from ..config.config import Config
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, TrainingError
 from ..model.gaussians import Gaussians
-from ..raster import RasterStats, rasterize_splats
+from ..raster import RasterSettings, RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from . import background as backgrounds
-from . import checkpoint_content, curriculum, losses, normalization, train_views
+from . import checkpoint_content, curriculum, devices, losses, normalization, step_graphs, train_views
 from . import optimizer as optimizers
 from .checkpoint import Checkpoint
 from .densification import densifier
@@ -32,9 +31,12 @@ from .initialization import run_start
 from .refinement import rig
 from .refinement.refinement import RefinedViews, Refinement
 from .representations import fused_posing, registry, still
+from .running_loss import RunningLoss, require_finite
+from .step_graphs import StepInputs
 
 TARGET_BYTES = 1 << 30  # maximum size of the cache of training images as floats
 MAX_CAMERAS = 256  # maximum number of cameras in tests of visibility
+DRAFT = RasterSettings(exact=False)
 FREEZE_EVERY = 100  # steps between updates of the frozen Gaussians
 
 
@@ -58,6 +60,7 @@ class Trainer:
     ):
         torch.set_num_threads(config.train.threads)
         self.dataset = dataset
+        device = devices.select(config.train.device)
         self.config = config = training_needs.resolve(config)
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         self.behind = train_views.behind(dataset, config)
@@ -84,24 +87,32 @@ class Trainer:
             self.identity.begin(self.gaussians)
         self.rates = optimizers.LearningRates(config, {} if self.identity is None else self.identity.rates)
         self.iteration = 0
-        self.running_loss = math.nan
+        self._loss = RunningLoss()
         view_times = np.array([train_views.nearest_knot(self.times, v.t) for v in self.views])
         self.curriculum = curriculum.Curriculum(config, view_times, len(self.times), self.first_time)
         self.distinct_cameras = [group[0].camera for group in train_views.by_camera(self.views, MAX_CAMERAS)]
-        self.frozen = torch.zeros(0, dtype=torch.bool)
-        self.optimizer = self.make_optimizer()
-        self.densifier = densification.make(config, self._conditions(), len(self.gaussians))
         self._targets: dict[int, Tensor] = {}
         spacing = float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
         self.refinement = Refinement(rig.of(self.views), spacing, config.train.iterations)
         self.given_views, self.views = self.views, RefinedViews(self.views, self.refinement)
-
-    def _conditions(self) -> densifier.Conditions:
+        self._known: tuple[Tensor, int, Tensor] | None = None  # motion ids, their version, and the classes
         white = self.behind is not None and bool((self.behind == 1).all())
-        cameras = [view.camera for view in self.views]
-        return densifier.conditions(
-            self.config, cameras, self.distinct_cameras, len(self.gaussians), self.generator, white
-        )
+        cameras, count = [view.camera for view in self.views], len(self.gaussians)
+        self._conditions = densifier.conditions(config, cameras, self.distinct_cameras, count, self.generator, white)
+        self._begin_on(device)
+
+    def _begin_on(self, device: torch.device) -> None:
+        """Move all tensors to a device, and begin optimisation and densification there."""
+        self.device = device
+        self.gaussians = self.gaussians.to(device)
+        self.motion = self.motion.to(device)
+        self.background = self.background.to(device)
+        if self.identity is not None:
+            self.identity.to(device)
+        self.frozen = torch.zeros(0, dtype=torch.bool, device=device)
+        self.optimizer = self.make_optimizer()
+        self.densifier = densification.make(self.config, self._conditions, len(self.gaussians), device)
+        self._graphs = step_graphs.StepGraphs(self)
 
     @property
     def params(self) -> dict[str, Tensor]:
@@ -117,15 +128,21 @@ class Trainer:
         return optimizers.make(self.gaussians.params, self._others(), self.rates)
 
     @property
+    def running_loss(self) -> float:
+        """Smoothed loss, nan before the first step."""
+        return self._loss.value
+
+    @property
     def done(self) -> bool:
         """True if all steps are taken."""
         return self.iteration >= self.config.train.iterations
 
-    def step(self) -> float:
-        """Take one step and return its loss.
+    def step(self) -> Tensor:
+        """Take one step and return its loss, a scalar on the device of the run.
 
         Raises:
-            TrainingError: The loss is not finite; the message names step, view and parameter.
+            TrainingError: The loss is not finite; the message names step, view and parameter. On a GPU, this is
+                checked every `running_loss.CHECK_EVERY` steps.
         """
         if self.iteration == 0:
             self.motion.begin(self.gaussians, self.generator)
@@ -140,9 +157,23 @@ class Trainer:
         place = f"step {self.iteration}, view {view.name}"
         for group in self.optimizer.param_groups:
             group["lr"] = self.rates.at(group["name"], self.iteration)
-        stats = RasterStats()
+        if self.iteration % FREEZE_EVERY == 0 or len(self.frozen) != len(self.gaussians):
+            # The depth of background that only one camera sees is not determined.
+            self.frozen = densifier.seen_by_one_camera(self.gaussians, self.distinct_cameras)
+        path, behind = self.motion.path(view.t, self.generator), self.given_views[index].camera
+        inputs = StepInputs(index, view, view.camera, behind, path, self._target(index))
+        loss = self._graphs.step(inputs) if self._graphs.take(inputs) else self.update(inputs, RasterStats(), place)
+        if self.device.type != devices.CPU:
+            require_finite(loss, self.optimizer, self.params, self.iteration, place)
+        self.iteration += 1
+        self._loss.add(loss)
+        self._maintain()
+        return loss
+
+    def update(self, inputs: StepInputs, stats: RasterStats, place: str = "") -> Tensor:
+        """Draw a view, update all parameters by the gradients, and return the loss; ``place`` is for messages."""
         try:
-            image, features, splats = self._draw_all(view, self.given_views[index].camera, stats)
+            image, features, splats = self._draw_all(inputs, stats)
         except ValueError as error:
             optimizers.check_finite(self.params, 0.0, place)
             raise TrainingError(
@@ -150,48 +181,36 @@ class Trainer:
                 "Remedy: lower the learning rates (--set rates.NAME=VALUE) or look at that view's camera"
             ) from error
         self.refinement.watch(splats)
-        target = self._target(index)
-        image = self.refinement.shade(image, target, index)
-        loss = losses.photometric(image, target, self.config.losses.ssim)
-        penalties = [self.motion.penalty(self.gaussians, self.iteration, self._labels)]
+        image = self.refinement.shade(image, inputs.target, inputs.index)
+        loss = losses.photometric(image, inputs.target, self.config.losses.ssim)
+        penalties = [self.motion.penalty(self.gaussians, self.iteration, self.labels)]
         penalties.append(self.densifier.penalty(self.gaussians))
         if self.identity is not None:
-            penalties.append(self.identity.loss(self.gaussians, splats, view, self.iteration, features))
+            penalties.append(self.identity.loss(self.gaussians, splats, inputs.view, self.iteration, features))
         total = loss
         for penalty in penalties:
             total = total if penalty is None else total + penalty
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
-        value = float(loss.detach())
-        if not (math.isfinite(value) and optimizers.has_finite_gradients(self.optimizer)):
-            optimizers.check_finite(self.params, value, place)
-        self.refinement.update(index, view, splats, self.iteration, lambda t: self.splats(view.camera, t))
+        loss = loss.detach()
+        if self.device.type == devices.CPU:
+            require_finite(loss, self.optimizer, self.params, self.iteration, place)
+        view = inputs.view
+        self.refinement.update(inputs.index, view, splats, self.iteration, lambda t: self.splats(view.camera, t))
         self._hide_harmonics()
-        self._freeze_single_view_centres()
-        self.optimizer.step()
-        self.densifier.observe(stats, view.camera)
-        self.iteration += 1
-        self.running_loss = value if math.isnan(self.running_loss) else 0.98 * self.running_loss + 0.02 * value
-        self._maintain()
-        return value
-
-    def _freeze_single_view_centres(self) -> None:
-        """Freeze the centres of background Gaussians that only one camera sees, as their depth is not determined."""
-        if self.iteration % FREEZE_EVERY == 0 or len(self.frozen) != len(self.gaussians):
-            self.frozen = densifier.seen_by_one_camera(self.gaussians, self.distinct_cameras)
         gradient = self.gaussians.params["means"].grad
         if gradient is not None:
-            gradient[self.frozen] = 0.0
+            gradient.masked_fill_(self.frozen[:, None], 0.0)
+        self.optimizer.step()
+        self.densifier.observe(stats, inputs.camera)
+        return loss
 
     def _draw_all(
-        self, view: train_views.TrainView, behind: Camera, stats: RasterStats
+        self, inputs: StepInputs, stats: RasterStats
     ) -> tuple[Tensor, Tensor | None, fused_posing.PosedSplats]:
-        """Render a training view: image, blended encodings (None if rendered separately) and splats.
-
-        The sky is that of the camera ``behind``, so that it need not be computed again for each correction.
-        """
-        splats = self.splats(view.camera, view.t, self.generator)
-        colors, background = splats.colors, self.background.image(behind)
+        """Render a training view: image, blended encodings (None if rendered separately) and splats."""
+        splats = self.motion.splats(self.gaussians, inputs.camera, inputs.path)
+        colors, background = splats.colors, self.background.image(inputs.behind, inputs.basis)
         together = self.identity is not None and self.identity.with_geometry
         if self.identity is not None and together:
             colors, background = self.identity.channels(self.gaussians, colors, background)
@@ -201,13 +220,16 @@ class Trainer:
             splats.scales,
             splats.opacities,
             colors,
-            view.camera,
+            inputs.camera,
             background,
+            settings=DRAFT,
             stats=stats,
         ).image
         return (image[..., :3].contiguous(), image[..., 3:], splats) if together else (image, None, splats)
 
-    def render(self, camera: Camera, t: float, behind: Camera | None = None) -> Tensor:
+    def render(
+        self, camera: Camera, t: float, behind: Camera | None = None, stats: RasterStats | None = None
+    ) -> Tensor:
         """Render a camera in normalised coordinates at a time, with the sky of another camera if given. [H, W, 3]"""
         splats = self.splats(camera, t)
         return rasterize_splats(
@@ -218,23 +240,29 @@ class Trainer:
             splats.colors,
             camera,
             self.background.image(camera if behind is None else behind),
+            settings=DRAFT,
+            stats=stats,
         ).image
 
-    def splats(self, camera: Camera, t: float, draw: torch.Generator | None = None) -> fused_posing.PosedSplats:
+    def splats(self, camera: Camera, t: float) -> fused_posing.PosedSplats:
         """Return activated Gaussians in normalised coordinates at a time, as seen by a camera."""
-        return self.motion.splats(self.gaussians, camera, t, draw)
+        return self.motion.splats(self.gaussians, camera, t)
 
-    def _labels(self) -> Tensor:
-        """Class of each Gaussian by the classifier if it is already trained, else by its motion group. [N]"""
+    def labels(self) -> Tensor:
+        """Return the class of each Gaussian by the classifier if it is already trained, else by its group. [N]"""
         if self.identity is not None:
             return self.identity.labels(self.gaussians)
-        return torch.from_numpy(self.motion.group_classes(self.motion.tensors()))[self.gaussians.motion_ids]
+        ids = self.gaussians.motion_ids
+        if self._known is None or self._known[0] is not ids or self._known[1] != ids._version:
+            classes = torch.from_numpy(self.motion.group_classes(self.motion.tensors()))
+            self._known = ids, ids._version, classes.to(self.device)[ids]
+        return self._known[2]
 
     def _target(self, index: int) -> Tensor:
         """Return a view's image in [0, 1]. Cached if all views fit into `TARGET_BYTES`, else converted on each call."""
         if index in self._targets:
             return self._targets[index]
-        target = torch.from_numpy(self.views[index].image).float() / 255
+        target = torch.from_numpy(self.views[index].image).to(self.device, non_blocking=True).float() / 255
         if sum(v.image.size for v in self.views) * 4 <= TARGET_BYTES:
             self._targets[index] = target
         return target
@@ -274,7 +302,7 @@ class Trainer:
         tensors |= optimizers.tensors(self.optimizer)
         x, y, z = (float(v) for v in self.dataset.origin + self.normalization.origin)
         return Checkpoint(
-            tensors={n: t.detach().clone() for n, t in tensors.items()},
+            tensors={n: t.detach().to("cpu", copy=True) for n, t in tensors.items()},
             representation=self.motion.name,
             iteration=self.iteration,
             entered=self.curriculum.entered,
@@ -288,16 +316,17 @@ class Trainer:
 
     def restore(self, state: Checkpoint) -> None:
         """Restore a `state` of a trainer with the same data set and configuration."""
-        tensors = {name: tensor.clone() for name, tensor in state.tensors.items()}  # training modifies them in place
+        # Copies, as training modifies them in place.
+        tensors = {name: tensor.to(self.device, copy=True) for name, tensor in state.tensors.items()}
         g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
         self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])
         self.motion = self.motion.restored(state.representation, tensors)
         if self.identity is not None:
             self.identity.restore(tensors, self.gaussians)
         self.background = backgrounds.Background(tensors["background"], self.background.learned)
-        self.object_ids = tensors["object_ids"].numpy()
+        self.object_ids = state.tensors["object_ids"].numpy().copy()
         try:
-            self.generator.set_state(tensors["generator"])
+            self.generator.set_state(state.tensors["generator"])
         except (RuntimeError, TypeError) as error:
             raise CheckpointError(
                 f"the checkpoint's 'generator' is not a state of torch's generator: {error}"
@@ -305,12 +334,12 @@ class Trainer:
         if any(len(t) != len(self.gaussians) for n, t in tensors.items() if n.startswith("gradients.")):
             raise CheckpointError(f"the checkpoint's 'gradients.*': expected {len(self.gaussians)} rows each")
         self.densifier.restore(tensors)
-        self.refinement.restore(tensors)
-        self.frozen = tensors.get(checkpoint_content.FROZEN, torch.zeros(0, dtype=torch.bool))
+        self.refinement.restore(state.tensors)
+        self.frozen = tensors.get(checkpoint_content.FROZEN, self.frozen[:0])
         self.optimizer = self.make_optimizer()
         optimizers.restore(self.optimizer, tensors)
         self.iteration = state.iteration
         self.curriculum.entered = state.entered
         self.first_time = state.first_time
         self.curriculum.queue = list(state.queue)
-        self.running_loss = state.running_loss
+        self._loss = RunningLoss(state.running_loss)

@@ -47,7 +47,9 @@ class HeldOutPsnr:
         """Return the current mean PSNR on the views, dB, for colours of 8 bits. The run's random state is preserved."""
         state = self._trainer.generator.get_state()
         with torch.random.fork_rng(devices=[]):
-            found = [psnr_8_bit(self._trainer.render(camera, t).numpy(), image) for _, camera, t, image in self._views]
+            found = [
+                psnr_8_bit(self._trainer.render(camera, t).cpu().numpy(), image) for _, camera, t, image in self._views
+            ]
         self._trainer.generator.set_state(state)
         return float(np.mean(found))
 

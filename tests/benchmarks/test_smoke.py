@@ -35,6 +35,7 @@ PROGRAMS = {
     "training.curve": ("{data}", "--iterations", "10", *SHORT),
     "raster.workloads": ("--workloads", "W0"),
     "futures.textures": ("--seeds", "1"),
+    "playback": ("{field}", "--device", "cpu", "--gaussians", "2000", "--sizes", "24"),
     "words": ("--encoder", "{encoder}"),
 }
 LONG = (  # more than five seconds each
@@ -43,6 +44,7 @@ LONG = (  # more than five seconds each
     "extrapolation.appearance",
     "extrapolation.modes",
     "futures.textures",
+    "playback",
     "raster.first_frame",
     "training.curve",
     "training.held_out_times",

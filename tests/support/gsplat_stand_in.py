@@ -8,7 +8,8 @@ import dataclasses
 
 import torch
 
-from r5dgs_core.raster import cuda
+from r5dgs_core.raster import RasterSettings, cuda, reference
+from r5dgs_core.scene.cameras import Camera
 
 COMPILED_CHANNELS = {1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 128, 129, 256, 257, 512, 513}  # gsplat 1.5 and 1.6
 
@@ -18,15 +19,15 @@ def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height, sort
     assert means2d.shape == radii.shape == (1, depths.shape[1], 2) and radii.dtype == torch.int32 and sort
     low = torch.floor((means2d[0] - radii[0]) / tile_size).clamp_min(0).int()
     high = torch.ceil((means2d[0] + radii[0]) / tile_size).int()
-    keys, pairs = [], []
-    for row in range(depths.shape[1]):
-        depth_bits = int(depths[0, row].view(torch.int32))
-        for y in range(low[row, 1], min(int(high[row, 1]), tile_height)):
-            for x in range(low[row, 0], min(int(high[row, 0]), tile_width)):
-                keys.append((y * tile_width + x) << 32 | depth_bits)
-                pairs.append(row)
-    keys, order = torch.sort(torch.tensor(keys, dtype=torch.int64), stable=True)
-    return None, keys, torch.tensor(pairs, dtype=torch.int32)[order]
+    high = torch.minimum(high, torch.tensor([tile_width, tile_height], dtype=torch.int32))
+    span = (high - low).clamp_min(0) * (radii[0] > 0).all(1, keepdim=True)
+    counts = span[:, 0] * span[:, 1]
+    pairs = torch.repeat_interleave(torch.arange(len(counts)), counts)
+    step = torch.arange(len(pairs)) - (counts.cumsum(0) - counts)[pairs]
+    x, y = low[pairs, 0] + step % span[pairs, 0], low[pairs, 1] + step // span[pairs, 0]
+    depth_bits = depths[0].contiguous().view(torch.int32).long()[pairs]
+    keys, order = torch.sort((y * tile_width + x) << 32 | depth_bits, stable=True)
+    return None, keys, pairs.int()[order]
 
 
 def isect_offset_encode(isect_ids, n_images, tile_width, tile_height):
@@ -70,7 +71,27 @@ def make_rasterizer(alpha_max):
     return rasterize_to_pixels
 
 
-STAND_IN = cuda.Kernels(isect_tiles, isect_offset_encode, make_rasterizer(0.99), "1.6.0", 1 / 255, 0.99, 1e-4)
+def fully_fused_projection(
+    means, covars, quats, scales, viewmats, Ks, width, height, eps2d=0.3, near_plane=0.01, opacities=None
+):
+    """Stands in for gsplat.fully_fused_projection: float32, and boxes of the ellipses of alpha 1/255, whole pixels."""
+    assert covars is None and all(t.dtype == torch.float32 for t in (means, quats, scales, viewmats, Ks))
+    pose, lens = viewmats[0].detach().cpu().double().numpy(), Ks[0].detach().cpu().double().numpy()
+    settings = RasterSettings(near_plane=near_plane, dilation=eps2d)
+    means2d, axes, z = reference.project(means, quats, scales, Camera(width, height, lens, pose), settings)
+    cov, determinant = reference.covariances(axes, eps2d)
+    conics = torch.stack([cov[:, 1, 1], -cov[:, 0, 1], cov[:, 0, 0]], 1) / determinant[:, None]
+    with torch.no_grad():
+        reach = (2 * torch.log(opacities * 255)).clamp_min(0).sqrt().clamp_max(3.33)
+        radii = torch.ceil(reach[:, None] * torch.diagonal(cov, dim1=1, dim2=2).sqrt())
+        size = torch.tensor([width, height], device=means.device)
+        seen = ((means2d + radii > 0) & (means2d - radii < size)).all(1) & (z >= near_plane) & (opacities >= 1 / 255)
+        radii = torch.where(seen[:, None], radii, 0).int()
+    return radii[None], means2d[None], z[None], conics[None], None
+
+
+FUNCTIONS = (isect_tiles, isect_offset_encode, make_rasterizer(0.99), fully_fused_projection)
+STAND_IN = cuda.Kernels(*FUNCTIONS, "1.6.0", 1 / 255, 0.99, 1e-4)
 OLD_STAND_IN = dataclasses.replace(
     STAND_IN, rasterize_to_pixels=make_rasterizer(0.999), version="1.5.3", alpha_max=0.999
 )

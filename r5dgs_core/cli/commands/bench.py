@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> None:
         seeds=args.seeds,
         preset=args.preset,
         config_path=args.config,
-        overrides=options.overrides(args),
+        overrides=[*options.overrides(args), *([] if args.device is None else [f"train.device={args.device}"])],
     )
 
 

@@ -68,6 +68,7 @@ def run_demo(
     preset: str | None = None,
     resume: bool,
     overwrite: bool = False,
+    device: str | None = None,
     threads: int | None = None,
     progress_kind: str,
 ) -> dict[str, Any]:
@@ -79,8 +80,7 @@ def run_demo(
     Returns:
         The evaluation.
     """
-    began = time.monotonic()
-    data = bundled_data()
+    began, data = time.monotonic(), bundled_data()
     settings = options.training_settings(out, config_path, overrides, preset=preset, resume=resume)
 
     from ...evaluation import contact_sheet, evaluate, evaluation_table
@@ -98,6 +98,7 @@ def run_demo(
             settings,
             resume=resume,
             overwrite=overwrite or _is_demo(out / run_folder.RUN_FILE),
+            device=device,
             resume_command=resume_command,
             progress=progress,
         )
@@ -107,8 +108,8 @@ def run_demo(
     if progress_kind != "json":
         terminal.console().print(evaluation_table.make(result))
         terminal.print_lines(predictability.warnings(scene))
-    stopped = f"stopped before the contact sheet; continue with: {resume_command}"
-    with make(progress_kind) as progress, interrupt.at_once(stopped), folder_lock.hold(out):
+    stopped = interrupt.at_once(f"stopped before the contact sheet; continue with: {resume_command}")
+    with make(progress_kind) as progress, stopped, folder_lock.hold(out):
         json_path = evaluate.write(result, out / run_folder.EVALUATION_FILE)
         progress({"event": "sheet", "text": "contact sheet"})
         sheet = contact_sheet.write(scene, dataset, out / "contact_sheet.png")

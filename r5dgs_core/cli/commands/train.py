@@ -43,6 +43,7 @@ def run_train(
     preset: str | None = None,
     resume: bool,
     overwrite: bool,
+    device: str | None = None,
     threads: int | None = None,
     progress_kind: str,
 ) -> None:
@@ -57,7 +58,7 @@ def run_train(
 
     options.use_threads(threads)
     with make(progress_kind) as progress:
-        trained = run.train(data, out, settings, resume=resume, overwrite=overwrite, progress=progress)
+        trained = run.train(data, out, settings, resume=resume, overwrite=overwrite, device=device, progress=progress)
         with interrupt.at_once(f"{out} is trained; stopped while its motion was fitted"):
             progress({"event": "prepare", "text": "motion past the last observed time"})
             scene = quick_fit.scene_of(trained)

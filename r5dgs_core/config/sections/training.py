@@ -9,6 +9,7 @@ BACKGROUNDS = ("auto", "learned", "white", "black")
 PLACEMENTS = ("scene", "random")
 RIGID_FORMS = ("absolute", "squared")
 CURRICULA = ("best", "first")
+DEVICES = r"auto|cpu|cuda(:\d{1,3})?"  # regular expression
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,9 @@ class TrainSection:
         sh_degree: Degree of the spherical harmonics of view-dependent colour, 0 to 3.
         sh_every: Steps between raising the trained degree by one, up to ``sh_degree`` (1000 in 3DGS). 0 trains all
             degrees from the start.
+        device: Device of the run: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, which is a CUDA device if gsplat can use
+            one, and else the CPU.
+        graphs: On a GPU, launch the steps of a field as CUDA graphs, if its configuration permits.
         threads: CPU threads of torch. More threads do not make training faster, because the tensors are small.
         checkpoint_every: Steps between checkpoints.
         log_every: Steps between lines of the log.
@@ -41,6 +45,8 @@ class TrainSection:
     background: str = "auto"
     sh_degree: int = 0
     sh_every: int = 0
+    device: str = "auto"
+    graphs: bool = True
     threads: int = 1
     checkpoint_every: int = 500
     log_every: int = 50

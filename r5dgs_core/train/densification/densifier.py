@@ -19,7 +19,7 @@ from torch import Tensor
 from ...config.config import Config
 from ...model.gaussians import Gaussians
 from ...motion import rotations
-from ...raster import RasterStats
+from ...raster import RasterStats, arrays
 from ...scene.cameras import Camera
 from ..normalization import TARGET_DISTANCE
 
@@ -112,17 +112,25 @@ class Strategy(Protocol):
 class ScreenGradients:
     """Mean screen-space gradient of each Gaussian over the views that show it, and its largest radius, px."""
 
-    def __init__(self, count: int):
-        self.total = torch.zeros(count)
-        self.views = torch.zeros(count)
-        self.radii = torch.zeros(count)
+    def __init__(self, count: int, device: torch.device | str = "cpu"):
+        self.total = torch.zeros(count, device=device)
+        self.views = torch.zeros(count, device=device)
+        self.radii = torch.zeros(count, device=device)
+
+    def restarted(self, count: int) -> ScreenGradients:
+        """Return statistics without a view: these, if the number of Gaussians is the same, or new ones."""
+        if count != len(self.total):
+            return ScreenGradients(count, self.total.device)
+        for tensor in (self.total, self.views, self.radii):
+            tensor.zero_()
+        return self
 
     def add(self, grad_norm: Tensor, visible: Tensor, radii: Tensor | None = None) -> None:
         """Add one view: gradient norms per half image width [N], visibility [N] and radii in px [N]."""
         self.total += torch.where(visible, grad_norm, 0.0)
         self.views += visible
         if radii is not None:
-            self.radii = torch.maximum(self.radii, torch.where(visible, radii.to(self.radii.dtype), 0.0))
+            torch.maximum(self.radii, torch.where(visible, radii.to(self.radii.dtype), 0.0), out=self.radii)
 
     def observe(self, stats: RasterStats, camera: Camera) -> None:
         """Add the view of a training step."""
@@ -140,7 +148,7 @@ class ScreenGradients:
     @classmethod
     def of(cls, tensors: dict[str, Tensor]) -> ScreenGradients:
         """Create from `tensors`; radii, which earlier versions did not store, default to 0."""
-        made = cls(len(tensors["gradients.total"]))
+        made = cls(len(tensors["gradients.total"]), tensors["gradients.total"].device)
         for name in ("total", "views", "radii"):
             setattr(made, name, tensors.get(f"gradients.{name}", getattr(made, name)))
         return made
@@ -172,17 +180,18 @@ def grow(
     Source: 3DGS (Kerbl et al. 2023), section 5.2.
     """
     n = len(gaussians)
-    cloned, halved = chosen[~split], chosen[split]
+    chosen = chosen[torch.argsort(split.byte(), stable=True)]
+    cloned, halved = chosen.tensor_split([len(chosen) - int(split.sum())])
     source = torch.cat([cloned, halved, halved])
     new = {name: tensor[source].clone() for name, tensor in gaussians.params.items()}
     first = len(cloned)
     scales = new["log_scales"][first:].exp()
     quats = rotations.normalize(new["quats"][first:])
-    noise = torch.randn(scales.shape, generator=generator) * scales
+    noise = torch.randn(scales.shape, generator=generator).to(scales.device, non_blocking=True) * scales
     new["means"][first:] += rotations.rotate(quats, noise)
     new["log_scales"][first:] -= torch.log(torch.tensor(SPLIT_SHRINK))
     gaussians.extend(optimizer, new, gaussians.motion_ids[source])
-    remove = torch.zeros(n + len(source), dtype=torch.bool)
+    remove = split.new_zeros(n + len(source), dtype=torch.bool)
     remove[halved] = True
     return remove
 
@@ -208,12 +217,13 @@ def seen_by_one_camera(gaussians: Gaussians, eyes: Sequence[Camera]) -> Tensor:
     Returns:
         Mask. [N] bool
     """
-    found = torch.zeros(len(gaussians), dtype=torch.bool)
+    means, background = gaussians.params["means"].detach(), gaussians.motion_ids == 0
+    found = torch.zeros_like(background)
     if len(eyes) < 3:
         return found
-    means = gaussians.params["means"].detach()
-    rows = torch.nonzero(gaussians.motion_ids == 0)[:, 0]
-    count = torch.zeros(len(rows), dtype=torch.int64)
+    on_cpu = arrays.takes_kernels(means)
+    rows = torch.nonzero(background)[:, 0] if on_cpu else torch.arange(len(means), device=means.device)
+    count = torch.zeros_like(rows)
     for camera in eyes:
         k = camera.intrinsics
         p_cam = _in_camera(means[rows], camera)
@@ -221,9 +231,10 @@ def seen_by_one_camera(gaussians: Gaussians, eyes: Sequence[Camera]) -> Tensor:
         u = k[0, 0] * p_cam[:, 0] / z + k[0, 2]
         v = k[1, 1] * p_cam[:, 1] / z + k[1, 2]
         count += (p_cam[:, 2] > 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
-        rows, count = rows[count < 2], count[count < 2]
-    found[rows] = True
-    return found
+        if on_cpu:  # a GPU tests all Gaussians faster than it returns the number of the others
+            rows, count = rows[count < 2], count[count < 2]
+    found[rows] = count < 2
+    return found & background
 
 
 def floaters(gaussians: Gaussians, eyes: Sequence[Camera], distance: float) -> Tensor:
@@ -237,17 +248,21 @@ def floaters(gaussians: Gaussians, eyes: Sequence[Camera], distance: float) -> T
     Returns:
         Mask. [N] bool
     """
-    found = seen_by_one_camera(gaussians, eyes) if distance > 0 else torch.zeros(len(gaussians), dtype=torch.bool)
-    rows = torch.nonzero(found)[:, 0]
-    means = gaussians.params["means"].detach()[rows]
-    near = torch.zeros(len(rows), dtype=torch.bool)
+    if distance <= 0:
+        return torch.zeros_like(gaussians.motion_ids, dtype=torch.bool)
+    found, means = seen_by_one_camera(gaussians, eyes), gaussians.params["means"].detach()
+    on_cpu = arrays.takes_kernels(means)
+    rows = torch.nonzero(found)[:, 0] if on_cpu else torch.arange(len(means), device=means.device)
+    near = torch.zeros_like(rows, dtype=torch.bool)
     for camera in eyes:
-        near |= _in_camera(means, camera).norm(dim=1) < distance
-    found[rows] = near
-    return found
+        near |= _in_camera(means[rows], camera).norm(dim=1) < distance
+    if on_cpu:
+        found[rows] = near
+        return found
+    return found & near
 
 
 def _in_camera(means: Tensor, camera: Camera) -> Tensor:
     """Return points [N, 3] in the frame of a camera. [N, 3]"""
-    T = torch.from_numpy(camera.T_cam_world).float()
+    T = torch.from_numpy(camera.T_cam_world).float().to(means.device, non_blocking=True)
     return means @ T[:3, :3].T + T[:3, 3]

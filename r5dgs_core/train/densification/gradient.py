@@ -24,11 +24,12 @@ class _Gradients:
     Args:
         conditions: Properties of the run.
         count: Number of Gaussians.
+        device: Their device.
     """
 
-    def __init__(self, conditions: Conditions, count: int):
+    def __init__(self, conditions: Conditions, count: int, device: torch.device | str = "cpu"):
         self.conditions = conditions
-        self.gradients = ScreenGradients(count)
+        self.gradients = ScreenGradients(count, device)
 
     def penalty(self, gaussians: Gaussians) -> Tensor | None:
         """See `densifier.Strategy.penalty`."""
@@ -57,10 +58,11 @@ class TopGradientShare(_Gradients):
         section: Thresholds.
         conditions: Properties of the run.
         count: Number of Gaussians.
+        device: Their device.
     """
 
-    def __init__(self, section: DensifySection, conditions: Conditions, count: int):
-        super().__init__(conditions, count)
+    def __init__(self, section: DensifySection, conditions: Conditions, count: int, device: torch.device | str = "cpu"):
+        super().__init__(conditions, count, device)
         self.section = section
         self.width_limit = section.prune_width * conditions.image_width * conditions.pixel_size
 
@@ -85,7 +87,7 @@ class TopGradientShare(_Gradients):
         score = self.gradients.mean()
         room = max(0, conditions.cap - n)
         count = int(min(section.share * n, room, int((score > section.gradient).sum())))
-        remove = torch.zeros(n, dtype=torch.bool)
+        remove = torch.zeros_like(score, dtype=torch.bool)
         if count > 0:
             chosen = score.topk(count).indices
             split = gaussians.log_scales[chosen].exp().amax(1) > section.split_pixels * conditions.pixel_size
@@ -94,7 +96,7 @@ class TopGradientShare(_Gradients):
         remove |= gaussians.log_scales.exp().amax(1) > self.width_limit
         remove |= densifier.floaters(gaussians, conditions.eyes, section.prune_near)
         gaussians.keep(optimizer, ~remove)
-        self.gradients = ScreenGradients(len(gaussians))
+        self.gradients = self.gradients.restarted(len(gaussians))
 
 
 class AdaptiveDensityControl(_Gradients):
@@ -106,10 +108,13 @@ class AdaptiveDensityControl(_Gradients):
         section: Thresholds.
         conditions: Properties of the run.
         count: Number of Gaussians.
+        device: Their device.
     """
 
-    def __init__(self, section: DensifyDefaultSection, conditions: Conditions, count: int):
-        super().__init__(conditions, count)
+    def __init__(
+        self, section: DensifyDefaultSection, conditions: Conditions, count: int, device: torch.device | str = "cpu"
+    ):
+        super().__init__(conditions, count, device)
         self.section = section
 
     def after_step(
@@ -137,7 +142,7 @@ class AdaptiveDensityControl(_Gradients):
         section, conditions, n = self.section, self.conditions, len(gaussians)
         score, radii = self.gradients.mean(), self.gradients.radii
         count = min(max(0, conditions.cap - n), int((score >= section.gradient).sum()))
-        remove = torch.zeros(n, dtype=torch.bool)
+        remove = torch.zeros_like(score, dtype=torch.bool)
         if count > 0:
             chosen = score.topk(count).indices
             split = gaussians.log_scales[chosen].exp().amax(1) > section.percent_dense * conditions.extent
@@ -147,7 +152,7 @@ class AdaptiveDensityControl(_Gradients):
             remove |= gaussians.log_scales.exp().amax(1) > section.prune_extent * conditions.extent
             remove[:n] |= radii > section.prune_radius
         gaussians.keep(optimizer, ~remove)
-        self.gradients = ScreenGradients(len(gaussians))
+        self.gradients = self.gradients.restarted(len(gaussians))
 
     @torch.no_grad()
     def reset(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ...config.sections.densification import DensifyMcmcSection
 from ...model.gaussians import Gaussians
 from ...motion import rotations
-from ...raster import RasterStats
+from ...raster import RasterStats, arrays
 from ...scene.cameras import Camera
 from . import densifier
 from .densifier import Conditions
@@ -46,7 +46,10 @@ def divided(
     # sum over j = 1..N of C(N, j) (-1)^(j-1) o'^j / sqrt(j)
     total = torch.zeros_like(o)
     term = torch.ones_like(o)
-    for j in range(1, int(counts.max()) + 1 if len(counts) else 1):
+    largest = MAX_REPLACEMENTS
+    if arrays.takes_kernels(counts):  # elsewhere, reading the largest count takes longer than terms that are 0
+        largest = int(counts.max()) if len(counts) else 0
+    for j in range(1, largest + 1):
         term = term * (n - j + 1).clamp(min=0) / j * each
         total += (1 if j % 2 else -1) * term / j**0.5
     return each.to(opacities.dtype), (o / total).to(opacities.dtype)
@@ -100,10 +103,11 @@ class MCMC:
         opacities = torch.sigmoid(gaussians.params["opacity_logits"])
         dead = opacities <= self.section.dead_opacity
         live = torch.where(dead, 0.0, opacities)
-        rows = torch.nonzero(dead)[:, 0]
-        if len(rows) == 0 or not (live > 0).any():
+        count, sources = torch.stack([dead.sum(), (live > 0).sum()]).tolist()
+        if count == 0 or sources == 0:
             return
-        source = self._draw(live, len(rows))
+        rows = torch.argsort((~dead).byte(), stable=True)[:count]
+        source = self._draw(live, count)
         self._divide(gaussians, source)
         for tensor in gaussians.params.values():
             tensor[rows] = tensor[source]
@@ -139,6 +143,7 @@ class MCMC:
         opacities = torch.sigmoid(params["opacity_logits"])
         gate = torch.sigmoid(GATE_SLOPE * (GATE_OPACITY - opacities))
         draws = torch.randn(params["means"].shape, generator=self.conditions.generator)
+        draws = draws.to(opacities.device, non_blocking=True)
         quats = rotations.normalize(params["quats"])
         own = rotations.rotate(rotations.conjugate(quats), draws)
         noise = rotations.rotate(quats, own * (2 * params["log_scales"]).exp())
@@ -147,15 +152,18 @@ class MCMC:
     def _draw(self, weights: Tensor, count: int) -> Tensor:
         """Draw rows by weight, with replacement. [count]"""
         edges = weights.double().cumsum(0)
-        draws = torch.rand(count, generator=self.conditions.generator, dtype=torch.float64) * edges[-1]
-        rows = torch.searchsorted(edges, draws, right=True)
-        return rows.clamp(max=int(torch.nonzero(weights).max()))
+        draws = torch.rand(count, generator=self.conditions.generator, dtype=torch.float64)
+        draws = draws.to(edges.device, non_blocking=True) * edges[-1]
+        last = len(weights) - 1 - (weights > 0).flip(0).int().argmax()  # last row with a weight
+        return torch.searchsorted(edges, draws, right=True).minimum(last)
 
     def _divide(self, gaussians: Gaussians, source: Tensor) -> None:
         """Set opacity and size of each drawn Gaussian so that it and its copies together look like the original."""
         opacities = torch.sigmoid(gaussians.params["opacity_logits"])
-        rows, times = source.unique(return_counts=True)
-        each, factor = divided(opacities[rows].clamp(max=1 - 1e-6), (times + 1).clamp(max=MAX_REPLACEMENTS))
+        times = torch.zeros_like(gaussians.motion_ids).index_add(0, source, torch.ones_like(source))
+        drawn = times > 0
+        each, factor = divided(opacities.clamp(max=1 - 1e-6), (times + 1).clamp(max=MAX_REPLACEMENTS))
         each = each.clamp(min=self.section.dead_opacity, max=1 - 1e-6)
-        gaussians.params["opacity_logits"][rows] = torch.logit(each)
-        gaussians.params["log_scales"][rows] += factor.log()[:, None]
+        logits, log_scales = gaussians.params["opacity_logits"], gaussians.params["log_scales"]
+        logits.copy_(torch.where(drawn, torch.logit(each), logits))
+        log_scales.add_(torch.where(drawn, factor.log(), 0.0)[:, None])

@@ -43,8 +43,8 @@ class _PixelCrossEntropy(torch.autograd.Function):
         classes, dims = weight.shape
         pixels, wanted = features.detach().reshape(-1, dims), target.reshape(-1)
         weight, bias = weight.detach(), bias.detach()
-        counted = int((wanted >= 0).sum())
-        share = 1 / (max(counted, 1) * math.log(max(classes, 2)))
+        counted = (wanted >= 0).sum().clamp(min=1).double()
+        share = (1 / (counted * math.log(max(classes, 2)))).to(pixels.dtype)
         total = pixels.new_zeros(())
         by_features, by_weight, by_bias = torch.empty_like(pixels), torch.zeros_like(weight), torch.zeros_like(bias)
         block = max(1, BLOCK_BYTES // (classes * pixels.element_size()))
@@ -125,7 +125,7 @@ class Neighbourhood:
         """Return the rows of the nearest other points, nearest first.
 
         Args:
-            rows: Queried points. [M] int64
+            rows: Queried points, on the CPU. [M] int64
             count: Neighbours of each, k.
 
         Returns:
@@ -134,9 +134,8 @@ class Neighbourhood:
         count = min(count, len(self.points) - 1)
         if count < 1 or len(rows) == 0:
             return rows.new_zeros(len(rows), max(count, 0))
-        asking = rows.cpu()
-        found = np.asarray(self._tree.query(self.points[asking].numpy(), count + 1)[1])
+        found = np.asarray(self._tree.query(self.points[rows].numpy(), count + 1)[1])
         # If points coincide, the tree may return others before the queried one, or not return it at all.
-        own = found == asking.numpy()[:, None]
+        own = found == rows.numpy()[:, None]
         own[~own.any(1), -1] = True
-        return torch.from_numpy(found[~own].reshape(len(rows), count).astype(np.int64)).to(rows.device)
+        return torch.from_numpy(found[~own].reshape(len(rows), count).astype(np.int64))

@@ -14,12 +14,14 @@ import torch
 from torch import Tensor
 
 from ...config.config import Config
-from ...raster import rasterize_splats
+from ...raster import RasterSettings, rasterize_splats
 from ...scene.scene import IDENTITY_DIM
 from ..representations.fused_posing import PosedSplats
 from ..train_views import TrainView
 from . import identity_losses
 from .label_votes import class_map
+
+DRAFT = RasterSettings(exact=False)
 
 
 def train_encodings(
@@ -30,7 +32,7 @@ def train_encodings(
     config: Config,
     means: Tensor,
     generator: torch.Generator,
-    progress: Callable[[int, float], None] | None = None,
+    progress: Callable[[int, Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Train identity encodings and their linear classifier on the masks.
 
@@ -58,7 +60,7 @@ def train_encodings(
     neighbourhood = identity_losses.Neighbourhood(means) if agreement.counts else None
     masked = [v for v in views if v.mask is not None]
     count = max(classes.values()) + 1
-    weight, bias = distinct_classes(count, generator)
+    weight, bias = (tensor.to(labels.device) for tensor in distinct_classes(count, generator))
     encodings = weight[labels].clone().requires_grad_(True)
     weight.requires_grad_(True)
     bias.requires_grad_(True)
@@ -68,7 +70,7 @@ def train_encodings(
     for step in range(section.iterations):
         queue = queue or torch.randperm(len(masked), generator=generator).tolist()
         view = masked[queue.pop()]
-        target = class_map(view, classes)
+        target = class_map(view, classes, encodings.device)
         with torch.no_grad():
             splats = pose(view)
         image = rasterize(splats, encodings, view)
@@ -79,7 +81,7 @@ def train_encodings(
         loss.backward()
         optimizer.step()
         if progress is not None:
-            progress(step + 1, float(loss.detach()))
+            progress(step + 1, loss.detach())
     return encodings.detach(), weight.detach(), bias.detach()
 
 
@@ -119,7 +121,7 @@ class Agreement:
         """
         rows = torch.randint(len(encodings), (self._section.samples,), generator=generator)
         found = neighbourhood.nearest(rows, self._section.neighbours)
-        both = torch.cat([rows[:, None], found], dim=1)
+        both = torch.cat([rows[:, None], found], dim=1).to(encodings.device, non_blocking=True)
         # index_select sums its gradients in the same order on any number of threads; indexing does not.
         answers = encodings.index_select(0, both.reshape(-1)) @ weight.T + bias
         probabilities = answers.softmax(dim=1).reshape(*both.shape, -1)
@@ -152,4 +154,5 @@ def rasterize(splats: PosedSplats, channels: Tensor, view: TrainView) -> Tensor:
         splats.opacities.detach(),
         channels,
         view.camera,
+        settings=DRAFT,
     ).image

@@ -84,6 +84,10 @@ class JointIdentity:
         named = {"classifier.weight": weight, "classifier.bias": bias}
         self.params = {n: t.detach().clone().contiguous().requires_grad_(True) for n, t in named.items()}
 
+    def to(self, device: torch.device) -> None:
+        """Move the classifier to a device."""
+        self._set_classifier(*(tensor.detach().to(device) for tensor in self.params.values()))
+
     def begin(self, gaussians: Gaussians) -> None:
         """Initialise the encodings of the Gaussians.
 
@@ -130,7 +134,7 @@ class JointIdentity:
             if not self.with_geometry and iteration % section.every == 0:
                 features = identity_training.rasterize(splats, gaussians.identities, view)
             if features is not None:
-                target = class_map(view, self._classes)
+                target = class_map(view, self._classes, features.device)
                 terms.append(section.weight * identity_losses.pixel_cross_entropy(features, weight, bias, target))
         if iteration % section.regularise_every == 0 and self._agreement.counts:
             near = self._neighbours(gaussians, iteration)
@@ -175,7 +179,7 @@ class JointIdentity:
     def restore(self, tensors: dict[str, Tensor], gaussians: Gaussians) -> None:
         """Restore the state from `tensors` and the Gaussians of that state. Call it before the optimizer is created."""
         self._set_classifier(tensors["identity.classifier.weight"], tensors["identity.classifier.bias"])
-        self._generator.set_state(tensors["identity.generator"])
+        self._generator.set_state(tensors["identity.generator"].cpu())
         self._neighbourhood, self._found_for = None, None
         if "identity.points" in tensors:
             self._neighbourhood = identity_losses.Neighbourhood(tensors["identity.points"])

@@ -31,14 +31,14 @@ def votes(
         count: Number of Gaussians, N.
 
     Returns:
-        Sums of blending weights, pixels. [N, C]
+        Sums of blending weights, pixels, on the CPU. [N, C]
     """
     kinds = max(classes.values(), default=0) + 1
     weights = torch.zeros(count, kinds)
     for view in spread([v for v in views if v.mask is not None], VOTE_VIEWS):
-        target = class_map(view, classes)
         with torch.no_grad():
             splats = pose(view)
+        target = class_map(view, classes, splats.means.device)
         given = (splats.means, splats.quats, splats.scales, splats.opacities)
         weights += torch.from_numpy(segment_weights(*given, view.camera, target, kinds).T.toarray())
     return weights
@@ -49,9 +49,9 @@ def elect(weights: Tensor, fallback: Tensor) -> Tensor:
     return torch.where(weights.amax(1) > 1e-3, weights.argmax(1), fallback)
 
 
-def class_map(view: TrainView, classes: dict[int, int]) -> Tensor:
+def class_map(view: TrainView, classes: dict[int, int], device: torch.device | str = "cpu") -> Tensor:
     """Return the class of each pixel, -1 for ids without a class. [H, W] int64"""
     assert view.mask is not None
     table = np.full(max(int(view.mask.max(initial=0)), *classes) + 1, -1, np.int64)
     table[list(classes)] = list(classes.values())
-    return torch.from_numpy(table[view.mask])
+    return torch.from_numpy(table[view.mask]).to(device, non_blocking=True)

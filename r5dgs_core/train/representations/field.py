@@ -44,6 +44,31 @@ HORIZON = 14 / 15  # default horizon as a share of the observed span (0.70 of 0.
 
 
 @dataclass(frozen=True)
+class Path:
+    """How the Gaussians reach a time in a training step.
+
+    Attributes:
+        through_trd: True if the field moves them to ``start``, and the TRD from there to ``end``; False if the field
+            moves them to ``end``.
+        start: Scene time, a number or a tensor [].
+        end: Scene time, a number or a tensor []; one TRD step from ``start`` if it is a tensor.
+    """
+
+    through_trd: bool
+    start: float | Tensor
+    end: float | Tensor
+
+    @property
+    def numbers(self) -> list[float]:
+        """Start and end, for `from_buffer`."""
+        return [float(self.start), float(self.end)]
+
+    def from_buffer(self, buffer: Tensor) -> Path:
+        """Return the path that reads `numbers` from a tensor."""
+        return Path(self.through_trd, buffer[0], buffer[1])
+
+
+@dataclass(frozen=True)
 class MovedGaussians:
     """State of the moved Gaussians at a time.
 
@@ -81,7 +106,16 @@ class FieldRepresentation(Representation):
         self._tracks = tracks
         self._first = first
         self._last: MovedGaussians | None = None
+        self._known: tuple[Tensor, int, Tensor] | None = None  # motion ids, their version, and the movers
         self._iteration = config.field.warm_up  # a field that is not in training is past the warm-up
+
+    def to(self, device: torch.device) -> FieldRepresentation:
+        """See `Representation.to`."""
+        self.motion.field.to(device)
+        self.motion.trd.to(device)
+        self.light = self.light.detach().to(device).requires_grad_(True)
+        self._tracks = self._tracks.to(device)
+        return self
 
     @property
     def params(self) -> dict[str, Tensor]:
@@ -95,15 +129,44 @@ class FieldRepresentation(Representation):
     def movers(self, gaussians: Gaussians) -> Tensor:
         """Return the rows that the networks move; none during the warm-up. [R] int64"""
         if self._iteration < self._config.field.warm_up:
-            return torch.zeros(0, dtype=torch.int64)
-        return gating.movers(gaussians.motion_ids, self._tracks.bodies, self.times, self._config)
+            return gaussians.motion_ids.new_zeros(0)
+        ids = gaussians.motion_ids
+        if self._known is None or self._known[0] is not ids or self._known[1] != ids._version:
+            rows = gating.movers(ids, self._tracks.bodies, self.times, self._config)
+            self._known = ids, ids._version, rows
+        return self._known[2]
 
-    def splats(
-        self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
-    ) -> fused_posing.PosedSplats:
+    def path(self, t: float, draw: torch.Generator) -> Path:
+        """Return a random path through field and TRD to a time of a training step."""
+        motion, h = self.motion, self.motion.step
+        if t > motion.horizon:
+            return Path(True, motion.horizon, t)
+        through, sign = torch.rand(2, generator=draw).tolist()
+        if t < motion.start + h or through >= self._config.field.trd_share:
+            return Path(False, t, t)
+        return Path(True, min(max(t - h if sign < 0.5 else t + h, motion.start), motion.horizon), t)
+
+    def graph_state(self) -> tuple[Tensor | None, ...]:
+        """See `Representation.graph_state`."""
+        return self.light, self._known[2] if self._known is not None else None
+
+    def graph_kind(self, path: Path, iteration: int) -> tuple | None:
+        """See `Representation.graph_kind`."""
+        one_step = abs(path.end - path.start) <= self.motion.step * (1 + 1e-9)
+        calm = self._measured and iteration < gating.gate_step(self._config)
+        warm = iteration < self._config.field.warm_up
+        return None if warm or not one_step else (path.through_trd, calm, self._pulls_rigidly(iteration))
+
+    def _pulls_rigidly(self, iteration: int) -> bool:
+        """Return True if a step has L_rigid."""
+        losses = self._config.losses
+        started = iteration >= losses.rigid_start * self._config.train.iterations
+        return self._config.field.variant == "r5dgs_extra" and losses.rigid > 0 and started
+
+    def splats(self, gaussians: Gaussians, camera: Camera, t: float | Path) -> fused_posing.PosedSplats:
         """See `Representation.splats`."""
         params = gaussians.params
-        moved = self.move(gaussians, t, draw)
+        moved = self.move(gaussians, t)
         self._last = moved
         rows = moved.rows
         means = params["means"].index_add(0, rows, moved.offsets)
@@ -117,7 +180,8 @@ class FieldRepresentation(Representation):
                 means.detach(), params["sh"], np.asarray(camera.center)[None], rest=params["sh_rest"]
             )
             # The harmonics of moved Gaussians are defined in their own frames.
-            seen = means.detach()[rows] - torch.from_numpy(np.asarray(camera.center)).float()
+            eye = torch.from_numpy(np.asarray(camera.center)).float().to(means.device, non_blocking=True)
+            seen = means.detach()[rows] - eye
             seen = rotations.rotate(rotations.conjugate(moved.quats.detach()), seen / seen.norm(dim=1, keepdim=True))
             both = torch.cat([params["sh"][rows], params["sh_rest"][rows]], dim=1)
             colors = colors.index_copy(0, rows, spherical_harmonics.to_rgb(both, seen))
@@ -147,25 +211,17 @@ class FieldRepresentation(Representation):
         groups = gating.rigid_groups(ids, tracks, field_fitting.ALONE)
         field_fitting.fit_trd(self.motion, means, groups, trd_steps, self._config.field.twist, draw)
 
-    def move(self, gaussians: Gaussians, t: float, draw: torch.Generator | None = None) -> MovedGaussians:
-        """Return the moved Gaussians at a time.
-
-        With ``draw`` (in training) they take a random path through field and TRD, otherwise that of `FieldMotion.at`.
-        """
-        rows = self.movers(gaussians)
+    def move(self, gaussians: Gaussians, t: float | Path) -> MovedGaussians:
+        """Return the moved Gaussians at a time, on the path of a training step or else that of `FieldMotion.at`."""
+        rows, motion = self.movers(gaussians), self.motion
         before = gaussians.params["means"].detach()[rows]
-        deltas = self._train_path(before, t, draw) if draw is not None else self.motion.at(before, t)
+        if not isinstance(t, Path):
+            deltas = motion.at(before, t)
+        elif t.through_trd:
+            deltas = motion.through(before, t.start, t.end, motion.step)
+        else:
+            deltas = motion.deltas(before, t.end)
         return MovedGaussians(rows, before, deltas.offsets, deltas.quats, deltas.log_scales)
-
-    def _train_path(self, means: Tensor, t: float, draw: torch.Generator) -> deformation.Deltas:
-        motion, h = self.motion, self.motion.step
-        if t > motion.horizon:
-            return motion.through(means, motion.horizon, t, h)
-        through, sign = torch.rand(2, generator=draw).tolist()
-        if t < motion.start + h or through >= self._config.field.trd_share:
-            return motion.deltas(means, t)
-        start = min(max(t - h if sign < 0.5 else t + h, motion.start), motion.horizon)
-        return motion.through(means, start, t, h)
 
     def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
         """Return the sum of distance from rest (until the gate), stiffness, and L_rigid for variant ``r5dgs_extra``."""
@@ -181,13 +237,12 @@ class FieldRepresentation(Representation):
         groups = gating.rigid_groups(gaussians.motion_ids[moved.rows], self._tracks, 0)
         if self._config.field.stiffness > 0:
             after = moved.before + moved.offsets
-            bent = rigidity.stiffness(moved.before, after, moved.quats, moved.log_scales, groups)
+            bent = rigidity.stiffness(moved.before, after, moved.quats, moved.log_scales, groups, self._tracks.groups)
             terms.append(self._config.field.stiffness * bent)
         losses = self._config.losses
-        started = iteration >= losses.rigid_start * self._config.train.iterations
-        if self._config.field.variant == "r5dgs_extra" and losses.rigid > 0 and started:
+        if self._pulls_rigidly(iteration):
             opacities = gaussians.opacity_logits.detach()[moved.rows].sigmoid()
-            anchors = rigidity.anchors(moved.before, labels()[moved.rows], opacities)
+            anchors = rigidity.anchors(moved.before, labels()[moved.rows], opacities, self._tracks.bodies)
             after = moved.before + moved.offsets
             terms.append(losses.rigid * rigidity.rigidity(moved.before, after, anchors, losses.rigid_form))
         return sum(terms[1:], terms[0]) if terms else None

@@ -36,9 +36,9 @@ def _optimise(parameters: Iterator[Tensor], steps: int, loss: Callable[[], Tenso
     optimizer.zero_grad(set_to_none=True)
 
 
-def _sample(count: int, generator: torch.Generator) -> Tensor:
+def _sample(count: int, generator: torch.Generator, device: torch.device) -> Tensor:
     """Draw the rows of a step. [<= ROWS] int64"""
-    return torch.randint(0, count, (min(ROWS, count),), generator=generator)
+    return torch.randint(0, count, (min(ROWS, count),), generator=generator).to(device, non_blocking=True)
 
 
 def fit_field(
@@ -71,9 +71,9 @@ def fit_field(
     times = [float(t) for t in tracks.times if t <= motion.horizon + 1e-9]
 
     def loss() -> Tensor:
-        total = torch.zeros(())
+        total = means.new_zeros(())
         for k in torch.randint(0, len(times), (4,), generator=generator).tolist():
-            rows = _sample(len(means), generator)
+            rows = _sample(len(means), generator, means.device)
             with torch.no_grad():
                 poses = tracks.poses(times[k])
                 turn = rotations.multiply(poses.quats, rotations.conjugate(home.quats))[groups[rows]]
@@ -107,7 +107,7 @@ def fit_trd(
         return
 
     def loss() -> Tensor:
-        rows = _sample(len(means), generator)
+        rows = _sample(len(means), generator, means.device)
         at, sign, reach = torch.rand(3, generator=generator).tolist()
         start = first + at * (motion.horizon - first)
         span = (0.5 + reach) * motion.step * (1 if sign < 0.5 else -1)
@@ -156,7 +156,7 @@ def cross_twist(
 def _partners(groups: Tensor, generator: torch.Generator) -> Tensor:
     """Return a row of the same group for each row, by a random cyclic shift; itself if `ALONE`. [R] int64"""
     order = torch.argsort(groups, stable=True)
-    partner = torch.arange(len(groups))
+    partner = torch.arange(len(groups), device=groups.device)
     start = int((groups == ALONE).sum())
     counts = torch.bincount(groups[groups != ALONE])
     for count in counts[counts > 0].tolist():

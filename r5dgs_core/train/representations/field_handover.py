@@ -27,7 +27,7 @@ def from_tracks(
         config: The run's configuration.
         draw: Random generator.
     """
-    made = field.FieldRepresentation(tracks, first, config)
+    made = field.FieldRepresentation(tracks, first, config).to(light.device)
     with torch.no_grad():
         made.light.copy_(light)
     pose_at_knot(gaussians, tracks, first, light.detach())
@@ -54,11 +54,11 @@ def pose_at_knot(gaussians: Gaussians, tracks: Tracks, knot: int, light: Tensor 
         quats.copy_(rotations.multiply(poses.quats[ids], quats))
         if light is None:
             return
-        sh = torch.cat([gaussians.sh, gaussians.sh_rest], dim=1).double().numpy()
-        vectors, turns = gaussians.shading.double().numpy(), poses.quats[ids].double().numpy()
+        sh = torch.cat([gaussians.sh, gaussians.sh_rest], dim=1).double().cpu().numpy()
+        vectors, turns = gaussians.shading.double().cpu().numpy(), poses.quats[ids].double().cpu().numpy()
         sh = spherical_harmonics.rotate(sh, turns)
         # Unlit surfaces start dark; factors at rest are dropped, as training assumes 1.
-        sh, vectors, _ = shading.rebind(sh, vectors, np.ones(len(sh)), turns, light.double().numpy())
+        sh, vectors, _ = shading.rebind(sh, vectors, np.ones(len(sh)), turns, light.double().cpu().numpy())
         gaussians.sh.copy_(torch.from_numpy(sh[:, :1]))
         gaussians.sh_rest.copy_(torch.from_numpy(sh[:, 1:]))
         gaussians.shading.copy_(torch.from_numpy(vectors))

@@ -7,6 +7,7 @@ so that the observed ones lie in [0, 1]; if they already do and fill at least a 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from torch import Tensor
@@ -14,6 +15,8 @@ from torch import Tensor
 from ...model import deformation
 from ...model.trd import TRD, MotionState
 from ...motion import point_dynamics, rotations
+
+Time = TypeVar("Time", float, Tensor)
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class Clock:
         scale = point_dynamics.time_unit(first, last)
         return Clock(0.0 if scale == 1.0 else first, scale)
 
-    def __call__(self, t: float) -> float:
+    def __call__(self, t: Time) -> Time:
         return (t - self.origin) / self.scale
 
 
@@ -65,15 +68,17 @@ class FieldMotion:
         self.step = step
         self.chunk = chunk
 
-    def deltas(self, means: Tensor, t: float) -> deformation.Deltas:
-        """Evaluate the field at a scene time, clamped to the horizon."""
-        return self.field(means, self.clock(min(t, self.horizon)), self.chunk)
+    def deltas(self, means: Tensor, t: float | Tensor) -> deformation.Deltas:
+        """Evaluate the field at a scene time; a number is clamped to the horizon."""
+        return self.field(means, self.clock(t if isinstance(t, Tensor) else min(t, self.horizon)), self.chunk)
 
-    def state(self, positions: Tensor, t: float) -> MotionState:
+    def state(self, positions: Tensor, t: float | Tensor) -> MotionState:
         """Evaluate the TRD at positions and a scene time, per unit of network time."""
         return self.trd(positions, self.clock(t), self.chunk)
 
-    def carry(self, positions: Tensor, state: MotionState, duration: float, step: float) -> tuple[Tensor, Tensor]:
+    def carry(
+        self, positions: Tensor, state: MotionState, duration: float | Tensor, step: float
+    ) -> tuple[Tensor, Tensor]:
         """Return positions and rotations after a signed scene time, by TRACE's integrator. [R, 3], [R, 4]"""
         return point_dynamics.rk2(
             positions,
@@ -91,7 +96,7 @@ class FieldMotion:
         step = point_dynamics.TRACE_STEP * self.clock.scale
         return deltas if t <= self.horizon else self.through(means, self.horizon, t, step)
 
-    def through(self, means: Tensor, start: float, t: float, step: float) -> deformation.Deltas:
+    def through(self, means: Tensor, start: float | Tensor, t: float | Tensor, step: float) -> deformation.Deltas:
         """Move Gaussians by the field to ``start`` and by the TRD from there to ``t``.
 
         The TRD starts at positions without gradient.

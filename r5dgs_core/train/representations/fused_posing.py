@@ -20,8 +20,9 @@ import torch
 from torch import Tensor
 
 from ...model.group_poses import GroupPoses
+from ...motion import rotations
+from ...raster import arrays, thread_pool
 from ...raster import compilation as kernels
-from ...raster import thread_pool
 
 CHUNKS = 16
 
@@ -66,6 +67,9 @@ def pose(
     Returns:
         Splats for the rasterizer; differentiable in everything but ``motion_ids`` and ``centers``.
     """
+    if not arrays.takes_kernels(means):
+        given = means, quats, log_scales, opacity_logits, colors, shading, light, motion_ids, group_poses, centers
+        return _pose_in_torch(*given)
     return PosedSplats(
         *_Pose.apply(
             means,
@@ -95,6 +99,8 @@ def activate(
 
     It is `pose` with one group at rest and no shading, so that its exponentials are the same to the bit.
     """
+    if not arrays.takes_kernels(means):
+        return PosedSplats(means, quats, log_scales.exp(), opacity_logits.sigmoid(), colors.clamp(min=0))
     at_rest = GroupPoses(torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.eye(3)[None], torch.zeros(1, 3))
     return pose(
         means,
@@ -107,6 +113,35 @@ def activate(
         torch.zeros(len(means), dtype=torch.int64),
         at_rest,
         torch.zeros(1, 3),
+    )
+
+
+def _pose_in_torch(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    opacity_logits: Tensor,
+    colors: Tensor,
+    shading: Tensor,
+    light: Tensor,
+    motion_ids: Tensor,
+    group_poses: GroupPoses,
+    centers: Tensor,
+) -> PosedSplats:
+    """Implement `pose` by the formulas of the kernels, for tensors on other devices."""
+    rotmats = group_poses.rotmats
+    arm = centers - (rotmats @ centers[..., None])[..., 0] + group_poses.displacements
+    turned_light = light @ rotmats - light
+    table = torch.cat([rotmats.flatten(1), arm, group_poses.quats, turned_light], 1)
+    # index_select sums gradients into the rows of the table; indexing would sort them first.
+    rotmat, arm, turn, towards = table.index_select(0, motion_ids).split([9, 3, 4, 3], 1)
+    lit = (1 + (towards * shading).sum(1, keepdim=True)).clamp(min=0)
+    return PosedSplats(
+        (rotmat.view(-1, 3, 3) * means[:, None]).sum(-1) + arm,
+        rotations.multiply(turn, quats),
+        log_scales.exp(),
+        opacity_logits.sigmoid(),
+        colors.clamp(min=0) * lit,
     )
 
 

@@ -48,9 +48,9 @@ def movers(motion_ids: Tensor, bodies: int, times: np.ndarray, config: Config) -
         config: The run's configuration.
     """
     if config.needs.tracks == "off" or len(times) < 2:
-        return torch.zeros(0, dtype=torch.int64)
+        return motion_ids.new_zeros(0, dtype=torch.int64)
     if mover_rule(bodies, config) == "all":
-        return torch.arange(len(motion_ids))
+        return torch.arange(len(motion_ids), device=motion_ids.device)
     return (motion_ids > 0).nonzero()[:, 0]
 
 
@@ -83,7 +83,8 @@ def distance_from_rest(offsets: Tensor, quats: Tensor, log_scales: Tensor) -> Te
         quats: Rotations applied after the canonical ones, unit wxyz. [R, 4]
         log_scales: Changes of the log scales. [R, 3]
     """
-    rest = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    rest = torch.zeros_like(quats)
+    rest[:, 0] = 1.0
     change = torch.cat([offsets, TURN * (quats - rest), TURN * log_scales], dim=-1)
     return (change.square().sum(-1) + SMOOTH**2).sqrt().mean()
 

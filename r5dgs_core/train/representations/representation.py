@@ -7,7 +7,7 @@ object, `field` by a deformation field, and `still` not at all. `registry` creat
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -43,6 +43,10 @@ class Representation:
     sorts_by_motion: ClassVar[bool] = False
     residuals: ResidualField | None = None
 
+    def to(self, device: torch.device) -> Representation:
+        """Move the state to a device, in place, and return the representation."""
+        raise NotImplementedError
+
     @property
     def params(self) -> dict[str, Tensor]:
         """Parameters for the optimizer; the name before the first dot selects the learning rate."""
@@ -55,16 +59,30 @@ class Representation:
         """Return the representation of the step ``iteration``: this one, or another one that continues from it."""
         return self
 
-    def splats(
-        self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
-    ) -> fused_posing.PosedSplats:
+    def path(self, t: float, draw: torch.Generator) -> Any:
+        """Return what `splats` takes in place of a time in a training step: a random path to it, or the time itself."""
+        return t
+
+    def graph_state(self) -> tuple[Tensor | None, ...]:
+        """Return the tensors that a graph of a step reads, and that are sometimes replaced."""
+        return ()
+
+    def graph_kind(self, path: Any, iteration: int) -> tuple | None:
+        """Return what the operations of a step depend on besides shapes; None if the step cannot be a graph.
+
+        Args:
+            path: A result of `path`, with ``numbers`` and ``from_buffer``.
+            iteration: The step.
+        """
+        return None
+
+    def splats(self, gaussians: Gaussians, camera: Camera, t: Any) -> fused_posing.PosedSplats:
         """Return activated Gaussians at a time, with colours as seen by a camera; differentiable.
 
         Args:
             gaussians: The canonical Gaussians.
             camera: The camera, normalised coordinates.
-            t: Scene time.
-            draw: Random generator of a training step; None to render an image.
+            t: Scene time, or a result of `path`.
 
         Returns:
             Splats in training coordinates.

@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from ...motion import rotations
+from ...raster import arrays
 from ...scene.visibility import SEEN_OPACITY
 
 QUAT_WEIGHT = 0.05  # weight of squared quaternion differences relative to squared distances in normalised units
+SQUARINGS = 6  # times four squares of a matrix: eigenvalues that differ by 1e-5 are separated
 SOFTENING = 1e-6  # length that keeps the gradient of a distance finite at 0
 
 
@@ -50,9 +52,36 @@ def representatives(means: Tensor, labels: Tensor, opacities: Tensor) -> Tensor:
     return torch.from_numpy(result).to(labels.device)
 
 
-def anchors(means: Tensor, labels: Tensor, opacities: Tensor) -> Tensor:
-    """Row of the representative of each Gaussian's object, -1 for those of no object; see `representatives`. [N]"""
-    rows = representatives(means, labels, opacities)
+def _representatives_in_torch(means: Tensor, labels: Tensor, opacities: Tensor, count: int) -> Tensor:
+    """Implement `representatives` for tensors on other devices. [count]"""
+    points, own, member = means.detach().double(), labels.clamp(min=0), labels > 0
+    seen = member & (opacities.detach() > SEEN_OPACITY)
+    zeros = points.new_zeros(count)
+    with_seen = zeros.index_add(0, own, seen.double()) > 0
+    chosen = torch.where(with_seen[own], seen, member)
+    sums = points.new_zeros(count, 3).index_add(0, own, points * chosen[:, None])
+    centroids = sums / zeros.index_add(0, own, chosen.double()).clamp(min=1)[:, None]
+    distances = torch.where(chosen, (points - centroids[own]).square().sum(1), torch.inf)
+    least = torch.full_like(zeros, torch.inf).scatter_reduce(0, own, distances, "amin")
+    rows = torch.arange(len(own), device=own.device)
+    nearest = torch.where(chosen & (distances == least[own]), rows, len(own))
+    result = torch.full_like(own[:1], len(own)).expand(count).scatter_reduce(0, own, nearest, "amin")
+    return torch.where(result < len(own), result, -1)
+
+
+def anchors(means: Tensor, labels: Tensor, opacities: Tensor, count: int) -> Tensor:
+    """Row of the representative of each Gaussian's object, -1 for those of no object; see `representatives`. [N]
+
+    Args:
+        means: Canonical centres. [N, 3]
+        labels: Class of each Gaussian; below 1 it belongs to no object. [N] int64
+        opacities: In [0, 1]. [N]
+        count: Number of classes.
+    """
+    if arrays.takes_kernels(means):
+        rows = representatives(means, labels, opacities)
+    else:
+        rows = _representatives_in_torch(means, labels, opacities, count)
     return torch.where(labels > 0, rows[labels.clamp(min=0)], -1)
 
 
@@ -75,7 +104,13 @@ def rigidity(before: Tensor, after: Tensor, anchor_rows: Tensor, form: str) -> T
         leaves open. ``absolute`` is ours.
     """
     rows = torch.arange(len(anchor_rows), device=anchor_rows.device)
-    members = rows[(anchor_rows >= 0) & (anchor_rows != rows)]
+    counted = (anchor_rows >= 0) & (anchor_rows != rows)
+    if not arrays.takes_kernels(after):  # a GPU computes all rows faster than it returns the number of members
+        centers = anchor_rows.clamp(min=0)
+        was, now = (_lengths(x - x.index_select(0, centers)) for x in (before.detach(), after))
+        size = (now - was).square() if form == "squared" else (now - was).abs()
+        return torch.where(counted, size, 0.0).sum() / counted.sum().clamp(min=1)
+    members = rows[counted]
     if len(members) == 0:
         return after.sum() * 0
     centers = anchor_rows[members]
@@ -84,7 +119,7 @@ def rigidity(before: Tensor, after: Tensor, anchor_rows: Tensor, form: str) -> T
     return (change.square() if form == "squared" else change.abs()).mean()
 
 
-def stiffness(before: Tensor, after: Tensor, quats: Tensor, log_scales: Tensor, groups: Tensor) -> Tensor:
+def stiffness(before: Tensor, after: Tensor, quats: Tensor, log_scales: Tensor, groups: Tensor, count: int) -> Tensor:
     """Return the mean squared deviation of positions, rotations and sizes from the best rigid motion of each group.
 
     Args:
@@ -93,9 +128,10 @@ def stiffness(before: Tensor, after: Tensor, quats: Tensor, log_scales: Tensor, 
         quats: Rotations since then, unit wxyz. [R, 4]
         log_scales: Change of the log scales. [R, 3]
         groups: Motion groups; group 0 and groups of fewer than four do not count. [R] int64
+        count: Number of groups G.
     """
     with torch.no_grad():
-        turn, shift, known = rigid_fits(before, after, groups)
+        turn, shift, known = rigid_fits(before, after, groups, count)
         goal = rotations.rotate(turn[groups], before) + shift[groups]
         counted = (groups > 0) & known[groups]
         sign = torch.where((quats * turn[groups]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
@@ -104,29 +140,56 @@ def stiffness(before: Tensor, after: Tensor, quats: Tensor, log_scales: Tensor, 
     return torch.where(counted, off, 0.0).sum() / counted.sum().clamp(min=1)
 
 
-def rigid_fits(before: Tensor, after: Tensor, groups: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def rigid_fits(before: Tensor, after: Tensor, groups: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
     """Fit the least-squares rigid motion of each group of points (Kabsch).
 
     Args:
         before: Points. [R, 3]
         after: The points after the motion. [R, 3]
         groups: Group of each. [R]
+        count: Number of groups G.
 
     Returns:
         Rotations, unit wxyz [G, 4], shifts [G, 3] of x -> q x q* + shift, and a mask of the groups with enough points.
         [G]
     """
-    count = int(groups.max()) + 1 if len(groups) else 0
-    n = torch.bincount(groups, minlength=count).to(before.dtype)
+    n = before.new_zeros(count).index_add(0, groups, torch.ones_like(before[:, 0]))
 
     def mean(x: Tensor) -> Tensor:
-        return torch.zeros(count, 3, dtype=x.dtype).index_add(0, groups, x) / n.clamp(min=1)[:, None]
+        return x.new_zeros(count, 3).index_add(0, groups, x) / n.clamp(min=1)[:, None]
 
     a, b = mean(before), mean(after)
     outer = (after - b[groups])[:, :, None] * (before - a[groups])[:, None, :]
-    spread = torch.zeros(count, 3, 3, dtype=before.dtype).index_add(0, groups, outer)
-    quats = rotations.rotmats_to_quats(rotations.nearest_rotmats(spread))
+    spread = before.new_zeros(count, 3, 3).index_add(0, groups, outer)
+    if arrays.takes_kernels(spread):
+        quats = rotations.rotmats_to_quats(rotations.nearest_rotmats(spread))
+    else:
+        quats = _nearest_quats(spread)
     return quats, b - rotations.rotate(quats, a), n >= 4
+
+
+def _nearest_quats(spread: Tensor) -> Tensor:
+    """Return the rotations nearest to matrices without a decomposition, which makes a GPU wait. [G, 3, 3] -> [G, 4]
+
+    The quaternion is the eigenvector of the largest eigenvalue of a symmetric matrix; repeated squares of the matrix
+    converge to its projector.
+
+    Source: Horn 1987, section 4.
+    """
+    s = spread.double()
+    trace = s.diagonal(dim1=-2, dim2=-1).sum(-1)
+    axis = torch.stack([s[:, 2, 1] - s[:, 1, 2], s[:, 0, 2] - s[:, 2, 0], s[:, 1, 0] - s[:, 0, 1]], -1)
+    corner = s + s.mT - trace[:, None, None] * torch.eye(3, dtype=s.dtype, device=s.device)
+    top = torch.cat([trace[:, None], axis], -1)
+    matrix = torch.cat([top[:, None], torch.cat([axis[..., None], corner], -1)], 1)
+    size = matrix.square().sum((-2, -1), keepdim=True).sqrt().clamp(min=1e-300)
+    projector = matrix / size + torch.eye(4, dtype=s.dtype, device=s.device)  # no negative eigenvalues
+    for _ in range(SQUARINGS):
+        projector = projector / projector.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
+        for _ in range(4):
+            projector = projector @ projector
+    column = projector.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    return rotations.normalize(projector.gather(2, column[:, None, None].expand(-1, 4, 1))[..., 0]).to(spread.dtype)
 
 
 def _lengths(offsets: Tensor) -> Tensor:

@@ -42,9 +42,12 @@ class StillRepresentation(Representation):
         self.centers = torch.from_numpy(start.tracks.centers.astype(np.float32))
         self.time = float(start.tracks.times[-1])
 
-    def splats(
-        self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
-    ) -> fused_posing.PosedSplats:
+    def to(self, device: torch.device) -> StillRepresentation:
+        """See `Representation.to`."""
+        self.centers = self.centers.to(device)
+        return self
+
+    def splats(self, gaussians: Gaussians, camera: Camera, t: float) -> fused_posing.PosedSplats:
         """See `Representation.splats`; the result is the same at all times."""
         params = gaussians.params
         if params["sh_rest"].shape[1] == 0:

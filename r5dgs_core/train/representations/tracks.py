@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -27,6 +28,28 @@ ROUGHNESS_EVERY = 4  # steps between evaluations of the roughness; its weight is
 REBASE_EVERY = 100  # steps
 
 
+@dataclass(frozen=True)
+class AtKnot:
+    """An observed time in a training step.
+
+    Attributes:
+        knot: The knot, a number or an int64 tensor [1].
+        there: 1 for each group that is in the scene then, 0 for others; None if all always are. [G] array or tensor
+    """
+
+    knot: int | Tensor
+    there: np.ndarray | Tensor | None
+
+    @property
+    def numbers(self) -> list[float]:
+        """Knot and presence of the groups, for `from_buffer`."""
+        return [float(self.knot), *([] if self.there is None else map(float, self.there))]
+
+    def from_buffer(self, buffer: Tensor) -> AtKnot:
+        """Return the path that reads `numbers` from a tensor."""
+        return AtKnot(buffer[:1].long(), None if self.there is None else buffer[1:].float())
+
+
 class TracksRepresentation(Representation):
     """One SE(3) track per object, with shading that turns in fixed light and shadows that follow their caster.
 
@@ -45,10 +68,18 @@ class TracksRepresentation(Representation):
         self._stiffness = tuple(
             torch.from_numpy(a).float() for a in (start.evidence.shift_stiffness, start.evidence.turn_stiffness)
         )
+        self._owners, self._casters = self.tracks.owners.numpy(), self.tracks.casters.numpy()
         self._first = start.first_time
         self._entered = (start.first_time, start.first_time)
         self._gains: Tensor | None = None  # gain of the residuals per body, dB, after the trial
         self._config = config
+
+    def to(self, device: torch.device) -> TracksRepresentation:
+        """See `Representation.to`."""
+        self.tracks = self.tracks.to(device)
+        self.light = self.light.detach().to(device).requires_grad_(True)
+        self._stiffness = tuple(tensor.to(device) for tensor in self._stiffness)
+        return self
 
     @property
     def params(self) -> dict[str, Tensor]:
@@ -66,10 +97,37 @@ class TracksRepresentation(Representation):
 
         return field_handover.from_tracks(self.tracks, self.light, gaussians, self._first, config, draw)
 
-    def splats(
-        self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
-    ) -> fused_posing.PosedSplats:
+    def path(self, t: float, draw: torch.Generator) -> float | AtKnot:
+        """Return the knot at an observed time."""
+        weights = self.tracks.knot_weights(t)
+        if len(weights) > 1:
+            return t
+        return AtKnot(next(iter(weights)), self._there(t) if self._absent.any() else None)
+
+    def graph_state(self) -> tuple[Tensor | None, ...]:
+        """See `Representation.graph_state`."""
+        params = self.tracks.params
+        residuals = None if self.residuals is None else self.residuals.values
+        return params["translations"], self.tracks.base_quats, self.light, residuals
+
+    def graph_kind(self, path: float | AtKnot, iteration: int) -> tuple | None:
+        """See `Representation.graph_kind`."""
+        all_entered = self._entered == (0, len(self.tracks.times) - 1)
+        return (iteration % ROUGHNESS_EVERY == 0,) if all_entered and isinstance(path, AtKnot) else None
+
+    def _there(self, t: float) -> np.ndarray:
+        """Return 1 for each group that is in the scene at a time, 0 for others. [G] float32"""
+        gone = self._absent[self._owners[1:] - 1, nearest_knot(self.tracks.times, t)]
+        there = np.concatenate([[1.0], ~gone]).astype(np.float32)
+        return np.concatenate([there, there[self._casters]])
+
+    def splats(self, gaussians: Gaussians, camera: Camera, t: float | AtKnot) -> fused_posing.PosedSplats:
         """See `Representation.splats`."""
+        if isinstance(t, AtKnot):
+            knots = t.knot if isinstance(t.knot, Tensor) else {t.knot: 1.0}
+            there, t = t.there, t.knot if isinstance(t.knot, Tensor) else float(self.tracks.times[t.knot])
+        else:
+            knots, there = self.tracks.knot_weights(t), self._there(t)
         poses = self.tracks.poses(t)
         centers = self.tracks.group_centers()
         params = gaussians.params
@@ -78,20 +136,21 @@ class TracksRepresentation(Representation):
         else:
             # The harmonics are defined in each group's own frame, so the camera is transformed into it.
             with torch.no_grad():
-                arm = centers + poses.displacements - torch.from_numpy(camera.center).float()
+                eye = torch.from_numpy(camera.center).float().to(centers.device, non_blocking=True)
+                arm = centers + poses.displacements - eye
                 eyes = centers - (poses.rotmats.transpose(1, 2) @ arm[..., None])[..., 0]
             colors = shade.seen_colors(
                 params["means"].detach(),
                 params["sh"],
-                eyes.numpy(),
+                eyes,
                 rest=params["sh_rest"],
                 pose_ids=gaussians.motion_ids,
             )
         means, quats, log_scales = params["means"], params["quats"], params["log_scales"]
         shading = params["shading"]
         if self.residuals is not None:
-            weights, opacities = self.tracks.knot_weights(t), torch.sigmoid(params["opacity_logits"])
-            change = self.residuals.change(means, quats, opacities, gaussians.motion_ids, weights)
+            opacities = torch.sigmoid(params["opacity_logits"])
+            change = self.residuals.change(means, quats, opacities, gaussians.motion_ids, knots)
             means = means.index_add(0, change.rows, change.offsets)
             log_scales = log_scales.index_add(0, change.rows, change.log_scales)
             quats = quats.index_copy(0, change.rows, rotations.multiply(change.quats, quats[change.rows]))
@@ -109,11 +168,10 @@ class TracksRepresentation(Representation):
             poses,
             centers,
         )
-        gone = self._absent[self.tracks.owners[1:].numpy() - 1, nearest_knot(self.tracks.times, t)]
-        if not gone.any():
+        if there is None or (isinstance(there, np.ndarray) and there.all()):
             return splats
-        there = torch.from_numpy(np.concatenate([[1.0], ~gone])).float()
-        there = torch.cat([there, there[self.tracks.casters]])
+        if isinstance(there, np.ndarray):
+            there = torch.from_numpy(there).to(means.device, non_blocking=True)
         return dataclasses.replace(splats, opacities=splats.opacities * there[gaussians.motion_ids])
 
     def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
@@ -137,7 +195,7 @@ class TracksRepresentation(Representation):
         near, next_near = knot + towards, knot + 2 * towards
         quats, shifts = self.tracks.base_quats, self.tracks.params["translations"]
         steady = entered[0] <= next_near <= entered[1]
-        ratio, turns = 0.0, torch.zeros(self.tracks.bodies, 3)
+        ratio, turns = 0.0, shifts.new_zeros(self.tracks.bodies, 3)
         if steady:
             ratio = (self.tracks.times[knot] - self.tracks.times[near]) / (
                 self.tracks.times[near] - self.tracks.times[next_near]
@@ -153,7 +211,8 @@ class TracksRepresentation(Representation):
             if beyond and steady and not gone[[knot, near]].any():
                 shifts[row, knot] = shifts[row, near] + ratio * (shifts[row, near] - shifts[row, next_near])
             else:
-                shifts[row, knot] = shifts[row, near] + torch.from_numpy(path[knot] - path[near]).float()
+                step = torch.from_numpy(path[knot] - path[near]).float().to(shifts.device, non_blocking=True)
+                shifts[row, knot] = shifts[row, near] + step
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
         """Fold learned rotations into the base rotations every `REBASE_EVERY` steps; end the shading of a ball.
@@ -189,6 +248,7 @@ class TracksRepresentation(Representation):
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Restore the state from `tensors`."""
         self.tracks = track_state.tracks_of(tensors)
+        self._owners, self._casters = self.tracks.owners.cpu().numpy(), self.tracks.casters.cpu().numpy()
         first, last = tensors.get("tracks.entered", torch.tensor([0, len(self.tracks.times) - 1])).tolist()
         self._entered = (first, last)
         self.light = tensors["light"].clone().requires_grad_(True)
@@ -198,7 +258,7 @@ class TracksRepresentation(Representation):
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
         """See `Representation.group_classes`: the object of each body; background for shadows."""
-        owners = track_state.tracks_of(tensors).owners.numpy()
+        owners = track_state.tracks_of(tensors).owners.cpu().numpy()
         return np.concatenate([owners, np.zeros(len(tensors["tracks.casters"]), np.int64)])
 
     @staticmethod

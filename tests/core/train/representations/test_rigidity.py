@@ -58,7 +58,7 @@ def test_the_first_of_equally_near_members_is_the_representative():
 def test_anchors_name_the_representative_of_each_member():
     means, labels, opacities = cloud()
     rows = rigidity.representatives(means, labels, opacities)
-    anchors = rigidity.anchors(means, labels, opacities)
+    anchors = rigidity.anchors(means, labels, opacities, int(labels.max()) + 1)
     for label, anchor in zip(labels.tolist(), anchors.tolist(), strict=True):
         assert anchor == (-1 if label < 1 else rows[label])
 
@@ -69,7 +69,7 @@ FORMS = pytest.mark.parametrize("form", ["absolute", "squared"])
 @FORMS
 def test_rigid_motions_of_the_objects_are_free_whatever_the_background_does(form):
     means, labels, opacities = cloud()
-    anchors = rigidity.anchors(means, labels, opacities)
+    anchors = rigidity.anchors(means, labels, opacities, int(labels.max()) + 1)
     moved = rigid_motion(means, labels)
     assert float((moved - means).norm()) > 1
     assert float(rigidity.rigidity(means, moved, anchors, form)) == pytest.approx(0, abs=1e-12)
@@ -78,7 +78,7 @@ def test_rigid_motions_of_the_objects_are_free_whatever_the_background_does(form
 @pytest.mark.parametrize(("form", "power"), [("absolute", 1), ("squared", 2)])
 def test_growth_costs_the_mean_power_of_the_change_of_distance(form, power):
     means, labels, opacities = cloud()
-    anchors = rigidity.anchors(means, labels, opacities)
+    anchors = rigidity.anchors(means, labels, opacities, int(labels.max()) + 1)
     members = [i for i, a in enumerate(anchors.tolist()) if a not in (-1, i)]
     distances = [float((means[i] - means[anchors[i]]).norm()) for i in members]
     for factor in (1.25, 0.5):
@@ -90,7 +90,7 @@ def test_growth_costs_the_mean_power_of_the_change_of_distance(form, power):
 @FORMS
 def test_gradients_match_the_loss_and_reach_only_the_later_state(form):
     means, labels, opacities = cloud(14, classes=3)
-    anchors = rigidity.anchors(means, labels, opacities)
+    anchors = rigidity.anchors(means, labels, opacities, int(labels.max()) + 1)
     assert len(set(anchors.tolist())) == 3
     after = (means + 0.3 * cloud(14, seed=1)[0]).requires_grad_(True)
     assert torch.autograd.gradcheck(lambda x: rigidity.rigidity(means, x, anchors, form), (after,))
@@ -104,7 +104,7 @@ def test_gradients_match_the_loss_and_reach_only_the_later_state(form):
 @pytest.mark.parametrize("collapsed", ["before", "after", "both"])
 def test_members_on_their_representative_have_finite_gradients(dtype, collapsed, form):
     means, labels, opacities = cloud(12, classes=3)
-    anchors = rigidity.anchors(means, labels, opacities)
+    anchors = rigidity.anchors(means, labels, opacities, int(labels.max()) + 1)
     points = torch.zeros(12, 3, dtype=dtype)
     before = points if collapsed != "after" else means.to(dtype)
     after = (points if collapsed != "before" else means.to(dtype)).clone().requires_grad_(True)
@@ -125,7 +125,7 @@ def test_without_members_there_is_no_loss_and_no_gradient(form):
 @pytest.mark.parametrize("weight", [0.0, 1.0])
 def test_the_loss_holds_together_an_object_that_is_pulled_apart(weight):
     means, labels, opacities = cloud(40, classes=2)
-    anchors = rigidity.anchors(means, labels, opacities)
+    anchors = rigidity.anchors(means, labels, opacities, int(labels.max()) + 1)
     target = rigid_motion(means, labels) + 0.3 * cloud(40, seed=7)[0]
     after = means.clone().requires_grad_(True)
     optimizer = torch.optim.Adam([after], lr=0.02)
@@ -146,10 +146,10 @@ def test_a_rigid_motion_of_each_group_costs_no_stiffness_and_anything_else_does(
     quats = turns[groups]
     offsets = rotations.rotate(quats, before) + groups[:, None] * 0.3 - before
     same = torch.zeros(40, 3)
-    assert float(rigidity.stiffness(before, before + offsets, quats, same, groups)) < 1e-10
+    assert float(rigidity.stiffness(before, before + offsets, quats, same, groups, int(groups.max()) + 1)) < 1e-10
     bent = before + offsets + 0.1 * before.square()
-    assert float(rigidity.stiffness(before, bent, quats, same, groups)) > 1e-4
-    found, shift, known = rigidity.rigid_fits(before, before + offsets, groups)
+    assert float(rigidity.stiffness(before, bent, quats, same, groups, int(groups.max()) + 1)) > 1e-4
+    found, shift, known = rigidity.rigid_fits(before, before + offsets, groups, int(groups.max()) + 1)
     assert known.all()
     assert rotations.angle_between(found.numpy(), turns.numpy()).max() < 1e-3
     torch.testing.assert_close(shift, torch.arange(3)[:, None].expand(3, 3) * 0.3, atol=1e-5, rtol=0)
@@ -161,9 +161,9 @@ def test_stiffness_pulls_every_gaussian_towards_where_its_group_has_it():
     offsets = (0.2 * torch.randn(12, 3, generator=draw, dtype=torch.float64)).requires_grad_(True)
     groups = torch.ones(12, dtype=torch.int64)
     rest = torch.zeros(12, 3, dtype=torch.float64)
-    found, shift, _ = rigidity.rigid_fits(before, before + offsets.detach(), groups)
+    found, shift, _ = rigidity.rigid_fits(before, before + offsets.detach(), groups, int(groups.max()) + 1)
     quats = found[groups]
-    loss = rigidity.stiffness(before, before + offsets, quats, rest, groups)
+    loss = rigidity.stiffness(before, before + offsets, quats, rest, groups, int(groups.max()) + 1)
     (gradient,) = torch.autograd.grad(loss, offsets)
     goal = rotations.rotate(quats, before) + shift[groups]
     torch.testing.assert_close(gradient, 2 * (before + offsets - goal).detach() / 12)

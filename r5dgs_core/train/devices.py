@@ -1,0 +1,44 @@
+"""Selection of the device that a run trains on."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+
+from ..errors import BackendError
+from ..raster import cuda
+
+log = logging.getLogger(__name__)
+
+AUTO, CPU = "auto", "cpu"
+
+
+def select(name: str) -> torch.device:
+    """Return the device of a name: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``.
+
+    ``auto`` is the first CUDA device if torch finds one and gsplat can be loaded, and otherwise the CPU.
+
+    Raises:
+        BackendError: The named device cannot be used; the message has the remedy.
+    """
+    if name == CPU:
+        return torch.device(CPU)
+    device = torch.device("cuda" if name == AUTO else name)
+    if torch.version.cuda is not None and torch.cuda.is_available():
+        count, index = torch.cuda.device_count(), device.index or 0
+        if index >= count:
+            raise BackendError(f"device {name}: torch finds {count} CUDA devices; remedy: --device cuda:{count - 1}")
+        device = torch.device("cuda", index)
+    reason = cuda.why_unavailable(device, torch.float32)
+    if reason is None:
+        return device
+    if name != AUTO:
+        raise BackendError(f"device {name}: {reason}".replace("backend='cpu'", "--device cpu"))
+    log.info("training on the CPU: %s", reason)
+    return torch.device(CPU)
+
+
+def title(device: torch.device) -> str:
+    """Return a device's name for messages: "CPU", or the name of the GPU."""
+    return "CPU" if device.type == CPU else f"{torch.cuda.get_device_name(device)} ({device})"
