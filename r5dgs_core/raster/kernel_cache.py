@@ -20,7 +20,7 @@ import numba
 
 log = logging.getLogger(__name__)
 
-_SHARED = ("raster/**/*.py", "scene/spherical_harmonics.py")  # sources that any kernel may use
+_SHARED = ("raster/**/*.py", "scene/spherical_harmonics.py", "motion/rotations.py")  # sources that any kernel may use
 _OURS = re.compile("r5dgs-[0-9a-f]{12}")
 _KEPT_S = 28 * 24 * 3600.0
 _SYSTEM_USERS = (0, 65534)  # root, and the owner that root's files have inside a user's container

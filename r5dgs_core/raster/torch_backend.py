@@ -103,18 +103,23 @@ class ArrayAdapter(Backend):
     ) -> SplatImage:
         inputs = (means, quats, scales, opacities, channels)
         found = self._inner.rasterize_splats(
-            *map(self._tensor, inputs), camera, self._tensor(background), self._tensor(labels), settings, stats
+            *map(self._tensor, inputs),  # pyright: ignore[reportCallIssue]
+            camera,
+            self._tensor(background),
+            self._tensor(labels),
+            settings,
+            stats,
         )
         _stats_to_arrays(stats)
         return SplatImage(*(_array(values) for values in (found.image, found.alpha, found.depth, found.ids)))
 
     @torch.no_grad()
     def seen_colors(self, means, sh, rest, factor, poses):
-        return _array(self._inner.seen_colors(*map(self._tensor, (means, sh, rest, factor)), poses))
+        return _array(self._inner.seen_colors(*map(self._tensor, (means, sh, rest, factor)), poses))  # pyright: ignore[reportCallIssue]
 
     def segment_weights(self, means, quats, scales, opacities, camera, segments, count, settings):
         inputs = map(self._tensor, (means, quats, scales, opacities))
-        return self._inner.segment_weights(*inputs, camera, self._tensor(segments), count, settings)
+        return self._inner.segment_weights(*inputs, camera, self._tensor(segments), count, settings)  # pyright: ignore[reportCallIssue]
 
     def _tensor(self, values: np.ndarray | None) -> Any:
         return None if values is None else torch.from_numpy(to_array(values)).to(self._device)

@@ -169,7 +169,7 @@ class StepGraphs:
         for camera in sampling.spread(trainer.distinct_cameras, CAMERAS):
             stats = RasterStats(capacity=1)
             trainer.render(camera, float(trainer.times[-1]), stats=stats)
-            most = torch.maximum(most, stats.pairs)
+            most = torch.maximum(most, stats.pairs)  # pyright: ignore[reportArgumentType]
         return int(most)
 
     def _write(self, inputs: StepInputs) -> None:
@@ -204,4 +204,4 @@ class StepGraphs:
         self._loss.copy_(trainer.update(inputs, stats))
         # The memory of the gradients belongs to the graph, and other graphs overwrite it.
         trainer.optimizer.zero_grad(set_to_none=True)
-        torch.maximum(self._pairs, stats.pairs, out=self._pairs)
+        torch.maximum(self._pairs, stats.pairs, out=self._pairs)  # pyright: ignore[reportArgumentType]

@@ -29,7 +29,7 @@ def main(folder: Path) -> None:
     reader.camera_model = "SIMPLE_RADIAL"
     reader.mask_path = str(folder / "masks")
     extraction = pycolmap.FeatureExtractionOptions()
-    extraction.use_gpu = False
+    extraction.use_gpu, extraction.num_threads = False, 1  # with more, the ids of images depend on the timing
     extraction.sift.max_num_features = _FEATURES
     extraction.sift.estimate_affine_shape = job["wide"]
     extraction.sift.peak_threshold = 0.004
@@ -81,7 +81,7 @@ def _match(database: Path, folder: Path, *, wide: bool) -> None:
     import pycolmap
 
     matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu, matching.guided_matching = False, wide
+    matching.use_gpu, matching.num_threads, matching.guided_matching = False, 1, wide
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
     pairing = pycolmap.ImportedPairingOptions()

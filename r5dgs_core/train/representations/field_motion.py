@@ -70,11 +70,11 @@ class FieldMotion:
 
     def deltas(self, means: Tensor, t: float | Tensor) -> deformation.Deltas:
         """Evaluate the field at a scene time; a number is clamped to the horizon."""
-        return self.field(means, self.clock(t if isinstance(t, Tensor) else min(t, self.horizon)), self.chunk)
+        return self.field(means, self.clock(t if isinstance(t, Tensor) else min(t, self.horizon)), self.chunk)  # pyright: ignore[reportArgumentType]
 
     def state(self, positions: Tensor, t: float | Tensor) -> MotionState:
         """Evaluate the TRD at positions and a scene time, per unit of network time."""
-        return self.trd(positions, self.clock(t), self.chunk)
+        return self.trd(positions, self.clock(t), self.chunk)  # pyright: ignore[reportArgumentType]
 
     def carry(
         self, positions: Tensor, state: MotionState, duration: float | Tensor, step: float

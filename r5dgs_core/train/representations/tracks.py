@@ -125,10 +125,10 @@ class TracksRepresentation(Representation):
         """See `Representation.splats`."""
         if isinstance(t, AtKnot):
             knots = t.knot if isinstance(t.knot, Tensor) else {t.knot: 1.0}
-            there, t = t.there, t.knot if isinstance(t.knot, Tensor) else float(self.tracks.times[t.knot])
+            there, t = t.there, t.knot if isinstance(t.knot, Tensor) else float(self.tracks.times[t.knot])  # pyright: ignore[reportAssignmentType]
         else:
             knots, there = self.tracks.knot_weights(t), self._there(t)
-        poses = self.tracks.poses(t)
+        poses = self.tracks.poses(t)  # pyright: ignore[reportArgumentType]
         centers = self.tracks.group_centers()
         params = gaussians.params
         if params["sh_rest"].shape[1] == 0:
