@@ -1,1 +1,1 @@
-"""Benchmarks of training with cameras that are wrong or few."""
+"""Benchmarks of training with cameras that are wrong."""

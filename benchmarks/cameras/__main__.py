@@ -1,9 +1,8 @@
-"""Benchmarks of training with cameras that are wrong or few.
+"""Benchmarks of training with cameras that are wrong.
 
     python -m benchmarks.cameras COMMAND [OPTIONS]
 
     jitter  quality with wrong poses and colours, refined or not
-    few     quality with a few of the cameras
 
 Results: docs/results/captures.md.
 """
