@@ -1,0 +1,86 @@
+"""Processor time and memory of `r5dgs prepare`, by number of frames.
+
+    python -m benchmarks.prepare [--cameras 4] [--frames 75 300] [--size 1920 1080] [--lines 960] [--json FILE]
+
+Videos (H.264, 30 per second, lens distortion) of a ball that swings over a texture are written first. Each number of
+frames is then prepared in a process of its own, with clocks compared by motion.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import resource
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+RATE = 30.0
+
+
+def write_videos(folder: Path, cameras: int, frames: int, width: int, height: int) -> None:
+    """Write videos and their calibration."""
+    from tests.support import recordings
+
+    rig = recordings.make_rig(cameras, width, height, (-0.1, 0.02, 0.001, -0.001, 0.0))
+    times = [np.arange(frames) / RATE] * cameras
+    recordings.record(folder, rig, times, recordings.draw_ball)
+
+
+def measure(source: Path, out: Path, lines: int, results: Any) -> None:
+    """Prepare a data set; puts processor seconds and peak memory into a queue."""
+    from r5dgs_core.cli.commands import prepare
+
+    before = resource.getrusage(resource.RUSAGE_SELF)
+    began = time.monotonic()
+    plan = prepare.run_prepare(source, out, lines=lines, sync="motion")
+    after = resource.getrusage(resource.RUSAGE_SELF)
+    results.put(
+        {
+            "images": sum(len(indices) for indices in plan.choice.indices),
+            "cpu_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+            "wall_s": time.monotonic() - began,
+            "peak_mb": after.ru_maxrss / 1024,
+            "offset_error_ms": 1e3 * max(abs(offset.seconds) for offset in plan.offsets),
+        }
+    )
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cameras", type=int, default=4)
+    parser.add_argument("--frames", type=int, nargs="+", default=[75, 300])
+    parser.add_argument("--size", type=int, nargs=2, default=[1920, 1080], metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--lines", type=int, default=960)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    context = multiprocessing.get_context("spawn")
+    rows = []
+    for frames in args.frames:
+        with tempfile.TemporaryDirectory() as folder:
+            source, out = Path(folder) / "videos", Path(folder) / "data"
+            writer = context.Process(target=write_videos, args=(source, args.cameras, frames, *args.size))
+            writer.start()
+            writer.join()
+            results = context.Queue()
+            process = context.Process(target=measure, args=(source, out, args.lines, results))
+            process.start()
+            rows.append({"cameras": args.cameras, "frames": frames, **results.get()})
+            process.join()
+            row = rows[-1]
+            print(
+                f"{row['cameras']} cameras x {frames} frames: {row['cpu_s']:.1f} s of processor time "
+                f"({1e3 * row['cpu_s'] / row['images']:.0f} ms per image), {row['peak_mb']:.0f} MB",
+                flush=True,
+            )
+    if args.json is not None:
+        args.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
