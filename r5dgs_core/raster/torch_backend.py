@@ -101,12 +101,16 @@ class ArrayAdapter(Backend):
     def rasterize_splats(
         self, means, quats, scales, opacities, channels, camera, background, labels, settings, stats
     ) -> SplatImage:
-        inputs = (means, quats, scales, opacities, channels)
+        tensors = [self._tensor(values) for values in (means, quats, scales, opacities, channels, background, labels)]
         found = self._inner.rasterize_splats(
-            *map(self._tensor, inputs),  # pyright: ignore[reportCallIssue]
+            tensors[0],
+            tensors[1],
+            tensors[2],
+            tensors[3],
+            tensors[4],
             camera,
-            self._tensor(background),
-            self._tensor(labels),
+            tensors[5],
+            tensors[6],
             settings,
             stats,
         )
