@@ -38,7 +38,7 @@ _KEYS_BY_UNIT = {
         rates.translations rates.rotvecs rates.slope rates.field rates.trd rates.residual rates.background
         identity.rate identity.classifier_rate
     """,
-    "factor": "rates.decay rates.decay_networks rates.decay_floor_appearance densify_mcmc.noise",
+    "factor": "init.shading rates.decay rates.decay_networks rates.decay_floor_appearance densify_mcmc.noise",
     "weight": """
         losses.roughness losses.rigid field.calm field.twist field.stiffness densify.opacity densify_mcmc.opacity
         densify_mcmc.scale residual.size residual.roughness identity.weight identity.spatial identity.majority
@@ -47,7 +47,7 @@ _KEYS_BY_UNIT = {
     "scene time": "field.horizon field.step",
     "1 / half image width": "densify.gradient densify_default.gradient",
     "px": "densify.split_pixels densify_default.prune_radius",
-    "dB": "residual.threshold",
+    "dB": "refine.threshold refine.threshold_time residual.threshold",
     "Gaussians": """
         init.object_points init.background_points init.shadow_points field.chunk densify.max_gaussians
         discovery.fewest identity.neighbours identity.samples
