@@ -12,6 +12,7 @@ import numpy as np
 from .. import errors
 from ..capture.calibration import reading
 from ..capture.calibration.calibration import CalibratedCamera, CalibratedFrame, Calibration
+from ..capture.calibration.lens import Lens
 from ..capture.reconstruction import gauge
 from . import camera_source, frame_times, names, source_files
 from .camera_source import FRAME_RATE, CameraSource
@@ -25,13 +26,13 @@ class Camera:
         source: The recording.
         calibrated: Its lens and pose, for the size of the frames.
         usable: Indices of the frames that have a pose, increasing.
-        poses: Pose of each usable frame of a moving camera; empty for a static one.
+        frames: Lens and pose of each usable frame, if they change; else empty.
     """
 
     source: CameraSource
     calibrated: CalibratedCamera
     usable: np.ndarray
-    poses: tuple[CalibratedFrame, ...] = ()
+    frames: tuple[CalibratedFrame, ...] = ()
 
     @property
     def name(self) -> str:
@@ -40,9 +41,14 @@ class Camera:
 
     def pose(self, index: int) -> np.ndarray:
         """Return camera to world of a frame, OpenCV axes. [4, 4]"""
-        if not self.poses:
-            return self.calibrated.camera_to_world
-        return self.poses[int(np.searchsorted(self.usable, index))].camera_to_world
+        return self._at(index).camera_to_world
+
+    def lens(self, index: int) -> Lens:
+        """Return the lens of a frame, for its size."""
+        return self._at(index).lens
+
+    def _at(self, index: int) -> CalibratedFrame | CalibratedCamera:
+        return self.frames[int(np.searchsorted(self.usable, index))] if self.frames else self.calibrated
 
 
 def open_all(
@@ -150,26 +156,26 @@ def _of_calibration(camera: CalibratedCamera, calibration: Calibration, rate: fl
 
 
 def _with_poses(source: CameraSource, calibrated: CalibratedCamera) -> Camera:
-    """Join a recording and its calibrated camera; finds the pose of each frame of a moving camera."""
+    """Join a recording and its calibrated camera; finds the pose and lens of each frame if they change."""
     calibrated = calibrated.resized(source.width, source.height)
-    if not calibrated.moves:
+    if not calibrated.changes:
         return Camera(source, calibrated, np.arange(len(source.times)))
     by_index = _frames_by_index(source, calibrated.frames)
     if not by_index:
         raise errors.DatasetError(
-            f"camera {source.name!r}: it moves, but the calibration names none of its frames; expected names such as "
-            f"{source.frame_name(0)}"
+            f"camera {source.name!r}: its pose or lens changes, but the calibration names none of its frames; expected "
+            f"names such as {source.frame_name(0)}"
         )
     usable = np.array(sorted(by_index))
-    poses = tuple(by_index[index] for index in usable.tolist())
+    frames = tuple(by_index[index] for index in usable.tolist())
     lost = len(source.times) - len(usable)
     if lost:
         source = replace(source, notes=(*source.notes, f"{lost} frames have no pose and are left out"))
-    return Camera(source, calibrated, usable, poses)
+    return Camera(source, calibrated, usable, frames)
 
 
 def _frames_by_index(source: CameraSource, frames: Sequence[CalibratedFrame]) -> dict[int, CalibratedFrame]:
-    """Find the pose of each frame by its file's name, or, for a video, by order or number."""
+    """Find the entry of each frame by its file's name, or, for a video, by order or number."""
     if not source.videos:
         by_path = {frame.path.resolve(): frame for frame in frames}
         by_stem = {frame.path.stem: frame for frame in frames}

@@ -66,8 +66,8 @@ def offsets(
             raise errors.ConfigError(f"--sync audio: {silent} has no sound; use --sync motion")
         if method == "audio":
             raise errors.ConfigError("--sync audio: the cameras' sounds do not match; use --sync motion")
-    if any(camera.moves for camera in cameras):
-        return none, ["clocks are not compared, because a camera moves; give offsets with --offset NAME=MS"]
+    if any(camera.changes for camera in cameras):
+        return none, ["clocks are not compared, because a camera moves or zooms; give offsets with --offset NAME=MS"]
     return _by_motion(sources, cameras, progress)
 
 

@@ -65,7 +65,6 @@ class Plan:
         choice: Chosen frames.
         timeline: Scene times and splits.
         size: Height of the images.
-        rectifiers: One for each camera.
         notes: Remarks for the user.
     """
 
@@ -76,12 +75,16 @@ class Plan:
     choice: Choice
     timeline: Timeline
     size: image_size.Size
-    rectifiers: tuple[rectify.Rectifier, ...]
     notes: tuple[str, ...]
 
     def image_name(self, camera: int, index: int) -> str:
         """Return the path of an image in the data set, without suffix."""
         return f"{IMAGES}/{self.cameras[camera].name}/{self.cameras[camera].source.frame_name(index)}"
+
+    def rectifier(self, camera: int, index: int) -> rectify.Rectifier:
+        """Return what makes an image of a frame."""
+        one = self.cameras[camera]
+        return rectify.rectifier(one.lens(index), (one.source.width, one.source.height), self.size.lines)
 
     @property
     def suffix(self) -> str:

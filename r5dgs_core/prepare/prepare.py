@@ -14,7 +14,7 @@ from typing import Any
 from .. import errors, folder_lock
 from ..capture.calibration.calibration import Calibration
 from ..data import images
-from . import cameras, capture_file, clocks, data_splits, frame_choice, image_size, record, rectify, unknown_cameras
+from . import cameras, capture_file, clocks, data_splits, frame_choice, image_size, record, unknown_cameras
 from .cameras import Camera
 from .frame_choice import Choice
 from .plan import IMAGES, Plan, Request
@@ -116,10 +116,7 @@ def _plan(
     sizes = [(source.width, source.height) for source in sources]
     counts = [sum(split == "train" for split in splits) for splits in timeline.splits]
     size = image_size.choose(sizes, counts, request.lines if known is None else known["images"]["lines"])
-    rectifiers = tuple(
-        rectify.rectifier(camera.calibrated.lens, wh, size.lines) for camera, wh in zip(opened, sizes, strict=True)
-    )
-    return Plan(request, tuple(opened), calibration, tuple(offsets), choice, timeline, size, rectifiers, tuple(notes))
+    return Plan(request, tuple(opened), calibration, tuple(offsets), choice, timeline, size, tuple(notes))
 
 
 def _length_notes(names: list[str], choice: Choice) -> list[str]:
@@ -144,7 +141,7 @@ def _write_images(plan: Plan, out: Path, progress: Progress) -> dict[str, list[i
         done += len(indices) - len(missing)
         written = set()
         for index, pixels in camera.source.read(missing):
-            write(paths[index], plan.rectifiers[number].image(pixels))
+            write(paths[index], plan.rectifier(number, index).image(pixels))
             written.add(index)
             done += 1
             progress({"event": "images", "done": done, "total": total, "text": camera.name})

@@ -128,7 +128,8 @@ def write_cameras(plan: Plan, out: Path, lost: Mapping[str, list[int]]) -> None:
         for number, camera in enumerate(plan.cameras):
             frames = _frames(plan, number, split, set(lost.get(camera.name, [])))
             if frames:
-                data[camera.name] = {**_lens(plan, number), **_shared_pose(camera), "frames": frames}
+                first = int(plan.choice.indices[number][0])
+                data[camera.name] = {**_lens(plan, number, first), **_shared_pose(camera), "frames": frames}
         path = out / f"transforms_{split}.json"
         if not data:
             path.unlink(missing_ok=True)
@@ -142,21 +143,23 @@ def write_cameras(plan: Plan, out: Path, lost: Mapping[str, list[int]]) -> None:
         capture_file.write_json(path, {**top, "data": data})
 
 
-def _lens(plan: Plan, number: int) -> dict[str, float]:
-    rectifier = plan.rectifiers[number]
+def _lens(plan: Plan, number: int, index: int) -> dict[str, float]:
+    rectifier = plan.rectifier(number, index)
     k = rectifier.intrinsics
     lens = {"fl_x": k[0, 0], "fl_y": k[1, 1], "cx": k[0, 2], "cy": k[1, 2], "w": rectifier.width, "h": rectifier.height}
     return {key: value if isinstance(value, int) else float(value) for key, value in lens.items()}
 
 
 def _shared_pose(camera: Camera) -> dict[str, Any]:
-    return {} if camera.poses else {"transform_matrix": (camera.pose(0) @ _OPENGL).tolist()}
+    return {} if camera.frames else {"transform_matrix": (camera.pose(0) @ _OPENGL).tolist()}
 
 
 def _frames(plan: Plan, number: int, split: str, lost: set[int]) -> list[dict[str, Any]]:
     camera, found = plan.cameras[number], []
+    indices = plan.choice.indices[number].tolist()
+    shared = _lens(plan, number, indices[0]) if indices else {}
     rows = zip(
-        plan.choice.indices[number].tolist(),
+        indices,
         plan.timeline.times[number].tolist(),
         plan.timeline.splits[number],
         plan.choice.moments[number].tolist(),
@@ -165,7 +168,8 @@ def _frames(plan: Plan, number: int, split: str, lost: set[int]) -> list[dict[st
     for index, t, own, moment in rows:
         if own == split and index not in lost:
             frame = {"file_path": plan.image_name(number, index) + plan.suffix, "time": t, "frame": moment}
-            if camera.poses:
+            if camera.frames:
+                frame |= {key: value for key, value in _lens(plan, number, index).items() if value != shared[key]}
                 frame["transform_matrix"] = (camera.pose(index) @ _OPENGL).tolist()
             found.append(frame)
     return found

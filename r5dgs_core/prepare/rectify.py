@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from . import image_size
 
 @dataclass(frozen=True)
 class Rectifier:
-    """Undistorts and reduces the frames of a camera.
+    """Undistorts and reduces the frames of a lens.
 
     Attributes:
         undistortion: The pinhole camera and its map, at the size of the frames.
@@ -50,12 +51,13 @@ class Rectifier:
         return masks.resize(full.astype(np.int32), self.width, self.height, place)
 
 
+@functools.lru_cache(maxsize=1)  # frames of a camera follow each other, and a map takes eight bytes per pixel
 def rectifier(lens: Lens, size: tuple[int, int], lines: int) -> Rectifier:
-    """Return the rectifier of a camera.
+    """Return the rectifier of a lens.
 
     Args:
-        lens: Its lens for the size of its frames.
-        size: Width and height of its frames.
+        lens: The lens, for the size of the frames.
+        size: Width and height of the frames.
         lines: Largest height of the images.
     """
     return Rectifier(undistort.undistortion(lens, size), *image_size.scaled(size, lines))

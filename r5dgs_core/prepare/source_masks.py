@@ -54,26 +54,25 @@ class SourceMasks:
                 f"{folder}: expected a folder of masks per camera ({', '.join(cameras)}), found "
                 f"{', '.join(folders) or 'none'}"
             )
-        self._paths = {
-            plan.image_name(number, index): path
+        self._found = {
+            plan.image_name(number, index): (path, number, index)
             for number, name in enumerate(cameras)
             for index, path in _by_index(plan, number, folders[matched[name]]).items()
         }
-        if not self._paths:
+        if not self._found:
             example = plan.cameras[0].source.frame_name(int(plan.choice.indices[0][0]))
             raise errors.DatasetError(f"{folder}: expected masks such as {cameras[0]}/{example}.png, found none")
-        self._colors = masks.color_table(self._paths.values())
+        self._colors = masks.color_table([path for path, *_ in self._found.values()])
 
     def label(self, video: Video, room: Path, report: Callable[[float], None]) -> Iterator[np.ndarray | None]:
         """Implement `make_masks.MaskBackend.label`."""
-        numbers = {camera.name: number for number, camera in enumerate(self._plan.cameras)}
         for k, view in enumerate(video.views):
-            path = self._paths.get(view.name)
-            if path is None:
-                yield None
+            if view.name in self._found:
+                path, number, index = self._found[view.name]
+                ids = masks.read(path, self._colors, self._unknown)
+                yield self._plan.rectifier(number, index).mask(ids, str(path))
             else:
-                rectifier = self._plan.rectifiers[numbers[view.name.split("/")[1]]]
-                yield rectifier.mask(masks.read(path, self._colors, self._unknown), str(path))
+                yield None
             report((k + 1) / len(video.views))
 
 

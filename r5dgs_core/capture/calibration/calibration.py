@@ -64,6 +64,11 @@ class CalibratedCamera:
         """True if the pose differs between frames."""
         return any(not np.array_equal(frame.camera_to_world, self.camera_to_world) for frame in self.frames)
 
+    @property
+    def changes(self) -> bool:
+        """True if the pose or the lens differs between frames."""
+        return self.moves or any(frame.lens != self.lens for frame in self.frames)
+
     def resized(self, width: int, height: int) -> CalibratedCamera:
         """Return the camera for images of another size.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -18,25 +19,57 @@ _EDGE = 0.5  # a pixel's area reaches half a pixel beyond its centre
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """A pinhole camera and where its pixels lie in the source image.
+    """A pinhole camera, and where its pixels lie in the source image.
 
     Attributes:
-        width: Width of the new image in pixels.
-        height: Height of the new image in pixels.
-        intrinsics: Its camera matrix, pixels, the first pixel's centre at 0.5. [3, 3]
-        map_x: Column in the source image of each new pixel, the first column at 0 as in OpenCV. [H, W] float32
-        map_y: Row in the source image, the first at 0. [H, W] float32
-        known: Pixels that lie in the source image; the others show nothing. [H, W] bool
-        identity: True if the new image is the source image.
+        lens: Lens of the source image.
+        pinhole: Lens of the new image.
+        width: Width of both images in pixels.
+        height: Height of both images in pixels.
     """
 
+    lens: Lens
+    pinhole: Lens
     width: int
     height: int
-    intrinsics: np.ndarray
-    map_x: np.ndarray
-    map_y: np.ndarray
-    known: np.ndarray
-    identity: bool
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """Camera matrix of the new image, pixels, the first pixel's centre at 0.5. [3, 3]"""
+        return self.pinhole.intrinsics
+
+    @property
+    def identity(self) -> bool:
+        """True if the new image is the source image."""
+        return self.pinhole == self.lens
+
+    @functools.cached_property
+    def _maps(self) -> tuple[np.ndarray, np.ndarray]:
+        maps = np.empty((2, self.height, self.width), np.float32)
+        for first in range(0, self.height, _ROWS):
+            rows = np.arange(first, min(first + _ROWS, self.height))
+            pixels = np.stack(np.meshgrid(np.arange(self.width) + 0.5, rows + 0.5), -1).reshape(-1, 2)
+            source = self.lens.project(self.pinhole.unproject(pixels)) - 0.5
+            maps[:, rows] = source.T.reshape(2, -1, self.width)
+        maps[np.isnan(maps)] = -1e4
+        return maps[0], maps[1]
+
+    @property
+    def map_x(self) -> np.ndarray:
+        """Column in the source image of each new pixel, the first column at 0 as in OpenCV. [H, W] float32"""
+        return self._maps[0]
+
+    @property
+    def map_y(self) -> np.ndarray:
+        """Row in the source image, the first at 0. [H, W] float32"""
+        return self._maps[1]
+
+    @functools.cached_property
+    def known(self) -> np.ndarray:
+        """Pixels that lie in the source image; the others show nothing. [H, W] bool"""
+        x, y = self._maps
+        in_columns = (x >= -_EDGE) & (x <= self.width - 1 + _EDGE)
+        return in_columns & (y >= -_EDGE) & (y <= self.height - 1 + _EDGE)
 
     def apply(self, pixels: np.ndarray, *, nearest: bool = False) -> np.ndarray:
         """Undistort an image or a mask; unknown pixels repeat the border.
@@ -58,7 +91,7 @@ class Undistortion:
 
 
 def undistortion(lens: Lens, size: tuple[int, int], *, field: float = 0.0) -> Undistortion:
-    """Choose a pinhole camera with square pixels for a lens, and map its pixels to the source image.
+    """Choose a pinhole camera with square pixels for a lens. The map of its pixels is computed on first use.
 
     A lens without distortion is kept as it is.
 
@@ -70,25 +103,14 @@ def undistortion(lens: Lens, size: tuple[int, int], *, field: float = 0.0) -> Un
     """
     width, height = size
     if lens.is_pinhole:
-        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-        known = np.ones((height, width), bool)
-        return Undistortion(width, height, lens.intrinsics, x, y, known, identity=True)
+        return Undistortion(lens, lens, width, height)
     inner, outer = _boxes(lens, width, height)
     left, top, right, bottom = (1 - field) * inner + field * outer
     scales = np.array([(width - 1) / (right - left), (height - 1) / (bottom - top)])
     focal = float(scales.max() * (1 - field) + scales.min() * field)
     center = np.array([width, height]) / 2 - focal * np.array([left + right, top + bottom]) / 2
     pinhole = Lens("pinhole", focal, focal, float(center[0]), float(center[1]))
-    map_x, map_y = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-    for first in range(0, height, _ROWS):
-        rows = slice(first, min(first + _ROWS, height))
-        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height)[rows] + 0.5), -1).reshape(-1, 2)
-        source = lens.project(pinhole.unproject(pixels)) - 0.5
-        map_x[rows], map_y[rows] = source.T.reshape(2, -1, width)
-    with np.errstate(invalid="ignore"):
-        known = (map_x >= -_EDGE) & (map_x <= width - 1 + _EDGE) & (map_y >= -_EDGE) & (map_y <= height - 1 + _EDGE)
-    map_x[np.isnan(map_x)] = map_y[np.isnan(map_y)] = -1e4
-    return Undistortion(width, height, pinhole.intrinsics, map_x, map_y, known, identity=False)
+    return Undistortion(lens, pinhole, width, height)
 
 
 def _boxes(lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:

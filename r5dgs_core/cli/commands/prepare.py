@@ -225,7 +225,7 @@ def summary(plan: Plan) -> list[str]:
         lines += [f"  {note}" for note in source.notes]
     lines += list(plan.notes)
     size, timeline = plan.size, plan.timeline
-    shown = plan.rectifiers[0]
+    shown = plan.rectifier(0, int(plan.choice.indices[0][0]))
     lines.append(
         f"images of {shown.width}x{shown.height}: training needs about {size.training_bytes / 2**30:.1f} GB of the "
         f"{size.machine_bytes / 2**30:.1f} GB of this machine"

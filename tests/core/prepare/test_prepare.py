@@ -1,7 +1,9 @@
 """Recordings become a data set: images, cameras, times, masks, record; resumable, reproducible, refused in words."""
 
+import dataclasses
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,6 +11,8 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.capture.calibration import undistort
+from r5dgs_core.capture.calibration.calibration import CalibratedCamera, CalibratedFrame, Calibration
+from r5dgs_core.capture.calibration.formats import r5dgs_json
 from r5dgs_core.cli.commands import prepare as command
 from r5dgs_core.data import dataset, images, masks
 from r5dgs_core.prepare import camera_source, image_size, prepare, rectify
@@ -172,6 +176,25 @@ def test_frames_as_images_give_the_same_data_set_as_their_video(capture, tmp_pat
     del one[next(p for p in one if p.name == "capture.json")], other[next(p for p in other if p.name == "capture.json")]
     assert set(one) == set(other)
     assert all(one[path] == other[path] for path in one if path.suffix == ".png")
+
+
+def test_each_frame_of_a_zooming_camera_is_undistorted_with_its_own_lens(tmp_path):
+    rig = recordings.make_rig(1, WIDTH, HEIGHT, COEFFICIENTS)
+    pose = np.linalg.inv(rig.cameras[0].T_cam_world)
+    lenses = [dataclasses.replace(rig.lenses[0], fx=f, fy=f) for f in (80.0, 80.0, 100.0)]
+    names = [Path("cam0") / f"{k:04d}.png" for k in range(3)]
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8) for _ in lenses]
+    for name, pixels in zip(names, pictures, strict=True):
+        images.write_png(tmp_path / "frames" / name, pixels)
+    frames = tuple(CalibratedFrame(name, None, lens, pose) for name, lens in zip(names, lenses, strict=True))
+    camera = CalibratedCamera("cam0", WIDTH, HEIGHT, lenses[0], pose, frames)
+    r5dgs_json.write(tmp_path / "frames" / r5dgs_json.FILES, Calibration((camera,), 1.0, "", tmp_path))
+    found = prepared(tmp_path / "frames", tmp_path / "data", lossless=True, rate=10.0)
+    for view, lens, pixels in zip(found.train, lenses, pictures, strict=True):
+        pinhole = undistort.undistortion(lens, (WIDTH, HEIGHT))
+        np.testing.assert_allclose(view.camera.intrinsics, pinhole.intrinsics, rtol=1e-9)
+        np.testing.assert_allclose(images.read(view.image_path) * 255, pinhole.apply(pixels), atol=1e-3)
 
 
 def test_the_calibration_of_other_cameras_is_refused(capture, tmp_path):
