@@ -56,17 +56,18 @@ def prepare(request: Request, progress: Progress) -> Plan:
     up = request.up if file == request.calibration else None  # a reconstruction is upright
     opened, calibration = cameras.open_all(request.source, file, request.rate, up, request.meters_per_unit)
     with folder_lock.hold(out):
-        known = _begin(request, opened, calibration, out)
+        identity = record.identity(request, opened, calibration)
+        known = _begin(out, identity, overwrite=request.overwrite)
         plan = _plan(request, opened, calibration, known, progress)
-        capture_file.write(out, record.content(plan, finished=False))
+        capture_file.write(out, record.content(plan, identity, finished=False))
         lost = _write_images(plan, out, progress)
         record.write_cameras(plan, out, lost)
-        capture_file.write(out, record.content(plan, finished=True, lost=lost))
+        capture_file.write(out, record.content(plan, identity, finished=True, lost=lost))
     return plan
 
 
-def _begin(request: Request, opened: list[Camera], calibration: Calibration, out: Path) -> dict[str, Any] | None:
-    """Return the record of a run with the same input, or None; with ``overwrite``, remove that of another run."""
+def _begin(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, Any] | None:
+    """Return the record of a run with the identity, or None; with ``overwrite``, remove that of another run."""
     present = capture_file.read(out)
     if present is None:
         own = {folder_lock.LOCK_FILE, unknown_cameras.FILE}
@@ -76,10 +77,9 @@ def _begin(request: Request, opened: list[Camera], calibration: Calibration, out
                 f"{out}: expected an empty folder or a prepared data set, found {foreign[0]}; name another folder"
             )
         return None
-    wanted = record.identity(request, opened, calibration)
     if present.get("identity") == wanted:
         return present
-    if not request.overwrite:
+    if not overwrite:
         changed = [key for key in wanted if present.get("identity", {}).get(key) != wanted[key]]
         raise errors.DatasetError(
             f"{out}: was prepared from other input or settings ({', '.join(changed)}); name another folder with --out, "

@@ -38,11 +38,16 @@ def identity(request: Request, opened: Sequence[Camera], calibration: Calibratio
         "hold_out_every": request.hold_out.every,
         "hold_out_after": request.hold_out.after,
         "horizon": request.hold_out.horizon,
+        "scale": calibration.meters_per_unit,
     }
     files = {camera.name: _fingerprint(camera.source.paths) for camera in opened}
-    lenses = repr([(c.name, c.lens, c.camera_to_world.tolist()) for c in (camera.calibrated for camera in opened)])
+    views = [
+        (camera.name, view.lens, view.camera_to_world.tolist())
+        for camera in opened
+        for view in camera.frames or [camera.calibrated]
+    ]
     times = hashlib.sha256(b"".join(camera.source.times.tobytes() for camera in opened)).hexdigest()
-    cameras = hashlib.sha256((calibration.format + lenses).encode()).hexdigest()
+    cameras = hashlib.sha256((calibration.format + repr(views)).encode()).hexdigest()
     return {**settings, "recordings": files, "calibration": cameras, "times": times}
 
 
@@ -58,14 +63,16 @@ def _fingerprint(paths: Sequence[Path]) -> str:
     return hasher.hexdigest()
 
 
-def content(plan: Plan, *, finished: bool, lost: Mapping[str, list[int]] | None = None) -> dict[str, Any]:
+def content(
+    plan: Plan, identity: dict[str, Any], *, finished: bool, lost: Mapping[str, list[int]] | None = None
+) -> dict[str, Any]:
     """Return the content of ``capture.json``. JSON types."""
     unit = plan.calibration.meters_per_unit
     return {
         "generator": f"r5dgs {__version__}",
         "finished": finished,
         "source": str(plan.request.source),
-        "identity": identity(plan.request, plan.cameras, plan.calibration),
+        "identity": identity,
         "cameras": [_camera(plan, number, (lost or {})) for number in range(len(plan.cameras))],
         "calibration": {
             "format": plan.calibration.format,

@@ -178,23 +178,42 @@ def test_frames_as_images_give_the_same_data_set_as_their_video(capture, tmp_pat
     assert all(one[path] == other[path] for path in one if path.suffix == ".png")
 
 
-def test_each_frame_of_a_zooming_camera_is_undistorted_with_its_own_lens(tmp_path):
-    rig = recordings.make_rig(1, WIDTH, HEIGHT, COEFFICIENTS)
-    pose = np.linalg.inv(rig.cameras[0].T_cam_world)
-    lenses = [dataclasses.replace(rig.lenses[0], fx=f, fy=f) for f in (80.0, 80.0, 100.0)]
-    names = [Path("cam0") / f"{k:04d}.png" for k in range(3)]
+ZOOM = [
+    dataclasses.replace(recordings.make_rig(1, WIDTH, HEIGHT, COEFFICIENTS).lenses[0], fx=f, fy=f) for f in (80, 99)
+]
+
+
+def write_zooming(folder, lenses):
+    """Write a frame for each lens, and the calibration; returns the frames."""
     rng = np.random.default_rng(0)
     pictures = [rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8) for _ in lenses]
+    names = [Path("cam0") / f"{k:04d}.png" for k in range(len(lenses))]
     for name, pixels in zip(names, pictures, strict=True):
-        images.write_png(tmp_path / "frames" / name, pixels)
-    frames = tuple(CalibratedFrame(name, None, lens, pose) for name, lens in zip(names, lenses, strict=True))
-    camera = CalibratedCamera("cam0", WIDTH, HEIGHT, lenses[0], pose, frames)
-    r5dgs_json.write(tmp_path / "frames" / r5dgs_json.FILES, Calibration((camera,), 1.0, "", tmp_path))
+        images.write_png(folder / name, pixels)
+    frames = tuple(CalibratedFrame(name, None, lens, np.eye(4)) for name, lens in zip(names, lenses, strict=True))
+    camera = CalibratedCamera("cam0", WIDTH, HEIGHT, lenses[0], np.eye(4), frames)
+    r5dgs_json.write(folder / r5dgs_json.FILES, Calibration((camera,), 1.0, "", folder))
+    return pictures
+
+
+def test_each_frame_of_a_zooming_camera_is_undistorted_with_its_own_lens(tmp_path):
+    lenses = [ZOOM[0], ZOOM[0], ZOOM[1]]
+    pictures = write_zooming(tmp_path / "frames", lenses)
     found = prepared(tmp_path / "frames", tmp_path / "data", lossless=True, rate=10.0)
     for view, lens, pixels in zip(found.train, lenses, pictures, strict=True):
         pinhole = undistort.undistortion(lens, (WIDTH, HEIGHT))
         np.testing.assert_allclose(view.camera.intrinsics, pinhole.intrinsics, rtol=1e-9)
         np.testing.assert_allclose(images.read(view.image_path) * 255, pinhole.apply(pixels), atol=1e-3)
+
+
+def test_other_lenses_of_later_frames_and_other_units_need_overwrite(tmp_path):
+    write_zooming(tmp_path / "frames", [ZOOM[0], ZOOM[1], ZOOM[1]])
+    prepared(tmp_path / "frames", tmp_path / "data", rate=10.0)
+    with pytest.raises(errors.DatasetError, match=r"other input or settings \(scale\)"):
+        prepared(tmp_path / "frames", tmp_path / "data", rate=10.0, meters_per_unit=2.0)
+    write_zooming(tmp_path / "frames", [ZOOM[0], ZOOM[1], ZOOM[0]])
+    with pytest.raises(errors.DatasetError, match=r"other input or settings \(calibration\)"):
+        prepared(tmp_path / "frames", tmp_path / "data", rate=10.0)
 
 
 def test_the_calibration_of_other_cameras_is_refused(capture, tmp_path):
