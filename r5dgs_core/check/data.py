@@ -13,7 +13,7 @@ from ..data import colmap_dataset, dataset, images, masks
 from ..data.dataset import Dataset, View
 from ..data.layouts import camera_files, colmap
 from ..findings import Collector, Finding, coded
-from ..prepare import capture_file
+from ..prepare import capture_file, motion_tracks
 from ..terminal import printable
 from .capture import agreement, arrangement, over_time, recording, timing
 from .capture.pictures import Album
@@ -158,7 +158,7 @@ def _check_images(found: Dataset, collect: Collector, album: Album) -> None:
                 other = same.setdefault(digest, view)
                 if other.camera.name != view.camera.name:
                     collect.add("D51", f"{view.image_path}: the same file as {other.image_path}, from another camera")
-                if len(reduced) < recording.MOST:
+                if len(reduced) < motion_tracks.MOST_FRAMES:
                     reduced.append((view, recording.reduce(pixels)))
         if len(reduced) >= recording.LEAST:
             one = recording.measure([view for view, _ in reduced], [picture for _, picture in reduced])

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import signal
 
 from .. import extras
+from ..motion.robust_weights import MEDIAN_TO_SIGMA
 from .camera_source import CameraSource
 from .clock import Offset, solve_pairs
 
@@ -68,8 +69,7 @@ def _pair(
             fine.append(offset + delay)
     if not fine:
         return None
-    spread = 1.4826 * float(np.median(np.abs(np.array(fine) - np.median(fine))))
-    return float(np.median(fine)), max(spread / np.sqrt(len(fine)), 0.5 / RATE)
+    return float(np.median(fine)), max(_spread(np.array(fine)) / np.sqrt(len(fine)), 0.5 / RATE)
 
 
 def _correlate(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
@@ -77,8 +77,12 @@ def _correlate(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     found = signal.correlate(x - x.mean(), y - y.mean(), method="fft")
     # Short overlaps correlate by chance: the sum is what counts, not its mean.
     top = int(np.argmax(found))
-    spread = 1.4826 * float(np.median(np.abs(found - np.median(found))))
-    return float(top - (len(y) - 1)), float((found[top] - np.median(found)) / max(spread, 1e-12))
+    return float(top - (len(y) - 1)), float((found[top] - np.median(found)) / max(_spread(found), 1e-12))
+
+
+def _spread(values: np.ndarray) -> float:
+    """Return the standard deviation of values by their median deviation."""
+    return MEDIAN_TO_SIGMA * float(np.median(np.abs(values - np.median(values))))
 
 
 def _phase_delay(x: np.ndarray, y: np.ndarray) -> float | None:
@@ -92,8 +96,7 @@ def _phase_delay(x: np.ndarray, y: np.ndarray) -> float | None:
     most = int(SEARCH_S * RATE)
     lags = np.concatenate([phase[-most:], phase[: most + 1]])
     top = int(np.argmax(lags))
-    spread = 1.4826 * float(np.median(np.abs(lags - np.median(lags))))
-    if not 0 < top < len(lags) - 1 or lags[top] < PEAK * spread:
+    if not 0 < top < len(lags) - 1 or lags[top] < PEAK * _spread(lags):
         return None
     left, middle, right = lags[top - 1 : top + 2]
     bend = left - 2 * middle + right

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from ..motion import rotations
 from .clock import Offset, solve_pairs
 from .motion_tracks import MotionTrack
 
@@ -54,7 +55,7 @@ def measure(
         One offset per camera as `clock.solve_pairs` returns them; None if motion does not determine any.
     """
     pairs = [
-        _Pair(a, b, _essential(T_cam_world[a], T_cam_world[b]))
+        _Pair(a, b, essential(T_cam_world[a], T_cam_world[b]))
         for a, b in itertools.combinations(range(len(tracks)), 2)
         if min(len(tracks[a].times), len(tracks[b].times)) >= LEAST_TIMES
     ]
@@ -96,7 +97,7 @@ def misfit(
     values = []
     for a, b in itertools.combinations(range(len(tracks)), 2):
         if min(len(tracks[a].times), len(tracks[b].times)) >= LEAST_TIMES:
-            pair = _Pair(a, b, _essential(T_cam_world[a], T_cam_world[b]))
+            pair = _Pair(a, b, essential(T_cam_world[a], T_cam_world[b]))
             trial = np.array([offsets[b] - offsets[a]])
             values.append(_curve(_distances(pair, tracks, trial, interval), None)[0])
     return float(np.mean(values)) if values else float("nan")
@@ -203,9 +204,8 @@ def _distances(pair: _Pair, tracks: Sequence[MotionTrack], trials: np.ndarray, s
     return result
 
 
-def _essential(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Essential matrix with x_other^T E x_one = 0 from world-to-camera transforms. [3, 3]"""
+def essential(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the essential matrix with x_other^T E x_one = 0 of world-to-camera transforms [4, 4]. [3, 3]"""
     relative = other @ np.linalg.inv(one)
     t = relative[:3, 3] / max(float(np.linalg.norm(relative[:3, 3])), 1e-12)
-    cross = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]])
-    return cross @ relative[:3, :3]
+    return rotations.skew(t) @ relative[:3, :3]

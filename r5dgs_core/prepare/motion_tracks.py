@@ -46,7 +46,7 @@ def track(source: CameraSource, lens: Lens, report: Callable[[int], None]) -> Mo
     """
     first = max(0, (len(source.times) - MOST_FRAMES) // 2)
     wanted = range(first, min(first + MOST_FRAMES, len(source.times)))
-    step = max(1, source.width // WIDTH)
+    step = step_of(source.width)
     found, small = [], []
     for count, (index, pixels) in enumerate(source.read(list(wanted)), 1):
         found.append(index)
@@ -62,6 +62,11 @@ def track(source: CameraSource, lens: Lens, report: Callable[[int], None]) -> Mo
     rows = pixels[:, 1] / source.height - 0.5
     good = np.isfinite(rays).all(1) & (rays[:, 2] > 1e-3)
     return MotionTrack(source.times[found][seen][good], rays[good, :2] / rays[good, 2:], 1.0 / lens.fx, rows[good])
+
+
+def step_of(width: int) -> int:
+    """Return the number of pixels of a frame per reduced pixel."""
+    return max(1, width // WIDTH)
 
 
 def reduce(pixels: np.ndarray, step: int) -> np.ndarray:

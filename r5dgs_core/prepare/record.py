@@ -13,12 +13,12 @@ import numpy as np
 from .. import __version__
 from ..capture.calibration.calibration import Calibration
 from ..data.splits import SPLITS
+from ..scene.cameras import OPENGL_TO_OPENCV
 from . import capture_file
 from .cameras import Camera
 from .clock import Offset
 from .plan import Plan, Request
 
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _EDGE_BYTES = 1 << 16  # of a file that enter its fingerprint, at each end
 
 
@@ -158,7 +158,7 @@ def _lens(plan: Plan, number: int, index: int) -> dict[str, float]:
 
 
 def _shared_pose(camera: Camera) -> dict[str, Any]:
-    return {} if camera.frames else {"transform_matrix": (camera.pose(0) @ _OPENGL).tolist()}
+    return {} if camera.frames else {"transform_matrix": (camera.pose(0) @ OPENGL_TO_OPENCV).tolist()}
 
 
 def _frames(plan: Plan, number: int, split: str, lost: set[int]) -> list[dict[str, Any]]:
@@ -177,6 +177,6 @@ def _frames(plan: Plan, number: int, split: str, lost: set[int]) -> list[dict[st
             frame = {"file_path": plan.image_name(number, index) + plan.suffix, "time": t, "frame": moment}
             if camera.frames:
                 frame |= {key: value for key, value in _lens(plan, number, index).items() if value != shared[key]}
-                frame["transform_matrix"] = (camera.pose(index) @ _OPENGL).tolist()
+                frame["transform_matrix"] = (camera.pose(index) @ OPENGL_TO_OPENCV).tolist()
             found.append(frame)
     return found

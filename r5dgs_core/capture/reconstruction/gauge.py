@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from ... import errors
+from ...motion import rotations
 from ..calibration.calibration import Calibration
 
 CAMERAS, PLANE, BOARD = "cameras", "plane", "board"
@@ -116,5 +117,5 @@ def _turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
         normal = np.cross(start, np.eye(3)[np.abs(start).argmin()])
         normal /= np.linalg.norm(normal)
         return 2 * np.outer(normal, normal) - np.eye(3)
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    cross = rotations.skew(axis)
     return np.eye(3) + cross + cross @ cross / (1 + cosine)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy import ndimage
 
 STILLS = 15  # frames that the picture of a fixed camera is made of
 _MOVED = 12  # difference from the median that marks a moving pixel, of 255
@@ -71,17 +72,5 @@ def still(recording: Recording) -> Still:
         moving += difference > _MOVED
         strong |= difference > 3 * _MOVED
     moved = strong | (moving > _SHARE * len(frames))
-    return Still(median, ~_grown(moved, max(1, round(_MARGIN * recording.height / 480))))
-
-
-def _grown(mask: np.ndarray, margin: int) -> np.ndarray:
-    """Return a mask and all pixels within a margin of it, horizontally and vertically."""
-    result = mask.copy()
-    for _ in range(margin):
-        wider = result.copy()
-        wider[1:] |= result[:-1]
-        wider[:-1] |= result[1:]
-        wider[:, 1:] |= result[:, :-1]
-        wider[:, :-1] |= result[:, 1:]
-        result = wider
-    return result
+    margin = max(1, round(_MARGIN * recording.height / 480))
+    return Still(median, ~np.asarray(ndimage.binary_dilation(moved, iterations=margin), bool))

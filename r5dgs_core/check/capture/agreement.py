@@ -14,6 +14,7 @@ from ...data import masks
 from ...data.dataset import Dataset
 from ...data.views import View
 from ...findings import Collector
+from ...prepare import motion_offsets
 from ...terminal import printable
 from . import pictures
 from .pictures import Album
@@ -126,11 +127,8 @@ def _draw_pair(a: Sighting, b: Sighting, object_id: int) -> Figure:
 def epipolar_line(a: Sighting, b: Sighting) -> np.ndarray:
     """Return the line a u + b v + c = 0 in the second image on which the first centre lies. [3]"""
     one, other = a.view.camera, b.view.camera
-    relative = other.T_cam_world @ np.linalg.inv(one.T_cam_world)
-    t = relative[:3, 3]
-    cross = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]])
     ray = np.linalg.inv(one.intrinsics) @ np.append(a.center, 1.0)
-    return np.linalg.inv(other.intrinsics).T @ (cross @ relative[:3, :3] @ ray)
+    return np.linalg.inv(other.intrinsics).T @ motion_offsets.essential(one.T_cam_world, other.T_cam_world) @ ray
 
 
 def distance(a: Sighting, b: Sighting) -> float:

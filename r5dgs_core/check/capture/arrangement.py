@@ -8,13 +8,13 @@ import numpy as np
 
 from ...data.dataset import Dataset
 from ...findings import Collector
-from ...scene.cameras import Camera
+from ...prepare.image_size import MOST_LINES
+from ...scene.cameras import Camera, project
 from . import pictures
 from .pictures import Album
 
 COMMON = 0.02  # least share of a camera's view that another camera sees
 SMALL_DEG = 5.0  # largest angle between cameras of a rig that is too narrow
-MOST_LINES = 960
 MOST_CAMERAS = 40  # compared cameras; more are thinned evenly
 _DEPTHS = np.geomspace(0.2, 3.0, 12)  # of the compared points, in distances to the middle
 _GRID = 7
@@ -71,12 +71,8 @@ def common_views(cameras: list[Camera], middle: np.ndarray) -> np.ndarray:
 
 def _inside(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Mask of points that a camera sees. [N]"""
-    local = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
-    in_front = local[:, 2] > 1e-9
-    pixels = local @ camera.intrinsics.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2]
-        return in_front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+    pixels, _ = project(camera, points)  # NaN behind the camera
+    return ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
 
 
 def widest_angle(cameras: list[Camera], middle: np.ndarray) -> float:
@@ -93,6 +89,6 @@ def _check_size(found: Dataset, collect: Collector, album: Album) -> None:
         collect.add(
             "D70",
             f"{found.root}: images of {largest.camera.height} lines, expected up to {MOST_LINES}; the Gaussians of a "
-            "scene do not show more. Remedy: prepare again with --size 960, which also trains faster",
+            f"scene do not show more. Remedy: prepare again with --size {MOST_LINES}, which also trains faster",
             picture=picture,
         )

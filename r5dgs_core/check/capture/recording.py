@@ -11,8 +11,6 @@ from ...data import images
 from ...data.views import View
 from ...prepare import motion_tracks
 
-WIDTH = 240  # of reduced images, pixels
-MOST = 600  # images per camera, which bounds memory
 LEAST = 8  # images of a camera that rules about time need
 
 
@@ -59,17 +57,12 @@ def measure(views: Sequence[View], pictures: Sequence[np.ndarray]) -> Recording:
         pictures: Their reduced images and edges, as from `reduce`.
     """
     stack, edges = zip(*pictures, strict=True)
-    return Recording(tuple(views), np.stack(stack), np.stack(edges), step_of(views[0].camera.width))
-
-
-def step_of(width: int) -> int:
-    """Return the number of full pixels per reduced pixel."""
-    return max(1, width // WIDTH)
+    return Recording(tuple(views), np.stack(stack), np.stack(edges), motion_tracks.step_of(views[0].camera.width))
 
 
 def reduce(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the reduced image [h, w, 3] uint8 and its edges [h, w] float16 of an image [H, W, C]."""
-    step = step_of(pixels.shape[1])
+    step = motion_tracks.step_of(pixels.shape[1])
     color = images.to_uint8(images.composite(images.to_rgba(pixels)))
     gray = color.mean(2, dtype=np.float32)
     slope = np.zeros_like(gray)
