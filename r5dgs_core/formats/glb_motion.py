@@ -13,7 +13,7 @@ import numpy as np
 
 from ..motion import cubic_curves, rotations
 from ..motion.cubic_curves import Keys
-from ..playback import group_curves
+from ..playback import group_curves, group_dynamics
 from ..scene.scene import MotionGroup, Scene
 from .gltf import Arrays, Content
 
@@ -45,12 +45,13 @@ def animation(
         source: Source of the motion past t_max, one of `playback.modes.SOURCES`.
     """
     start, pace, reaches = float(scene.tracks.times[0]), seconds_per_unit(scene), group_curves.reaches(scene)
+    other_models = None if source == "fitted" else group_dynamics.models_of(scene, source)
     clocks: dict[bytes, int] = {}
     samplers, channels = [], []
     for motion_id, node in nodes.items():
         if motion_id == 0:
             continue
-        curves = group_curves.curves(scene, motion_id, end, float(reaches[motion_id]), source)
+        curves = group_curves.curves(scene, motion_id, end, float(reaches[motion_id]), other_models)
         shift = home(scene, scene.groups[motion_id])
         for path, keys, offset in (("translation", curves.location, shift), ("rotation", curves.rotation, None)):
             if not (keys.values != keys.values[:1]).any():

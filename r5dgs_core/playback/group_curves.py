@@ -6,6 +6,7 @@ The curves are those of the group's anchor: in the frame of its parent if the gr
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -28,27 +29,29 @@ def observed(scene: Scene, motion_id: int) -> Curves:
 
 
 def future(
-    scene: Scene, motion_id: int, most: int = reduction.MAX_INTERVALS, source: str = "fitted"
+    scene: Scene,
+    motion_id: int,
+    most: int = reduction.MAX_INTERVALS,
+    other_models: Sequence[models.MotionModel] | None = None,
 ) -> tuple[reduction.Sampler, models.MotionModel, float | None]:
     """Sampler of a group's motion past t_max, at scene times.
 
     Args:
-        scene: The scene; without parts if ``source`` is not "fitted".
+        scene: The scene; without parts if there are other models.
         motion_id: Motion group.
         most: Maximum number of intervals between keys, as for `key_reduction.reduce`.
-        source: Source of the motion, one of `modes.SOURCES`.
+        other_models: Models of all groups (`group_dynamics.models_of`) in place of the fitted ones, or None.
 
     Returns:
         The sampler, the model behind it (that of the leader if the group follows one), and the time past t_max at which
         it stops, or None.
     """
     group = scene.groups[motion_id]
-    all_models = None if source == "fitted" else group_dynamics.models_of(scene, source)
     if group.follows is None or group.follow_matrix is None:
-        model = group.own_model if all_models is None else all_models[motion_id]
+        model = group.own_model if other_models is None else other_models[motion_id]
         stop = None if group.joint is None else group.joint.stop_time
         return stopped(reduction.model_sampler(model, scene.t_max, most), scene.t_max, stop), model, stop
-    model = scene.groups[group.follows].model if all_models is None else all_models[group.follows]
+    model = scene.groups[group.follows].model if other_models is None else other_models[group.follows]
     leader = reduction.model_sampler(model, scene.t_max, most)
     follow = np.asarray(group.follow_matrix, np.float64)
 
@@ -81,7 +84,13 @@ def kinks(model: models.MotionModel, start: float, end: float, stop_time: float 
     return found.tolist()
 
 
-def curves(scene: Scene, motion_id: int, end: float, reach: float, source: str = "fitted") -> Curves:
+def curves(
+    scene: Scene,
+    motion_id: int,
+    end: float,
+    reach: float,
+    other_models: Sequence[models.MotionModel] | None = None,
+) -> Curves:
     """Keys from the first knot to a scene time; up to t_max if it is not later. Slopes may jump at t_max and at kinks.
 
     Args:
@@ -89,12 +98,12 @@ def curves(scene: Scene, motion_id: int, end: float, reach: float, source: str =
         motion_id: Motion group.
         end: Last scene time.
         reach: Reach of the group, from `reaches`.
-        source: As for `future`.
+        other_models: As for `future`.
     """
     past = observed(scene, motion_id)
     if end <= scene.t_max:
         return past
-    sample, model, stop = future(scene, motion_id, source=source)
+    sample, model, stop = future(scene, motion_id, other_models=other_models)
     jumps = kinks(model, scene.t_max, end, stop)
     ahead = reduction.reduce(sample, scene.t_max, end, TOLERANCE * scene.extent, reach, jumps)
     return cubic_curves.join(past, ahead)
