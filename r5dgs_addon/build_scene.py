@@ -194,7 +194,7 @@ def _objects(
     bodies = object_hulls.bodies(scene)
     hulls = {(hull.object_id, hull.motion_id): hull.vertices.ravel().tolist() for hull in scene.hulls}
     anchors = {}
-    depths = {group.id: number for number, (group, _) in enumerate(group_dynamics.parts_of(scene), start=1)}
+    depths = {group.id: number for number, (group, _) in enumerate(group_dynamics.parts_of(scene.groups), start=1)}
     for part in sorted(anchor_ranges(scene, parts), key=lambda own: depths.get(own.motion_id, 0)):  # parents come first
         home = children[part.object_id, part == largest[part.object_id]]
         anchors[_anchor_key(part)] = anchor = _anchor(home, root, scene, part, largest, extent)

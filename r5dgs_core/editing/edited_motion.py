@@ -116,7 +116,7 @@ def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[
     """
     quats, moves = group_dynamics.knot_poses(scene)
     known = np.concatenate([quats, moves], axis=-1)
-    carried = {group.id: number for number, (group, _) in enumerate(group_dynamics.parts_of(scene), start=1)}
+    carried = {group.id: number for number, (group, _) in enumerate(group_dynamics.parts_of(scene.groups), start=1)}
     courses = [_course(scene, cluster, known) for cluster in found]
     later = np.asarray(times[len(scene.tracks.times) :], np.float64) - scene.t_max
     groups: dict[int, tuple[MotionGroup, bool]] = {}

@@ -140,7 +140,7 @@ def _add_groups(scene: Scene, options: registry.Options, tree: _Nodes, arrays: g
         if group.id not in numbers:
             parent = None if group.parent is None else node_of(scene.groups[group.parent])
             extras = {"r5dgs": {"group": group.id, "role": group.role}}
-            place = glb_motion.home(scene, group).tolist()
+            place = glb_motion.home(scene.groups, group).tolist()
             name = _group_name(scene, group, bodies[group.object_id])
             numbers[group.id] = tree.add(name, parent, translation=place, extras=extras)
             if parent is None:

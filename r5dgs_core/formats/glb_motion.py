@@ -6,7 +6,7 @@ one second. The two tangents of a key differ where the velocity jumps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,20 +15,21 @@ from ..motion import cubic_curves, rotations
 from ..motion.cubic_curves import Keys
 from ..playback import group_curves, group_dynamics
 from ..scene.scene import MotionGroup, Scene
+from ..scene.units import Units
 from .gltf import Arrays, Content
 
 CUBIC = "CUBICSPLINE"
 _TO_XYZW, _TO_WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
 
 
-def seconds_per_unit(scene: Scene) -> float:
+def seconds_per_unit(units: Units) -> float:
     """Seconds of an animation per unit of scene time."""
-    return scene.units.seconds_per_unit or 1.0
+    return units.seconds_per_unit or 1.0
 
 
-def home(scene: Scene, group: MotionGroup) -> np.ndarray:
+def home(groups: Sequence[MotionGroup], group: MotionGroup) -> np.ndarray:
     """Position of a group's anchor at t_max in the frame of its parent. [3]"""
-    return group.home if group.parent is None else group.home - scene.groups[group.parent].home
+    return group.home if group.parent is None else group.home - groups[group.parent].home
 
 
 def animation(
@@ -44,7 +45,7 @@ def animation(
         mode: Name of the animation.
         source: Source of the motion past t_max, one of `playback.modes.SOURCES`.
     """
-    start, pace, reaches = float(scene.tracks.times[0]), seconds_per_unit(scene), group_curves.reaches(scene)
+    start, pace, reaches = float(scene.tracks.times[0]), seconds_per_unit(scene.units), group_curves.reaches(scene)
     other_models = None if source == "fitted" else group_dynamics.models_of(scene, source)
     clocks: dict[bytes, int] = {}
     samplers, channels = [], []
@@ -52,7 +53,7 @@ def animation(
         if motion_id == 0:
             continue
         curves = group_curves.curves(scene, motion_id, end, float(reaches[motion_id]), other_models)
-        shift = home(scene, scene.groups[motion_id])
+        shift = home(scene.groups, scene.groups[motion_id])
         for path, keys, offset in (("translation", curves.location, shift), ("rotation", curves.rotation, None)):
             if not (keys.values != keys.values[:1]).any():
                 continue

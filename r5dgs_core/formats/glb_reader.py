@@ -123,21 +123,19 @@ def _tracks(content: gltf.Content, groups: Sequence[MotionGroup], times: np.ndar
     """Poses of all groups at the observed times, in the world. [G, S, 7]"""
     found = [item for item in content.items("animations") if item.get("name") == _MODE]
     nodes = {own["group"]: number for number, _, own in _tagged(content, "group") if "object" not in own}
+    parts = _parts(content, groups)
     still = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(groups), len(times), 1))
-    since = (units.seconds_per_unit or 1.0) * (times - times[0])
+    since = glb_motion.seconds_per_unit(units) * (times - times[0])
     since = since.astype(np.float32).astype(np.float64)
-    own = {group.id: (still[0, :, :4], still[0, :, 4:]) for group in groups}
+    world = {group.id: (still[0, :, :4], still[0, :, 4:]) for group in groups}
     for group in groups:
         if found and group.id in nodes:
-            place = group.home if group.parent is None else group.home - groups[_checked(content, group, groups)].home
-            own[group.id] = glb_motion.poses(content, found[0], nodes[group.id], place, since)
-    world = dict(own)
-    for _ in groups:  # parents before their parts, in at most G rounds
-        for group in groups:
-            if group.parent is not None and group.joint is not None:
-                above = groups[_checked(content, group, groups)]
-                parent, move, point = world[above.id], own[group.id], group.joint.point
-                world[group.id] = joints.composed(parent, above.pivot, move, point, group.pivot)
+            place = glb_motion.home(groups, group)
+            world[group.id] = glb_motion.poses(content, found[0], nodes[group.id], place, since)
+    for part, joint in parts:  # relative to the parent so far
+        assert part.parent is not None
+        above = groups[part.parent]
+        world[part.id] = joints.composed(world[above.id], above.pivot, world[part.id], joint.point, part.pivot)
     poses = np.stack([np.concatenate(world[group.id], axis=-1) for group in groups])
     quats = rotations.make_continuous(np.moveaxis(poses[..., :4], 1, 0)[::-1])[::-1]
     poses[..., :4] = np.moveaxis(quats, 0, 1)
@@ -145,10 +143,16 @@ def _tracks(content: gltf.Content, groups: Sequence[MotionGroup], times: np.ndar
     return poses
 
 
-def _checked(content: gltf.Content, group: MotionGroup, groups: Sequence[MotionGroup]) -> int:
-    if group.parent is None or not 0 <= group.parent < len(groups):
-        raise content.error(f"group {group.id}: parent: expected a number below {len(groups)}, found {group.parent!r}")
-    return group.parent
+def _parts(content: gltf.Content, groups: Sequence[MotionGroup]) -> list[tuple[MotionGroup, joints.Joint]]:
+    """Groups with a parent, parents first."""
+    for group in groups:
+        if group.parent is not None and not 0 <= group.parent < len(groups):
+            wanted = f"expected a number below {len(groups)}"
+            raise content.error(f"group {group.id}: parent: {wanted}, found {group.parent!r}")
+    try:
+        return group_dynamics.parts_of(groups)
+    except ValueError as error:
+        raise content.error(str(error)) from error
 
 
 def _sky(top: Row) -> np.ndarray:

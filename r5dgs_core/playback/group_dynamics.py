@@ -8,6 +8,7 @@ be compared and averaged. About a distant origin they would lose precision to ca
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -76,7 +77,7 @@ class GroupMotion:
         self._times, self._t_max = scene.tracks.times, scene.t_max
         self._scene, self._source = scene, source
         self._quats, self._displacements = knot_poses(scene)
-        self._parts = parts_of(scene)
+        self._parts = parts_of(scene.groups)
         if self._parts:
             self._displacements = self._displacements.copy()
         for part, _ in self._parts:
@@ -141,14 +142,18 @@ class GroupMotion:
             quats[part.id], displacements[part.id] = joints.composed(parent, pivot, own, joint.point, part.pivot)
 
 
-def parts_of(scene: Scene) -> list[tuple[MotionGroup, Joint]]:
-    """Return the groups with a parent, and their joints; parents come before their children."""
-    found, known = [], {g.id for g in scene.groups if g.joint is None}
-    waiting = [g for g in scene.groups if g.joint is not None]
+def parts_of(groups: Sequence[MotionGroup]) -> list[tuple[MotionGroup, Joint]]:
+    """Return the groups with a parent, and their joints; parents come before their children.
+
+    Raises:
+        ValueError: The parents form a circle, or one is missing.
+    """
+    found, known = [], {g.id for g in groups if g.joint is None}
+    waiting = [g for g in groups if g.joint is not None]
     while waiting:
         ready = [g for g in waiting if g.parent in known]
         if not ready:
-            raise ValueError("groups: the parents form a circle")
+            raise ValueError("groups: the parents form a circle, or one is missing")
         found += [(g, g.joint) for g in ready if g.joint is not None]
         known |= {g.id for g in ready}
         waiting = [g for g in waiting if g.id not in known]
