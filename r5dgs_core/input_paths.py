@@ -81,6 +81,12 @@ def check_source(source: Path) -> None:
         raise errors.DatasetError(f"{source}: expected a video, or a folder of videos or frames, found nothing")
 
 
+def check_calibration(path: Path) -> None:
+    """Raise `DatasetError` if the file or folder of ``--calibration`` does not exist."""
+    if not path.exists():
+        raise errors.DatasetError(f"--calibration {path}: expected a file or folder, found nothing")
+
+
 def prepare_command(source: Path) -> str:
     """Return the command that makes a data set of a folder of videos or of distorted images, for messages."""
     out = source.with_name(f"{source.name}_data")

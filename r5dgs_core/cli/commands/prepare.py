@@ -183,9 +183,9 @@ def _check(window: dict[str, Any], source: Path, calibration: Path | None) -> No
     """Raise UsageError for a window that ends before it starts, or DatasetError for a missing path."""
     if window.get("end") is not None and window["end"] <= window.get("start", 0.0):
         raise errors.UsageError(f"--end {window['end']:g}: expected a time after --start {window.get('start', 0.0):g}")
-    for path in (source, calibration):
-        if path is not None:
-            input_paths.check_source(Path(path))
+    input_paths.check_source(Path(source))
+    if calibration is not None:
+        input_paths.check_calibration(Path(calibration))
 
 
 def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: str) -> None:

@@ -533,6 +533,11 @@ def test_every_kind_of_error_has_its_status(monkeypatch, capsys, error, status):
     assert ("Traceback" in shown) == (status == 70) and ("usage: r5dgs info" in shown) == (status == 2)
 
 
+def test_a_missing_calibration_is_named_as_one(tmp_path, capsys):
+    given = ("prepare", tmp_path, "--out", tmp_path / "data", "--calibration", tmp_path / "no.toml")
+    assert f"--calibration {tmp_path / 'no.toml'}: expected a file or folder" in complaint(capsys, *given)
+
+
 def test_a_query_that_finds_nothing_is_status_1(made, capsys):
     assert main.main(["query", str(made[1]), "brick"]) == 0
     assert main.main(["query", str(made[1]), "elephant"]) == 1
