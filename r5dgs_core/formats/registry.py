@@ -30,8 +30,8 @@ class Options:
         times: Scene times, at least one.
         frames: Frame number of each time; None for a single time without a number.
         object_ids: Objects to export; None for all.
-        still: PNG of the scene at t_max for formats with a picture, or None.
         until: Last scene time of formats with motion; None for the time up to which Blender extrapolates by default.
+        still: PNG of the scene at t_max for formats with a picture, or None.
     """
 
     times: tuple[float, ...]

@@ -43,15 +43,19 @@ def isolate(
         Display-referred sRGB and straight alpha, in [0, 1]; black if alpha is 0. [H, W, 4] float32
     """
     frame = scene_player.Player(scene, mode).frame(t, origin=camera.center)
-    wanted = np.isin(frame.object_ids, list(object_ids))
-    alone = dataclasses.replace(
-        frame, opacity_logits=np.where(wanted, frame.opacity_logits, np.float32(_ABSENT)).astype(np.float32)
-    )
+    alone = without_others(frame, object_ids)
     output = scene_renderer.render_frame(scene, alone, camera, background=None, backend=backend)
     color = output.color  # premultiplied: blended over black
     alpha = np.clip(output.alpha, 0, 1)[..., None]
     straight = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 1e-6)
     return np.concatenate([np.clip(straight, 0, 1), alpha], axis=-1)
+
+
+def without_others(frame: scene_player.Frame, object_ids: Collection[int]) -> scene_player.Frame:
+    """Return a frame in which the Gaussians of all other objects are invisible."""
+    wanted = np.isin(frame.object_ids, list(object_ids))
+    logits = np.where(wanted, frame.opacity_logits, np.float32(_ABSENT)).astype(np.float32)
+    return dataclasses.replace(frame, opacity_logits=logits)
 
 
 def highlight(

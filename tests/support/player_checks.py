@@ -15,9 +15,7 @@ import numpy as np
 from r5dgs_core import errors
 from r5dgs_core.data import images
 from r5dgs_core.playback.scene_player import Player
-from r5dgs_core.render import scene_renderer
-from r5dgs_core.scene import cameras
-from r5dgs_core.scene.cameras import Camera
+from r5dgs_core.render import scene_renderer, viewpoints
 from r5dgs_core.scene.scene import Scene
 from r5dgs_core.search import object_search
 
@@ -53,12 +51,6 @@ def shown_times(scene: Scene, end: float) -> list[float]:
     return [first, 0.5 * (first + last), last, 0.5 * (last + end), end]
 
 
-def sized(camera: Camera, side: int) -> Camera:
-    """The camera with a longest side of some pixels."""
-    share = side / max(camera.width, camera.height)
-    return cameras.resize(camera, round(share * camera.width), round(share * camera.height))
-
-
 def compare(browser: Browser, scene: Scene, url: str, side: int, end: float, folder: Path) -> list[Comparison]:
     """Compare pictures of some captured cameras at `shown_times`.
 
@@ -72,7 +64,7 @@ def compare(browser: Browser, scene: Scene, url: str, side: int, end: float, fol
     """
     player, found = Player(scene), []
     for number in shown_cameras(scene):
-        camera = sized(scene.cameras[number], side)
+        camera = viewpoints.resized(scene.cameras[number], side)
         browser.open(f"{url}?ui=0&t={scene.t_max}&camera={number}", camera.width, camera.height)
         for t in shown_times(scene, end):
             data = browser.eval(f"(r5dgs.go({t}), r5dgs.engine.picture())").partition(",")[2]
@@ -113,7 +105,7 @@ def picks(browser: Browser, scene: Scene, url: str, side: int, count: int = 50) 
     """
     player, random_, result = Player(scene), random.Random(0), {}
     for number in shown_cameras(scene):
-        camera = sized(scene.cameras[number], side)
+        camera = viewpoints.resized(scene.cameras[number], side)
         ids = scene_renderer.render(player, camera, scene.t_max).ids
         browser.open(f"{url}?ui=0&t={scene.t_max}&camera={number}", camera.width, camera.height)
         for object_id in np.unique(ids[ids > 0]).tolist():

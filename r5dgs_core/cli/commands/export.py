@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import logging
 import math
 from pathlib import Path
@@ -24,7 +23,6 @@ EXAMPLE = "scene.r5dgs --to ply --out frame.ply --frames 1:60"
 PAGE = "user/export.md"
 
 STILL_SIDE = 480  # longest side of the picture in formats with one, pixels
-TRANSPARENT = -30.0  # logit of the opacity of Gaussians that are not shown
 log = logging.getLogger(__name__)
 
 
@@ -96,10 +94,7 @@ def run_export(
     from ...scene import scene_file
 
     scene = scene_file.read(path)
-    _check_until(scene, until)
-    what = dataclasses.replace(_selection(scene, t, frames, words), until=until)
-    if chosen.has_still:
-        what = dataclasses.replace(what, still=still(scene, what.object_ids))
+    what = selection(chosen, scene, t=t, frames=frames, until=until, words=words)
     targets = chosen.paths(out, what)
     present = [target for target in targets if target.exists()]
     if present and not overwrite:
@@ -151,55 +146,48 @@ def _check_arguments(
             raise errors.UsageError(f"{option} {time}: expected a finite number")
 
 
-def _check_until(scene: Scene, until: float | None) -> None:
-    if until is not None and not (math.isfinite(until) and until >= scene.t_max):
-        raise errors.UsageError(f"--until {until:g}: expected a time from t_max on, which is {scene.t_max:g}")
-
-
-def page_options(scene: Scene, until: float | None, words: str | None) -> registry.Options:
-    """Return the options of a page with a scene's motion.
+def selection(
+    chosen: registry.Format,
+    scene: Scene,
+    *,
+    t: float | None = None,
+    frames: tuple[int, int] | None = None,
+    until: float | None = None,
+    words: str | None = None,
+) -> registry.Options:
+    """Return the selected part of the scene (times and objects), with a picture if the format has one.
 
     Raises:
-        UsageError: The time is not finite or before t_max, or the words are empty.
+        UsageError: ``until`` is not finite or before t_max, or the words are empty.
         ConfigError: No object matches the words.
     """
-    _check_until(scene, until)
-    chosen = None if words is None else object_ids(scene, words)
-    return registry.Options((scene.t_max,), None, chosen, until, still(scene, chosen))
-
-
-def still(scene: Scene, object_ids: frozenset[int] | None) -> bytes | None:
-    """Return a PNG of the scene, or of some of its objects, at t_max; None if no rasterizer is usable."""
-    import numpy as np
-
-    from ...formats import image_files
-    from ...playback.scene_player import Player
-    from ...render import scene_renderer, viewpoints
-    from ...scene import cameras
-
-    shown = scene
-    if object_ids is not None:
-        others = ~np.isin(scene.gaussians.object_ids, list(object_ids))
-        logits = np.where(others, np.float32(TRANSPARENT), scene.gaussians.opacity_logits)
-        shown = scene.with_arrays(opacity_logits=logits)
-    camera = scene.cameras[0] if scene.cameras else viewpoints.overview(scene)
-    share = STILL_SIDE / max(camera.width, camera.height)
-    camera = cameras.resize(camera, max(1, round(share * camera.width)), max(1, round(share * camera.height)))
-    try:
-        color = scene_renderer.render(Player(shown), camera, scene.t_max).color
-    except errors.BackendError as error:
-        log.warning("the page has no picture for browsers without WebGL: %s", error)
-        return None
-    return image_files.png(np.rint(255 * np.clip(color, 0, 1)).astype(np.uint8))
-
-
-def _selection(scene: Scene, t: float | None, frames: tuple[int, int] | None, words: str | None) -> registry.Options:
-    """Return the selected part of the scene (frames and objects)."""
+    if until is not None and not (math.isfinite(until) and until >= scene.t_max):
+        raise errors.UsageError(f"--until {until:g}: expected a time from t_max on, which is {scene.t_max:g}")
     numbers = None if frames is None else tuple(range(frames[0], frames[1] + 1))
     times = (scene.t_max if t is None else t,)
     if numbers is not None:
         times = tuple((number - 1) / scene.frames_per_unit for number in numbers)
-    return registry.Options(times, numbers, None if words is None else object_ids(scene, words))
+    ids = None if words is None else object_ids(scene, words)
+    return registry.Options(times, numbers, ids, until, _still(scene, ids) if chosen.has_still else None)
+
+
+def _still(scene: Scene, object_ids: frozenset[int] | None) -> bytes | None:
+    """Return a PNG of the scene, or of some of its objects, at t_max; None if no rasterizer is usable."""
+    from ...data import images
+    from ...formats import image_files
+    from ...playback.scene_player import Player
+    from ...render import highlight, scene_renderer, viewpoints
+
+    camera = viewpoints.resized(scene.cameras[0] if scene.cameras else viewpoints.overview(scene), STILL_SIDE)
+    frame = Player(scene).frame(scene.t_max, origin=camera.center)
+    if object_ids is not None:
+        frame = highlight.without_others(frame, object_ids)
+    try:
+        color = scene_renderer.render_frame(scene, frame, camera).color
+    except errors.BackendError as error:
+        log.warning("the page has no picture for browsers without WebGL: %s", error)
+        return None
+    return image_files.png(images.to_uint8(color))
 
 
 def frame_range(text: str) -> tuple[int, int]:

@@ -61,7 +61,8 @@ def run_view(
     from . import export
 
     scene = scene_file.read(path)
-    with serving(html.page(scene, export.page_options(scene, until, words)), port) as server:
+    what = export.selection(html.FORMAT, scene, until=until, words=words)
+    with serving(html.page(scene, what), port) as server:
         address = f"http://{HOST}:{server.server_port}/"
         print(f"{address} (end with Ctrl-C)", flush=True)
         if browser:
