@@ -61,50 +61,40 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **fi
         UsageError: ``out`` has another suffix, or an option does not apply to a file.
     """
     input_paths.check_scene_output(out)
-    if run_folder.suffix.lower() == GLB and run_folder.is_file():
-        _import_file(run_folder, out, progress_kind, fields)
-        return
-    input_paths.check_foreign_run(run_folder)
-    if fields.get("data") is not None:
-        inputs.check_dataset(fields["data"])
-    from ...importing import importer
+    given = {name: value for name, value in fields.items() if value is not None}
+    is_file = run_folder.suffix.lower() == GLB and run_folder.is_file()
+    if is_file and given:
+        option = f"--{next(iter(given)).replace('_', '-')}"
+        raise errors.UsageError(f"{option}: applies to run folders only, and {run_folder} is a file; leave it out")
+    if not is_file:
+        input_paths.check_foreign_run(run_folder)
+    if "data" in given:
+        inputs.check_dataset(given["data"])
     from ...progress import make
     from ...scene import scene_file
 
-    chosen = importer.Options(**{name: value for name, value in fields.items() if value is not None})
     with make(progress_kind) as progress:
-        scene = importer.import_run(
-            run_folder,
-            chosen,
-            lambda done, total: progress({"event": "import", "done": done, "total": total, "unit": "Gaussians"}),
-        )
+        scene = _read_file(run_folder) if is_file else _convert(run_folder, given, progress)
         scene_file.write(scene, out)
         if progress_kind == "json":
             progress({"event": "imported", "path": str(out), "gaussians": len(scene.gaussians.means)})
     if progress_kind != "json":
-        _print_summary(scene, out)
+        count = sum(o.id > 0 for o in scene.objects)
+        objects = "1 object" if count == 1 else f"{count} objects"
+        print(f"{out}: {len(scene.gaussians.means)} Gaussians, {objects}, t_max {scene.t_max:g}")
 
 
-def _import_file(path: Path, out: Path, progress_kind: str, fields: dict[str, Any]) -> None:
-    """Convert a .glb file of ``r5dgs export`` to a scene file."""
-    given = [name for name, value in fields.items() if value is not None]
-    if given:
-        option = f"--{given[0].replace('_', '-')}"
-        raise errors.UsageError(f"{option}: applies to run folders only, and {path} is a file; leave it out")
+def _read_file(path: Path) -> Scene:
     from ...formats import glb_reader
-    from ...progress import make
-    from ...scene import scene_file
 
-    with make(progress_kind) as progress:
-        scene = glb_reader.read(path)
-        scene_file.write(scene, out)
-        if progress_kind == "json":
-            progress({"event": "imported", "path": str(out), "gaussians": len(scene.gaussians.means)})
-    if progress_kind != "json":
-        _print_summary(scene, out)
+    return glb_reader.read(path)
 
 
-def _print_summary(scene: Scene, out: Path) -> None:
-    count = sum(o.id > 0 for o in scene.objects)
-    objects = "1 object" if count == 1 else f"{count} objects"
-    print(f"{out}: {len(scene.gaussians.means)} Gaussians, {objects}, t_max {scene.t_max:g}")
+def _convert(run_folder: Path, given: dict[str, Any], progress: Any) -> Scene:
+    from ...importing import importer
+
+    return importer.import_run(
+        run_folder,
+        importer.Options(**given),
+        lambda done, total: progress({"event": "import", "done": done, "total": total, "unit": "Gaussians"}),
+    )
