@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any
 from ... import errors, user_settings
 from .. import inputs, options
 
-log = logging.getLogger(__name__)
-
 if TYPE_CHECKING:
     from ...data.dataset import Dataset
     from ...data.views import View
@@ -28,6 +26,8 @@ PAGE = "user/masks.md"
 
 BACKENDS = ("precomputed", "blender", "sam2", "sam3")
 MODELS = ("sam2", "sam3")  # backends that run networks
+
+log = logging.getLogger(__name__)
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:

@@ -22,7 +22,6 @@ LONG = (
 )
 EXAMPLE = "VIDEOS --calibration calibration.toml --out DATA"
 PAGE = "user/your_data.md"
-MODELS = ("sam2", "sam3")
 SYNC = ("auto", "audio", "motion", "none")
 
 
@@ -194,7 +193,7 @@ def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: st
 
     if masks == "none":
         return
-    if masks in MODELS:
+    if masks in masks_command.MODELS:
         overwrite = plan.request.overwrite
         masks_command.run_masks(
             plan.request.out, backend=masks, overwrite=overwrite, progress_kind=progress_kind, **given
