@@ -2,8 +2,8 @@
 
 A root node turns the data set's world to glTF's y up. Below it, each motion group has one node at its anchor, with keys
 of translation and rotation; parts hang on the node of their parent. The Gaussians of an object in a group are a mesh of
-a child of the group's node. Everything else that our own programs read is in ``extras.r5dgs``, beside which nodes are
-referred to by number.
+a child of the group's node. Everything else that our own programs read is in ``extras.r5dgs`` of the file's scene; such
+extras of nodes have the number of their group, object or camera.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def losses(scene: Scene) -> list[str]:
     found = []
     if scene.residuals is not None and len(scene.residuals.rows):
         found.append(f"{len(scene.residuals.rows)} Gaussians bend: written as at t_max, they move rigidly")
-    lost = [mode for mode in modes.MODES if mode not in ("rigid",) and available(scene, mode)]
+    lost = [mode for mode in modes.MODES if mode != "rigid" and available(scene, mode)]
     if lost:
         found.append(f"motion of single Gaussians (modes {', '.join(lost)})")
     if scene.gaussians.identities is not None:
@@ -131,6 +131,7 @@ def _add_groups(scene: Scene, options: registry.Options, tree: _Nodes, arrays: g
     if not pieces:
         raise errors.ConfigError(f"{scene.name}: expected Gaussians to export, found none in the selected objects")
     numbers: dict[int, int] = {}
+    names = {item.id: item.name for item in scene.objects}
     bodies: dict[int, list[int]] = {item.id: [] for item in scene.objects}
     for group in scene.groups:
         if group.role == "body":
@@ -141,14 +142,13 @@ def _add_groups(scene: Scene, options: registry.Options, tree: _Nodes, arrays: g
             parent = None if group.parent is None else node_of(scene.groups[group.parent])
             extras = {"r5dgs": {"group": group.id, "role": group.role}}
             place = glb_motion.home(scene.groups, group).tolist()
-            name = _group_name(scene, group, bodies[group.object_id])
+            name = _group_name(group, names[group.object_id], bodies[group.object_id])
             numbers[group.id] = tree.add(name, parent, translation=place, extras=extras)
             if parent is None:
                 tree.roots.append(numbers[group.id])
         return numbers[group.id]
 
     factors = Player(scene).frame(scene.t_max).shading_factor
-    names = {item.id: item.name for item in scene.objects}
     for rows, object_id, motion_id in pieces:
         group = scene.groups[motion_id]
         name = f"{names[object_id]} Gaussians" + ("" if motion_id == 0 else f" in group {motion_id}")
@@ -158,11 +158,10 @@ def _add_groups(scene: Scene, options: registry.Options, tree: _Nodes, arrays: g
     return numbers
 
 
-def _group_name(scene: Scene, group: MotionGroup, bodies: list[int]) -> str:
-    """Name of a group's node: that of its object, with the number of the part if there are several."""
+def _group_name(group: MotionGroup, name: str, bodies: list[int]) -> str:
+    """Name of a group's node: the name of its object, with the number of the part if there are several bodies."""
     if group.role == "pinned":
         return "static"
-    name = next(item.name for item in scene.objects if item.id == group.object_id)
     if group.role == "shadow":
         return f"{name} (shadow)"
     return name if len(bodies) < 2 else f"{name} (part {bodies.index(group.id) + 1})"
@@ -185,7 +184,7 @@ def _add_cameras(scene: Scene, tree: _Nodes) -> None:
 
 
 def _extras(scene: Scene, end: float) -> dict[str, Any]:
-    """What our own programs read beside nodes and meshes: entries of ``scene.json``, times, sky, words."""
+    """Content of ``extras.r5dgs``, for our own programs: entries of ``scene.json``, times, sky, words."""
     bare = dataclasses.replace(scene, provenance={}, needs=(), vocabulary=(), lookup=None, hulls=())
     head = {"format": FORMAT_NAME, "format_version": FORMAT_VERSION, "scene_version": format_features.version(bare)}
     tree = json.loads(scene_json.dump(bare, head | format_features.to_json(bare)))

@@ -80,7 +80,7 @@ def value(item):
 
 
 def snapshot(bpy):
-    """What the operators change: objects, their motion, looks, keys, points and selection, tables and settings."""
+    """Values that operators change: objects, their motion, looks, keys, points and selection, tables and settings."""
     found = {}
     for obj in bpy.data.objects:
         tint, motion = obj.r5dgs_look.tint, obj.r5dgs_motion
