@@ -101,29 +101,22 @@ class ArrayAdapter(Backend):
     def rasterize_splats(
         self, means, quats, scales, opacities, channels, camera, background, labels, settings, stats
     ) -> SplatImage:
-        tensors = [self._tensor(values) for values in (means, quats, scales, opacities, channels, background, labels)]
+        inputs = means, quats, scales, opacities, channels, background, labels
+        means, quats, scales, opacities, channels, background, labels = map(self._tensor, inputs)
         found = self._inner.rasterize_splats(
-            tensors[0],
-            tensors[1],
-            tensors[2],
-            tensors[3],
-            tensors[4],
-            camera,
-            tensors[5],
-            tensors[6],
-            settings,
-            stats,
+            means, quats, scales, opacities, channels, camera, background, labels, settings, stats
         )
         _stats_to_arrays(stats)
         return SplatImage(*(_array(values) for values in (found.image, found.alpha, found.depth, found.ids)))
 
     @torch.no_grad()
     def seen_colors(self, means, sh, rest, factor, poses):
-        return _array(self._inner.seen_colors(*map(self._tensor, (means, sh, rest, factor)), poses))  # pyright: ignore[reportCallIssue]
+        means, sh, rest, factor = map(self._tensor, (means, sh, rest, factor))
+        return _array(self._inner.seen_colors(means, sh, rest, factor, poses))
 
     def segment_weights(self, means, quats, scales, opacities, camera, segments, count, settings):
-        inputs = map(self._tensor, (means, quats, scales, opacities))
-        return self._inner.segment_weights(*inputs, camera, self._tensor(segments), count, settings)  # pyright: ignore[reportCallIssue]
+        means, quats, scales, opacities, segments = map(self._tensor, (means, quats, scales, opacities, segments))
+        return self._inner.segment_weights(means, quats, scales, opacities, camera, segments, count, settings)
 
     def _tensor(self, values: np.ndarray | None) -> Any:
         return None if values is None else torch.from_numpy(to_array(values)).to(self._device)

@@ -7,7 +7,6 @@ so that the observed ones lie in [0, 1]; if they already do and fill at least a 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from torch import Tensor
@@ -15,8 +14,6 @@ from torch import Tensor
 from ...model import deformation
 from ...model.trd import TRD, MotionState
 from ...motion import point_dynamics, rotations
-
-Time = TypeVar("Time", float, Tensor)
 
 
 @dataclass(frozen=True)
@@ -33,7 +30,7 @@ class Clock:
         scale = point_dynamics.time_unit(first, last)
         return Clock(0.0 if scale == 1.0 else first, scale)
 
-    def __call__(self, t: Time) -> Time:
+    def __call__(self, t: float | Tensor) -> float | Tensor:
         return (t - self.origin) / self.scale
 
 
@@ -70,11 +67,11 @@ class FieldMotion:
 
     def deltas(self, means: Tensor, t: float | Tensor) -> deformation.Deltas:
         """Evaluate the field at a scene time; a number is clamped to the horizon."""
-        return self.field(means, self.clock(t if isinstance(t, Tensor) else min(t, self.horizon)), self.chunk)  # pyright: ignore[reportArgumentType]
+        return self.field(means, self.clock(t if isinstance(t, Tensor) else min(t, self.horizon)), self.chunk)
 
     def state(self, positions: Tensor, t: float | Tensor) -> MotionState:
         """Evaluate the TRD at positions and a scene time, per unit of network time."""
-        return self.trd(positions, self.clock(t), self.chunk)  # pyright: ignore[reportArgumentType]
+        return self.trd(positions, self.clock(t), self.chunk)
 
     def carry(
         self, positions: Tensor, state: MotionState, duration: float | Tensor, step: float
