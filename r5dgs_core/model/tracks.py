@@ -105,11 +105,14 @@ class Tracks:
         )
         return {int(s): float(w) for s, w in zip(window, weights, strict=True) if w != 0.0}
 
-    def poses(self, t: float | Tensor) -> GroupPoses:
-        """Return the poses of all groups at a time, or at the knot that an int64 tensor [1] names, differentiable."""
-        weights = {t: 1.0} if isinstance(t, Tensor) else self.knot_weights(t)
-        quats, displacements = self._knot(next(iter(weights)))
-        if len(weights) > 1:
+    def poses(self, t: float) -> GroupPoses:
+        """Return the poses of all groups at a time, differentiable."""
+        return self.poses_of(self.knot_weights(t))
+
+    def poses_of(self, weights: dict[int, float] | Tensor) -> GroupPoses:
+        """Return the poses of all groups, differentiable; weights as of `knot_weights`, or one knot, int64 [1]."""
+        quats, displacements = self._knot(weights if isinstance(weights, Tensor) else next(iter(weights)))
+        if not isinstance(weights, Tensor) and len(weights) > 1:
             mixed, moved, previous = torch.zeros_like(quats), torch.zeros_like(displacements), quats
             for s, weight in weights.items():
                 quats, displacements = self._knot(s)

@@ -124,11 +124,10 @@ class TracksRepresentation(Representation):
     def splats(self, gaussians: Gaussians, camera: Camera, t: float | AtKnot) -> fused_posing.PosedSplats:
         """See `Representation.splats`."""
         if isinstance(t, AtKnot):
-            knots = t.knot if isinstance(t.knot, Tensor) else {t.knot: 1.0}
-            there, t = t.there, t.knot if isinstance(t.knot, Tensor) else float(self.tracks.times[t.knot])  # pyright: ignore[reportAssignmentType]
+            weights, there = t.knot if isinstance(t.knot, Tensor) else {t.knot: 1.0}, t.there
         else:
-            knots, there = self.tracks.knot_weights(t), self._there(t)
-        poses = self.tracks.poses(t)  # pyright: ignore[reportArgumentType]
+            weights, there = self.tracks.knot_weights(t), self._there(t)
+        poses = self.tracks.poses_of(weights)
         centers = self.tracks.group_centers()
         params = gaussians.params
         if params["sh_rest"].shape[1] == 0:
@@ -150,7 +149,7 @@ class TracksRepresentation(Representation):
         shading = params["shading"]
         if self.residuals is not None:
             opacities = torch.sigmoid(params["opacity_logits"])
-            change = self.residuals.change(means, quats, opacities, gaussians.motion_ids, knots)
+            change = self.residuals.change(means, quats, opacities, gaussians.motion_ids, weights)
             means = means.index_add(0, change.rows, change.offsets)
             log_scales = log_scales.index_add(0, change.rows, change.log_scales)
             quats = quats.index_copy(0, change.rows, rotations.multiply(change.quats, quats[change.rows]))
