@@ -64,10 +64,12 @@ class Trainer:
         self.config = config = training_needs.resolve(config)
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         self.behind = train_views.behind(dataset, config)
-        self.views: Sequence[train_views.TrainView] = train_views.load(dataset, self.normalization, self.behind)
+        self.given_views = train_views.load(dataset, self.normalization, self.behind)
         self.discovered_masks = None if discovered_masks is None else packed_masks.pack(discovered_masks)
-        shown = self.views if discovered_masks is None else train_views.with_masks(self.views, discovered_masks)
-        motion = registry.configured(config, at_rest=still.applies(self.views, config))
+        shown = (
+            self.given_views if discovered_masks is None else train_views.with_masks(self.given_views, discovered_masks)
+        )
+        motion = registry.configured(config, at_rest=still.applies(self.given_views, config))
         if not motion.moves:
             self.config = config = config.replace(**{"train.shading": False, "train.shadows": False})
         start = run_start.initial_state(
@@ -79,25 +81,25 @@ class Trainer:
         self.object_ids = start.object_ids
         self.places = start.places
         self.first_time = start.first_time
-        self.background = run_start.background(self.views, self.behind, start.sky, config)
+        self.background = run_start.background(self.given_views, self.behind, start.sky, config)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         classes = {int(object_id): row for row, object_id in enumerate(self.object_ids)}
-        self.identity = joint_identity.joint(self.views, classes, config)
+        self.identity = joint_identity.joint(self.given_views, classes, config)
         if self.identity is not None:
             self.identity.begin(self.gaussians)
         self.rates = optimizers.LearningRates(config, {} if self.identity is None else self.identity.rates)
         self.iteration = 0
         self._loss = RunningLoss()
-        view_times = np.array([train_views.nearest_knot(self.times, v.t) for v in self.views])
+        view_times = np.array([train_views.nearest_knot(self.times, v.t) for v in self.given_views])
         self.curriculum = curriculum.Curriculum(config, view_times, len(self.times), self.first_time)
-        self.distinct_cameras = [group[0].camera for group in train_views.by_camera(self.views, MAX_CAMERAS)]
+        self.distinct_cameras = [group[0].camera for group in train_views.by_camera(self.given_views, MAX_CAMERAS)]
         self._targets: dict[int, Tensor] = {}
         spacing = float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
-        self.refinement = Refinement(rig.of(self.views), spacing, config.train.iterations)
-        self.given_views, self.views = self.views, RefinedViews(self.views, self.refinement)
+        self.refinement = Refinement(rig.of(self.given_views), spacing, config.train.iterations)
+        self.views = RefinedViews(self.given_views, self.refinement)  # corrects a camera on each access
         self._known: tuple[Tensor, int, Tensor] | None = None  # motion ids, their version, and the classes
         white = self.behind is not None and bool((self.behind == 1).all())
-        cameras, count = [view.camera for view in self.views], len(self.gaussians)
+        cameras, count = [view.camera for view in self.given_views], len(self.gaussians)
         self._conditions = densifier.conditions(config, cameras, self.distinct_cameras, count, self.generator, white)
         self._begin_on(device)
 
@@ -262,8 +264,8 @@ class Trainer:
         """Return a view's image in [0, 1]. Cached if all views fit into `TARGET_BYTES`, else converted on each call."""
         if index in self._targets:
             return self._targets[index]
-        target = torch.from_numpy(self.views[index].image).to(self.device, non_blocking=True).float() / 255
-        if sum(v.image.size for v in self.views) * 4 <= TARGET_BYTES:
+        target = torch.from_numpy(self.given_views[index].image).to(self.device, non_blocking=True).float() / 255
+        if sum(v.image.size for v in self.given_views) * 4 <= TARGET_BYTES:
             self._targets[index] = target
         return target
 
