@@ -162,7 +162,7 @@ def fused(
     return Projected(None, *numbers, tile_starts, pairs, camera.width, camera.height)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlacedCamera(Camera):
     """A camera whose pose and intrinsics are those of two tensors on the device; the arrays only give the kind of lens.
 
@@ -171,13 +171,13 @@ class PlacedCamera(Camera):
         lens: Intrinsics, px. [1, 3, 3]
     """
 
-    view: Tensor | None = None
-    lens: Tensor | None = None
+    view: Tensor
+    lens: Tensor
 
 
 def matrices(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return pose [1, 4, 4] and intrinsics [1, 3, 3] of a camera on a device."""
-    if isinstance(camera, PlacedCamera) and camera.view is not None and camera.lens is not None:
+    if isinstance(camera, PlacedCamera):
         return camera.view, camera.lens
     return _matrices(camera.T_cam_world.tobytes(), camera.intrinsics.tobytes(), device)
 

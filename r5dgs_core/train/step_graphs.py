@@ -8,6 +8,7 @@ and again when the number of Gaussians changes.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import logging
 from collections.abc import Callable
@@ -19,7 +20,6 @@ from torch import Tensor
 
 from ..raster import RasterStats, cuda_projection
 from ..scene import sampling
-from ..scene.cameras import Camera
 from .train_views import TrainView
 
 log = logging.getLogger(__name__)
@@ -32,13 +32,11 @@ CHECK_EVERY = 50  # steps between comparisons of the number of pairs with the ca
 
 @dataclass(frozen=True)
 class StepInputs:
-    """What a training step depends on besides the state.
+    """Inputs of a training step besides the state.
 
     Attributes:
         index: Index of the view.
         view: The view, with its corrected camera and time.
-        camera: Its camera.
-        behind: Its camera in the data set, whose sky is drawn, so that it is not computed again for each correction.
         path: Result of `Representation.path`.
         target: Its image in [0, 1]. [H, W, 3]
         basis: Harmonics of its background; None to look them up. [H W, Kb]
@@ -46,8 +44,6 @@ class StepInputs:
 
     index: int
     view: TrainView
-    camera: Camera
-    behind: Camera
     path: Any
     target: Tensor
     basis: Tensor | None = None
@@ -155,10 +151,10 @@ class StepGraphs:
         self._numbers = torch.zeros(len(inputs.path.numbers), dtype=torch.float64, device=device)
         self._rates = torch.zeros(len(groups), device=device)
         self._loss = torch.zeros((), device=device)
-        view, lens = cuda_projection.matrices(inputs.camera, device)
+        view, lens = cuda_projection.matrices(inputs.view.camera, device)
         self._view, self._lens = view.clone(), lens.clone()
         self._target = inputs.target.clone()
-        self._basis = trainer.background.basis(inputs.camera).clone() if trainer.background.learned else None
+        self._basis = trainer.background.basis(inputs.view.camera).clone() if trainer.background.learned else None
         self._frozen = trainer.frozen
         self._capacity = max(1, int(ROOM * self._most_pairs()))
 
@@ -175,12 +171,12 @@ class StepGraphs:
     def _write(self, inputs: StepInputs) -> None:
         """Write the inputs of a step into the buffers."""
         trainer = self._trainer
-        view, lens = cuda_projection.matrices(inputs.camera, trainer.device)
+        view, lens = cuda_projection.matrices(inputs.view.camera, trainer.device)
         self._view.copy_(view)
         self._lens.copy_(lens)
         self._target.copy_(inputs.target)
         if self._basis is not None:
-            self._basis.copy_(trainer.background.basis(inputs.camera))
+            self._basis.copy_(trainer.background.basis(inputs.view.camera))
         if trainer.frozen is not self._frozen:
             self._frozen.copy_(trainer.frozen)
             trainer.frozen = self._frozen
@@ -191,13 +187,13 @@ class StepGraphs:
 
     def _work(self, like: Any) -> None:
         """Take a step from the buffers, with a path of the kind of another one."""
-        trainer = self._trainer
-        shape = trainer.views[0].camera
+        trainer, some = self._trainer, self._trainer.views[0]
+        shape = some.camera
         camera = cuda_projection.PlacedCamera(
             shape.width, shape.height, shape.intrinsics, shape.T_cam_world, view=self._view, lens=self._lens
         )
-        path = like.from_buffer(self._numbers)
-        inputs = StepInputs(0, trainer.views[0], camera, camera, path, self._target, self._basis)
+        view = dataclasses.replace(some, camera=camera)
+        inputs = StepInputs(0, view, like.from_buffer(self._numbers), self._target, self._basis)
         for group, rate in zip(trainer.optimizer.param_groups, self._rates, strict=True):
             group["lr"] = rate
         stats = RasterStats(capacity=self._capacity)

@@ -162,8 +162,7 @@ class Trainer:
         if self.iteration % FREEZE_EVERY == 0 or len(self.frozen) != len(self.gaussians):
             # The depth of background that only one camera sees is not determined.
             self.frozen = densifier.seen_by_one_camera(self.gaussians, self.distinct_cameras)
-        path, behind = self.motion.path(view.t, self.generator), self.given_views[index].camera
-        inputs = StepInputs(index, view, view.camera, behind, path, self._target(index))
+        inputs = StepInputs(index, view, self.motion.path(view.t, self.generator), self._target(index))
         loss = self._graphs.step(inputs) if self._graphs.take(inputs) else self.update(inputs, RasterStats(), place)
         if self.device.type != devices.CPU:
             require_finite(loss, self.optimizer, self.params, self.iteration, place)
@@ -204,15 +203,18 @@ class Trainer:
         if gradient is not None:
             gradient.masked_fill_(self.frozen[:, None], 0.0)
         self.optimizer.step()
-        self.densifier.observe(stats, inputs.camera)
+        self.densifier.observe(stats, view.camera)
         return loss
 
     def _draw_all(
         self, inputs: StepInputs, stats: RasterStats
     ) -> tuple[Tensor, Tensor | None, fused_posing.PosedSplats]:
         """Render a training view: image, blended encodings (None if rendered separately) and splats."""
-        splats = self.motion.splats(self.gaussians, inputs.camera, inputs.path)
-        colors, background = splats.colors, self.background.image(inputs.behind, inputs.basis)
+        camera = inputs.view.camera
+        splats = self.motion.splats(self.gaussians, camera, inputs.path)
+        # The sky is that of the given camera, so that it is not computed again for each correction.
+        background = self.background.image(self.given_views[inputs.index].camera, inputs.basis)
+        colors = splats.colors
         together = self.identity is not None and self.identity.with_geometry
         if self.identity is not None and together:
             colors, background = self.identity.channels(self.gaussians, colors, background)
@@ -222,7 +224,7 @@ class Trainer:
             splats.scales,
             splats.opacities,
             colors,
-            inputs.camera,
+            camera,
             background,
             settings=DRAFT,
             stats=stats,

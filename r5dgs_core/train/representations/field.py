@@ -45,7 +45,7 @@ HORIZON = 14 / 15  # default horizon as a share of the observed span (0.70 of 0.
 
 @dataclass(frozen=True)
 class Path:
-    """How the Gaussians reach a time in a training step.
+    """Path of the Gaussians to a time in a training step.
 
     Attributes:
         through_trd: True if the field moves them to ``start``, and the TRD from there to ``end``; False if the field
