@@ -165,7 +165,8 @@ class StepGraphs:
         for camera in sampling.spread(trainer.distinct_cameras, CAMERAS):
             stats = RasterStats(capacity=1)
             trainer.render(camera, float(trainer.times[-1]), stats=stats)
-            most = torch.maximum(most, stats.pairs)  # pyright: ignore[reportArgumentType]
+            assert stats.pairs is not None  # as a capacity was given
+            most = torch.maximum(most, stats.pairs)
         return int(most)
 
     def _write(self, inputs: StepInputs) -> None:
@@ -198,6 +199,7 @@ class StepGraphs:
             group["lr"] = rate
         stats = RasterStats(capacity=self._capacity)
         self._loss.copy_(trainer.update(inputs, stats))
+        assert stats.pairs is not None
         # The memory of the gradients belongs to the graph, and other graphs overwrite it.
         trainer.optimizer.zero_grad(set_to_none=True)
-        torch.maximum(self._pairs, stats.pairs, out=self._pairs)  # pyright: ignore[reportArgumentType]
+        torch.maximum(self._pairs, stats.pairs, out=self._pairs)
