@@ -24,7 +24,7 @@ from .. import errors, extras
 from ..scene.cameras import Camera
 from .arrays import Array
 from .backend import Backend
-from .cuda_projection import TILE, Kernels, Projected, project
+from .cuda_projection import TILE, Inputs, Kernels, Projected, project
 from .settings import RasterSettings, RasterStats, SplatImage
 from .torch_backend import ArrayAdapter, TorchBackend
 
@@ -240,7 +240,7 @@ class CudaBackend(TorchBackend):
         if isinstance(kernels, str):
             raise errors.BackendError(f"rasterizer 'cuda': {kernels}")
         check_settings(settings, kernels, opacities)
-        splats = project(means, quats, scales, opacities, camera, settings, kernels, stats)
+        splats = project(Inputs(means, quats, scales, opacities, camera, settings, stats, kernels))
         blended, alpha = _blend(splats, torch.cat([splats.of(channels), splats.depths[:, None]], 1), kernels)
         covered = alpha > 0
         depth = torch.where(covered, blended[..., -1] / torch.where(covered, alpha, 1), 0)

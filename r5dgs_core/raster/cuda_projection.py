@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -73,36 +74,32 @@ class Projected:
         return values if self.rows is None else values[self.rows]
 
 
-def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    camera: Camera,
-    settings: RasterSettings,
-    kernels: Kernels,
-    stats: RasterStats | None,
-) -> Projected:
-    """Project Gaussians, and fill the statistics; arguments as for `rasterizer.rasterize_splats`.
+class Inputs(NamedTuple):
+    """Arguments of `rasterizer.rasterize_splats` that the projection needs, and gsplat."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    camera: Camera
+    settings: RasterSettings
+    stats: RasterStats | None
+    kernels: Kernels
+
+
+def project(given: Inputs) -> Projected:
+    """Project Gaussians, and fill the statistics.
 
     gsplat's own projection is used if the settings permit it and it supports them and the camera.
     """
-    fits = camera.intrinsics[0, 1] == 0 and settings.frustum_slack == FUSED_SLACK and len(means) > 0
-    chosen = exact if settings.exact or not fits else fused
-    return chosen(means, quats, scales, opacities, camera, settings, kernels, stats)
+    camera, settings = given.camera, given.settings
+    fits = camera.intrinsics[0, 1] == 0 and settings.frustum_slack == FUSED_SLACK and len(given.means) > 0
+    return exact(given) if settings.exact or not fits else fused(given)
 
 
-def exact(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    camera: Camera,
-    settings: RasterSettings,
-    kernels: Kernels,
-    stats: RasterStats | None,
-) -> Projected:
+def exact(given: Inputs) -> Projected:
     """Project, cull and sort in float64 as the reference does; only Gaussians that touch the image are returned."""
+    means, quats, scales, opacities, camera, settings, stats, kernels = given
     with torch.no_grad():
         projected = reference.project(means.double(), quats.double(), scales.double(), camera, settings)
         means2d, axes, z = projected
@@ -123,17 +120,9 @@ def exact(
     return Projected(order, *numbers, tile_starts, pairs, camera.width, camera.height)
 
 
-def fused(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    camera: Camera,
-    settings: RasterSettings,
-    kernels: Kernels,
-    stats: RasterStats | None,
-) -> Projected:
+def fused(given: Inputs) -> Projected:
     """Project, cull and sort by gsplat's kernels in float32; rows of Gaussians outside the image are meaningless."""
+    means, quats, scales, opacities, camera, settings, stats, kernels = given
     view, lens = matrices(camera, means.device)
     radii, means2d, depths, conics, _ = kernels.fully_fused_projection(
         means,
@@ -151,7 +140,7 @@ def fused(
     if stats is not None:
         _fill_fused_stats(stats, means2d, conics, radii)
     with torch.no_grad():
-        tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+        tiles_x, tiles_y = _tile_counts(camera)
         if stats is not None and stats.capacity:
             listed = _bounded_tile_lists(means2d[0], radii[0], depths[0], tiles_x, tiles_y, stats.capacity)
             tile_starts, pairs, stats.pairs = listed
@@ -232,7 +221,7 @@ def _tile_lists(means2d: Tensor, extent: Tensor, camera: Camera, kernels: Kernel
     low, high = (means2d - extent).clamp_min(0), torch.minimum(means2d + extent, size)
     radii = torch.ceil(0.5 * (high - low)).clamp_min(1).int()
     ranks = torch.arange(len(means2d), dtype=torch.float32, device=means2d.device)
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    tiles_x, tiles_y = _tile_counts(camera)
     if not len(means2d):
         return ranks.new_zeros((1, tiles_y, tiles_x), dtype=torch.int32), ranks.int()
     centers = (0.5 * (low + high)).float()
@@ -240,37 +229,42 @@ def _tile_lists(means2d: Tensor, extent: Tensor, camera: Camera, kernels: Kernel
     return kernels.isect_offset_encode(keys, 1, tiles_x, tiles_y), pairs
 
 
+def _tile_counts(camera: Camera) -> tuple[int, int]:
+    """Return the numbers of columns and rows of tiles."""
+    return -(-camera.width // TILE), -(-camera.height // TILE)
+
+
+@torch.no_grad()
 def _fill_exact_stats(stats: RasterStats, means2d: Tensor, cov: Tensor, order: Tensor, means: Tensor) -> None:
-    """Write visibility and radii now, and the norm of the screen-space gradient in the backward pass."""
+    """Fill the statistics of `exact`."""
 
     def spread(rows: Tensor) -> Tensor:
         """Scatter rows of the visible Gaussians to all Gaussians, zero elsewhere. [N]"""
         return means.new_zeros(len(means)).index_copy_(0, order, rows.to(means.dtype))
 
-    with torch.no_grad():
-        longest = reference.radii(cov)
-        stats.visible = spread(torch.ones_like(longest)) > 0
-        stats.radii = spread(longest)
-        stats.grad_norm = torch.zeros_like(stats.radii)
-    if means2d.requires_grad:
-
-        def keep_norm(grad):
-            stats.grad_norm = spread(grad.norm(dim=1))
-
-        means2d.register_hook(keep_norm)
+    longest = reference.radii(cov)
+    visible = spread(torch.ones_like(longest)) > 0
+    _fill_stats(stats, visible, spread(longest), means2d, lambda grad: spread(grad.norm(dim=1)))
 
 
 @torch.no_grad()
 def _fill_fused_stats(stats: RasterStats, means2d: Tensor, conics: Tensor, radii: Tensor) -> None:
-    """Write visibility and radii now, and the norm of the screen-space gradient in the backward pass."""
+    """Fill the statistics of `fused`."""
     xx, xy, yy = conics[0].unbind(-1)
     least = 0.5 * (xx + yy) - torch.hypot(0.5 * (xx - yy), xy)
-    stats.visible = radii[0, :, 0] > 0
-    stats.radii = torch.where(stats.visible, 3 * least.clamp(min=1e-12).rsqrt(), 0.0)
-    stats.grad_norm = torch.zeros_like(stats.radii)
+    visible = radii[0, :, 0] > 0
+    longest = torch.where(visible, 3 * least.clamp(min=1e-12).rsqrt(), 0.0)
+    _fill_stats(stats, visible, longest, means2d, lambda grad: grad[0].norm(dim=1))
+
+
+def _fill_stats(
+    stats: RasterStats, visible: Tensor, radii: Tensor, means2d: Tensor, norms: Callable[[Tensor], Tensor]
+) -> None:
+    """Write visibility and radii now, and the norm of the screen-space gradient in the backward pass."""
+    stats.visible, stats.radii, stats.grad_norm = visible, radii, torch.zeros_like(radii)
     if means2d.requires_grad:
 
-        def keep_norm(grad):
-            stats.grad_norm = grad[0].norm(dim=1)
+        def keep_norms(gradient: Tensor) -> None:
+            stats.grad_norm = norms(gradient)
 
-        means2d.register_hook(keep_norm)
+        means2d.register_hook(keep_norms)
