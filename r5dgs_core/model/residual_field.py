@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..motion import rotations
 from ..scene.visibility import SEEN_OPACITY
+from .remembered import Remembered
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,7 @@ class ResidualField:
         self._share = nodes.new_ones(len(nodes), 1, 1)  # 1 / length of each node's body
         for body, (length, _) in zip(self.bodies, sizes, strict=True):
             self._share[owners == body] = 1 / length
-        # Groups of the Gaussians and version of that tensor, then the result of `_members_of`.
-        self._members: tuple[Tensor, int, Tensor, Tensor, Tensor] | None = None
+        self._members: Remembered[tuple[Tensor, Tensor, Tensor]] = Remembered()
 
     def only(self, bodies: list[int]) -> ResidualField:
         """Return the field of some of its bodies."""
@@ -86,7 +86,7 @@ class ResidualField:
             motion_ids: Their motion groups. [N] int64
             weights: Weights of the knots at that time, or one knot as an int64 tensor [1].
         """
-        index, there, kept = self._members_of(motion_ids)
+        index, there, kept = self._members.of(motion_ids, self._members_of)
         if len(kept) == 0:
             none = means.new_zeros(0, 3)
             return Change(motion_ids.new_zeros(0), none, means.new_zeros(0, 4), none)
@@ -123,12 +123,8 @@ class ResidualField:
 
     def _members_of(self, motion_ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Members of each body, padded, the mask of valid entries [F, n], and the valid entries of both, flattened."""
-        known = self._members
-        if known is None or known[0] is not motion_ids or known[1] != motion_ids._version:
-            index, there = _padded(motion_ids, self.bodies)
-            kept = torch.nonzero(there.flatten())[:, 0]
-            self._members = known = (motion_ids, motion_ids._version, index, there, kept)
-        return known[2:]
+        index, there = _padded(motion_ids, self.bodies)
+        return index, there, torch.nonzero(there.flatten())[:, 0]
 
     def _blend(self, x: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Offsets [F, n, 3] of members at x and their gradients, one column per axis of x, [F, n, 3, 3]."""

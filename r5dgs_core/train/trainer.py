@@ -18,6 +18,7 @@ from ..config.config import Config
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, TrainingError
 from ..model.gaussians import Gaussians
+from ..model.remembered import Remembered
 from ..raster import RasterSettings, RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from . import background as backgrounds
@@ -97,7 +98,7 @@ class Trainer:
         spacing = float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
         self.refinement = Refinement(rig.of(self.given_views), spacing, config.train.iterations)
         self.views = RefinedViews(self.given_views, self.refinement)  # corrects a camera on each access
-        self._known: tuple[Tensor, int, Tensor] | None = None  # motion ids, their version, and the classes
+        self._classes: Remembered[Tensor] = Remembered()  # of the motion groups of the Gaussians
         white = self.behind is not None and bool((self.behind == 1).all())
         cameras, count = [view.camera for view in self.given_views], len(self.gaussians)
         self._conditions = densifier.conditions(config, cameras, self.distinct_cameras, count, self.generator, white)
@@ -256,11 +257,11 @@ class Trainer:
         """Return the class of each Gaussian by the classifier if it is already trained, else by its group. [N]"""
         if self.identity is not None:
             return self.identity.labels(self.gaussians)
-        ids = self.gaussians.motion_ids
-        if self._known is None or self._known[0] is not ids or self._known[1] != ids._version:
-            classes = torch.from_numpy(self.motion.group_classes(self.motion.tensors()))
-            self._known = ids, ids._version, classes.to(self.device)[ids]
-        return self._known[2]
+        return self._classes.of(self.gaussians.motion_ids, self._classes_of)
+
+    def _classes_of(self, groups: Tensor) -> Tensor:
+        classes = torch.from_numpy(self.motion.group_classes(self.motion.tensors()))
+        return classes.to(self.device)[groups]
 
     def _target(self, index: int) -> Tensor:
         """Return a view's image in [0, 1]. Cached if all views fit into `TARGET_BYTES`, else converted on each call."""

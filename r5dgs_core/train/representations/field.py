@@ -26,6 +26,7 @@ from ...config.config import Config
 from ...errors import CheckpointError, ConfigError
 from ...model import deformation
 from ...model.gaussians import Gaussians
+from ...model.remembered import Remembered
 from ...model.tracks import Tracks
 from ...model.trd import SHAPES as TRD_SHAPES
 from ...model.trd import TRD
@@ -106,7 +107,7 @@ class FieldRepresentation(Representation):
         self._tracks = tracks
         self._first = first
         self._last: MovedGaussians | None = None
-        self._known: tuple[Tensor, int, Tensor] | None = None  # motion ids, their version, and the movers
+        self._movers: Remembered[Tensor] = Remembered()
         self._iteration = config.field.warm_up  # a field that is not in training is past the warm-up
 
     def to(self, device: torch.device) -> FieldRepresentation:
@@ -130,11 +131,10 @@ class FieldRepresentation(Representation):
         """Return the rows that the networks move; none during the warm-up. [R] int64"""
         if self._iteration < self._config.field.warm_up:
             return gaussians.motion_ids.new_zeros(0)
-        ids = gaussians.motion_ids
-        if self._known is None or self._known[0] is not ids or self._known[1] != ids._version:
-            rows = gating.movers(ids, self._tracks.bodies, self.times, self._config)
-            self._known = ids, ids._version, rows
-        return self._known[2]
+        bodies = self._tracks.bodies
+        return self._movers.of(
+            gaussians.motion_ids, lambda groups: gating.movers(groups, bodies, self.times, self._config)
+        )
 
     def path(self, t: float, draw: torch.Generator) -> Path:
         """Return a random path through field and TRD to a time of a training step."""
@@ -148,7 +148,7 @@ class FieldRepresentation(Representation):
 
     def graph_state(self) -> tuple[Tensor | None, ...]:
         """See `Representation.graph_state`."""
-        return self.light, self._known[2] if self._known is not None else None
+        return self.light, self._movers.value
 
     def graph_kind(self, path: Path, iteration: int) -> tuple | None:
         """See `Representation.graph_kind`."""

@@ -31,8 +31,7 @@ def test_a_step_and_a_picture_stay_on_the_device(tiny, name):
     with fake_cuda.mode():
         trainer._begin_on(fake_cuda.DEVICE)
         if rows is not None:  # their number depends on values
-            ids = trainer.gaussians.motion_ids
-            trainer.motion._known = ids, ids._version, rows.to(fake_cuda.DEVICE)
+            trainer.motion._movers.of(trainer.gaussians.motion_ids, lambda _: rows.to(fake_cuda.DEVICE))
         trainer.iteration = 1
         loss = trainer.step()
         assert loss.device == fake_cuda.DEVICE
