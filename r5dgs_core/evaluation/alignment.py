@@ -17,7 +17,7 @@ from ..render import camera_fit, scene_renderer
 from ..scene import camera_correction, cameras
 from ..scene.camera_correction import Correction
 from ..scene.cameras import Camera
-from ..scene.sampling import spread
+from ..scene.sampling import spacing, spread
 from ..scene.scene import Scene
 
 IMAGES = 6  # maximum number of images of a camera for the fit
@@ -63,8 +63,7 @@ def _fitted(
     """Return the correction that explains the images of a camera best."""
     shots = [camera_fit.Shot(view.camera, view.t, datasets.load_image(view, background)) for view in views]
     times = scene.tracks.times
-    spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    units = camera_fit.Units(_depth(scene, views[0].camera), TIME * spacing)
+    units = camera_fit.Units(_depth(scene, views[0].camera), TIME * spacing(times))
     which = camera_fit.columns(pose=True, focal=True, time=len(times) > 1, color=True)
     return camera_fit.fit(draw, shots, units, which, Correction())
 

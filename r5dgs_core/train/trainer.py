@@ -21,6 +21,7 @@ from ..model.gaussians import Gaussians
 from ..model.remembered import Remembered
 from ..raster import RasterSettings, RasterStats, rasterize_splats
 from ..scene.cameras import Camera
+from ..scene.sampling import spacing
 from . import background as backgrounds
 from . import checkpoint_content, curriculum, devices, losses, normalization, step_graphs, train_views
 from . import optimizer as optimizers
@@ -95,8 +96,7 @@ class Trainer:
         self.curriculum = curriculum.Curriculum(config, view_times, len(self.times), self.first_time)
         self.distinct_cameras = [group[0].camera for group in train_views.by_camera(self.given_views, MAX_CAMERAS)]
         self._targets: dict[int, Tensor] = {}
-        spacing = float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
-        self.refinement = Refinement(rig.of(self.given_views), spacing, config.train.iterations)
+        self.refinement = Refinement(rig.of(self.given_views), spacing(self.times), config.train.iterations)
         self.views = RefinedViews(self.given_views, self.refinement)  # corrects a camera on each access
         self._classes: Remembered[Tensor] = Remembered()  # of the motion groups of the Gaussians
         white = self.behind is not None and bool((self.behind == 1).all())

@@ -15,10 +15,11 @@ import numpy as np
 import torch
 
 from ...config.config import Config
+from ...raster.arrays import to_host
 from ...render import camera_fit
 from ...render.camera_fit import Normal, Shot, Units
 from ...scene.cameras import Camera
-from ...scene.sampling import spread
+from ...scene.sampling import spacing, spread
 from .. import train_views
 from ..normalization import TARGET_DISTANCE
 from ..trainer import Trainer
@@ -83,7 +84,7 @@ def decide(trainer: Trainer, possible: Sequence[str]) -> None:
         return
     which = _indices([part for part in taken if part in possible])
     changes = {row: (a + b).solve(which, RIDGE) for row, (a, b) in halves.items()}
-    refinement.begin(taken, trainer.gaussians.means.detach().cpu().numpy(), trainer.iteration, changes)
+    refinement.begin(taken, to_host(trainer.gaussians.means), trainer.iteration, changes)
 
 
 def _possible(trainer: Trainer) -> list[str]:
@@ -114,14 +115,13 @@ def _halves(trainer: Trainer, row: int, parts: Sequence[str]) -> tuple[Normal, N
     if not mine:
         return None
     mine.sort(key=lambda index: trainer.given_views[index].t)
-    spacing = float(np.median(np.diff(trainer.times))) if len(trainer.times) > 1 else 1.0
-    units, which = Units(TARGET_DISTANCE, TIME_PIXEL * spacing), _indices(parts)
+    units, which = Units(TARGET_DISTANCE, TIME_PIXEL * spacing(trainer.times)), _indices(parts)
     a, b = [], []
     for number, index in enumerate(spread(mine, VIEWS)):
         view = trainer.given_views[index]
 
         def draw(camera: Camera, t: float, given: Camera = view.camera) -> np.ndarray:
-            return trainer.render(camera, t, behind=given).cpu().numpy()
+            return to_host(trainer.render(camera, t, behind=given))
 
         shot = Shot(view.camera, view.t, view.image.astype(np.float32) / 255)
         halves = camera_fit.normal_halves(draw, shot, refinement.correction(row), units, which, odd=number % 2)

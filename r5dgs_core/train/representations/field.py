@@ -32,7 +32,7 @@ from ...model.trd import SHAPES as TRD_SHAPES
 from ...model.trd import TRD
 from ...motion import rotations
 from ...raster import shade
-from ...scene import spherical_harmonics
+from ...scene import sampling, spherical_harmonics
 from ...scene.cameras import Camera
 from ..observed_motion import ObservedMotion
 from . import field_fitting, field_to_groups, fused_posing, gating, rigidity, shading
@@ -312,7 +312,6 @@ def _motion_of(times: np.ndarray, config: Config) -> FieldMotion:
     """Return untrained networks with the clock of the observed times."""
     section = config.field
     first, last = float(times[0]), float(times[-1])
-    spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     clock = Clock.of(times)
     if section.horizon and len(times) > 1 and not first < section.horizon <= last:
         raise ConfigError(
@@ -330,7 +329,7 @@ def _motion_of(times: np.ndarray, config: Config) -> FieldMotion:
         clock,
         first,
         min(section.horizon or first + HORIZON * (last - first), last),
-        section.step * clock.scale or 2 * spacing,
+        section.step * clock.scale or 2 * sampling.spacing(times),
         section.chunk,
     )
 
