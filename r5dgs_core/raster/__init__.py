@@ -5,6 +5,6 @@ Backends: `cpu` (numba), `cuda` (gsplat) and `reference` (torch).
 
 from . import environment as environment  # first: validates variables that numba reads
 from .rasterizer import rasterize, rasterize_splats
-from .settings import RasterSettings, RasterStats, RenderOutput, SplatImage
+from .settings import DRAFT, RasterSettings, RasterStats, RenderOutput, SplatImage
 
-__all__ = ["RasterSettings", "RasterStats", "RenderOutput", "SplatImage", "rasterize", "rasterize_splats"]
+__all__ = ["DRAFT", "RasterSettings", "RasterStats", "RenderOutput", "SplatImage", "rasterize", "rasterize_splats"]

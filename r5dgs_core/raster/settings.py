@@ -67,6 +67,9 @@ class RasterSettings:
                 raise ValueError(f"raster settings: {name}: expected {expected}, got {getattr(self, name)}")
 
 
+DRAFT = RasterSettings(exact=False)  # for pictures whose Gaussians change with every step
+
+
 @dataclass
 class RasterStats:
     """Statistics of one call for densification. Pass an empty instance and read it afterwards.

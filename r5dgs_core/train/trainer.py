@@ -19,7 +19,7 @@ from ..data.dataset import Dataset
 from ..errors import CheckpointError, TrainingError
 from ..model.gaussians import Gaussians
 from ..model.remembered import Remembered
-from ..raster import RasterSettings, RasterStats, rasterize_splats
+from ..raster import DRAFT, RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from ..scene.sampling import spacing
 from . import background as backgrounds
@@ -38,7 +38,6 @@ from .step_graphs import StepInputs
 
 TARGET_BYTES = 1 << 30  # maximum size of the cache of training images as floats
 MAX_CAMERAS = 256  # maximum number of cameras in tests of visibility
-DRAFT = RasterSettings(exact=False)
 FREEZE_EVERY = 100  # steps between updates of the frozen Gaussians
 
 

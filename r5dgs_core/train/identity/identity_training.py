@@ -14,14 +14,12 @@ import torch
 from torch import Tensor
 
 from ...config.config import Config
-from ...raster import RasterSettings, rasterize_splats
+from ...raster import DRAFT, rasterize_splats
 from ...scene.scene import IDENTITY_DIM
 from ..representations.fused_posing import PosedSplats
 from ..train_views import TrainView
 from . import identity_losses
 from .label_votes import class_map
-
-DRAFT = RasterSettings(exact=False)
 
 
 def train_encodings(
