@@ -35,24 +35,22 @@ class RunningLoss:
         self._value = new if first else OLD * self._value + NEW * new
 
 
-def require_finite(
-    loss: Tensor, optimizer: torch.optim.Adam, named: dict[str, Tensor], iteration: int, place: str
-) -> None:
-    """Raise `TrainingError` if the loss, a gradient or (on a GPU, if a check is due) a parameter is not finite.
+def require_finite_step(loss: Tensor, optimizer: torch.optim.Adam, named: dict[str, Tensor], place: str) -> None:
+    """Raise `TrainingError` if the loss or a gradient is not finite.
 
     Args:
         loss: The loss of the step, a scalar without gradient.
         optimizer: The optimizer, with gradients.
         named: Parameters by name, for the message.
-        iteration: The step.
         place: Step and view, for the message.
     """
-    if loss.device.type != "cpu":
-        if iteration % CHECK_EVERY == 0:
-            sums = [loss, *(parameter.detach().sum() for parameter in named.values())]
-            if not math.isfinite(float(torch.stack(sums).sum())):
-                optimizers.check_finite(named, float(loss), place)
-        return
     value = float(loss)
     if not (math.isfinite(value) and optimizers.has_finite_gradients(optimizer)):
         optimizers.check_finite(named, value, place)
+
+
+def require_finite_state(loss: Tensor, named: dict[str, Tensor], place: str) -> None:
+    """Raise `TrainingError` if the loss or a parameter is not finite; arguments as for `require_finite_step`."""
+    sums = [loss, *(parameter.detach().sum() for parameter in named.values())]
+    if not math.isfinite(float(torch.stack(sums).sum())):
+        optimizers.check_finite(named, float(loss), place)

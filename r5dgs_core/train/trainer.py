@@ -33,7 +33,7 @@ from .initialization import run_start
 from .refinement import rig
 from .refinement.refinement import RefinedViews, Refinement
 from .representations import fused_posing, registry, still
-from .running_loss import RunningLoss, require_finite
+from .running_loss import CHECK_EVERY, RunningLoss, require_finite_state, require_finite_step
 from .step_graphs import StepInputs
 
 TARGET_BYTES = 1 << 30  # maximum size of the cache of training images as floats
@@ -164,8 +164,8 @@ class Trainer:
             self.frozen = densifier.seen_by_one_camera(self.gaussians, self.distinct_cameras)
         inputs = StepInputs(index, view, self.motion.path(view.t, self.generator), self._target(index))
         loss = self._graphs.step(inputs) if self._graphs.take(inputs) else self.update(inputs, RasterStats(), place)
-        if self.device.type != devices.CPU:
-            require_finite(loss, self.optimizer, self.params, self.iteration, place)
+        if self.device.type != devices.CPU and self.iteration % CHECK_EVERY == 0:
+            require_finite_state(loss, self.params, place)
         self.iteration += 1
         self._loss.add(loss)
         self._maintain()
@@ -195,7 +195,7 @@ class Trainer:
         total.backward()
         loss = loss.detach()
         if self.device.type == devices.CPU:
-            require_finite(loss, self.optimizer, self.params, self.iteration, place)
+            require_finite_step(loss, self.optimizer, self.params, place)
         view = inputs.view
         self.refinement.update(inputs.index, view, splats, self.iteration, lambda t: self.splats(view.camera, t))
         self._hide_harmonics()
