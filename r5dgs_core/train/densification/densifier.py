@@ -221,8 +221,7 @@ def seen_by_one_camera(gaussians: Gaussians, eyes: Sequence[Camera]) -> Tensor:
     found = torch.zeros_like(background)
     if len(eyes) < 3:
         return found
-    on_cpu = arrays.takes_kernels(means)
-    rows = torch.nonzero(background)[:, 0] if on_cpu else torch.arange(len(means), device=means.device)
+    rows = _rows(background)
     count = torch.zeros_like(rows)
     for camera in eyes:
         k = camera.intrinsics
@@ -231,7 +230,7 @@ def seen_by_one_camera(gaussians: Gaussians, eyes: Sequence[Camera]) -> Tensor:
         u = k[0, 0] * p_cam[:, 0] / z + k[0, 2]
         v = k[1, 1] * p_cam[:, 1] / z + k[1, 2]
         count += (p_cam[:, 2] > 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
-        if on_cpu:  # a GPU tests all Gaussians faster than it returns the number of the others
+        if arrays.takes_kernels(rows):
             rows, count = rows[count < 2], count[count < 2]
     found[rows] = count < 2
     return found & background
@@ -251,15 +250,17 @@ def floaters(gaussians: Gaussians, eyes: Sequence[Camera], distance: float) -> T
     if distance <= 0:
         return torch.zeros_like(gaussians.motion_ids, dtype=torch.bool)
     found, means = seen_by_one_camera(gaussians, eyes), gaussians.params["means"].detach()
-    on_cpu = arrays.takes_kernels(means)
-    rows = torch.nonzero(found)[:, 0] if on_cpu else torch.arange(len(means), device=means.device)
+    rows = _rows(found)
     near = torch.zeros_like(rows, dtype=torch.bool)
     for camera in eyes:
         near |= _in_camera(means[rows], camera).norm(dim=1) < distance
-    if on_cpu:
-        found[rows] = near
-        return found
-    return found & near
+    found[rows] &= near
+    return found
+
+
+def _rows(mask: Tensor) -> Tensor:
+    """Return the rows of a mask; on a GPU all rows, which it tests faster than it returns the number of some."""
+    return torch.nonzero(mask)[:, 0] if arrays.takes_kernels(mask) else torch.arange(len(mask), device=mask.device)
 
 
 def _in_camera(means: Tensor, camera: Camera) -> Tensor:

@@ -47,7 +47,7 @@ def pixel_units(camera: Camera, points: np.ndarray) -> np.ndarray:
     shown &= ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(1)
     p = points[shown] @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
     if len(p) < 10:
-        return np.diag([1.0] * 6) / camera.intrinsics[0, 0]
+        return np.eye(6) / camera.intrinsics[0, 0]
     focal = np.diag(camera.intrinsics)[:2]
     by_point = np.zeros((len(p), 2, 3))
     by_point[:, 0, 0], by_point[:, 1, 1] = focal[0] / p[:, 2], focal[1] / p[:, 2]

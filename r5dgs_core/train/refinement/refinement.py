@@ -248,17 +248,15 @@ class Refinement:
         """Restore the state from `tensors`."""
         named = {n.removeprefix(PREFIX): t.numpy().copy() for n, t in tensors.items() if n.startswith(PREFIX)}
         self.parts, self.gains, self._gauge = frozenset(), named.get("gains"), None
-        for rows in self._kinds().values():
-            rows.__dict__.update(vars(_Rows.zeros(*rows.values.shape)))
-        if self.gains is None:
-            return
-        self._begin = int(named["begin"])
-        self.parts = frozenset(part for part, on in zip(PARTS, named["on"], strict=True) if on)
+        if self.gains is not None:
+            self._begin = int(named["begin"])
+            self.parts = frozenset(part for part, on in zip(PARTS, named["on"], strict=True) if on)
+        for name, rows in self._kinds().items():
+            for field, values in vars(rows).items():
+                values[...] = named[f"{name}.{field}"] if self.active else 0.0
         if self.active:
             self._units = named["units"]
             self._gauge = gauge.Gauge(self.rig.cameras, self._units)
-            for name, rows in self._kinds().items():
-                rows.__dict__.update({field: named[f"{name}.{field}"] for field in vars(rows)})
 
     def _kinds(self) -> dict[str, _Rows]:
         return {"poses": self._poses, "focal": self._focal, "time": self._time, "color": self._color}

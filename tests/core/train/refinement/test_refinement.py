@@ -8,6 +8,7 @@ import torch
 
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.raster import rasterize_splats
+from r5dgs_core.scene import cameras
 from r5dgs_core.scene.camera_correction import Correction
 from r5dgs_core.train import run
 from r5dgs_core.train.refinement import refined_dataset, refinement, trial
@@ -49,9 +50,7 @@ def offsets(dataset, trainer, truth):
     points = np.random.default_rng(0).normal([0, 0, 0.4], 0.5, (200, 3))
     result = []
     for view, true in zip(refined.train, truth.train, strict=True):
-        change = Correction()  # of the true camera
-        before = refined_dataset.cameras.project(view.camera, points)[0]
-        after = refined_dataset.cameras.project(change.camera(true.camera), points)[0]
+        before, after = (cameras.project(camera, points)[0] for camera in (view.camera, true.camera))
         result.append(np.sqrt(((before - after) ** 2).sum(1).mean()))
     return np.array(result)
 
