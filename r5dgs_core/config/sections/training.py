@@ -28,7 +28,7 @@ class TrainSection:
             degrees from the start.
         device: Device of the run: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, which is a CUDA device if gsplat can use
             one, and else the CPU.
-        graphs: On a GPU, launch the steps of a field as CUDA graphs, if its configuration permits.
+        graphs: On a GPU, launch the steps of tracks and fields as CUDA graphs, if the configuration permits.
         threads: CPU threads of torch. More threads do not make training faster, because the tensors are small.
         checkpoint_every: Steps between checkpoints.
         log_every: Steps between lines of the log.
