@@ -24,7 +24,7 @@ _WORK = "reconstruction"  # folder of intermediate files
 
 @dataclass(frozen=True)
 class UnknownCameras:
-    """What is known about cameras without a calibration.
+    """Known facts about cameras without a calibration.
 
     Attributes:
         board: Description of a board in the recordings (`board.parse`), or None.

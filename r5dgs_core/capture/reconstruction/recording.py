@@ -1,4 +1,4 @@
-"""What reconstruction needs of a recording, and pictures of its static parts."""
+"""Recordings of cameras as reconstruction reads them, and pictures of their static parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known about cameras before they are reconstructed."""
+"""Known lenses, poses and scale of cameras before they are reconstructed."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def common_views(cameras: list[Camera], middle: np.ndarray) -> np.ndarray:
 def _inside(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Mask of points that a camera sees. [N]"""
     pixels, _ = project(camera, points)  # NaN behind the camera
-    return ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
+    return np.all((pixels >= 0) & (pixels <= (camera.width, camera.height)), axis=1)
 
 
 def widest_angle(cameras: list[Camera], middle: np.ndarray) -> float:

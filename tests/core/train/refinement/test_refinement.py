@@ -57,7 +57,7 @@ def offsets(dataset, trainer, truth):
 
 @pytest.fixture(scope="module")
 def wrong(tiny):
-    return jittered(tiny, {"turn": 0.015})
+    return jittered(tiny, {"turn": 0.015}, seed=3)
 
 
 @pytest.fixture(scope="module")
