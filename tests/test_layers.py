@@ -73,7 +73,7 @@ ALLOWED = {
     "masks": {"data", "language"},
     "worker": {"scene", "raster", "playback", "editing", "protocol", "render", "language"},
     "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train", "shapes"},
-    "prepare": {"color", "data", "capture", "masks"},
+    "prepare": {"color", "motion", "scene", "data", "capture", "masks"},
     "check": {"motion", "terminal", "scene", "color", "data", "formats", "config", "train", "prepare"},
     "stability": {"motion", "motion_fit", "scene", "data", "raster", "config", "playback", "render", "train"},
     "association": {"scene", "data", "raster", "playback", "render", "masks"},

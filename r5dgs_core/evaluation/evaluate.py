@@ -98,9 +98,7 @@ def evaluate(
     result: dict[str, Any] = {"scene": scene.name, "splits": {}, "objects": object_errors(scene, dataset.ground_truth)}
     result["horizon"] = predictability.horizon(scene)
     corrections = None
-    if align is None:
-        align = bool(scene.provenance.get("cameras", {}).get("refined"))
-    if align:
+    if align or (align is None and scene.provenance.get("cameras", {}).get("refined")):
         held_out = [view for split in splits for view in dataset.views(split)]
         corrections = alignment.corrections(scene, held_out, background, backend)
     for split in splits:
