@@ -88,7 +88,7 @@ def check_calibration(path: Path) -> None:
 
 
 def prepare_command(source: Path) -> str:
-    """Return the command that makes a data set of a folder of videos or of distorted images, for messages."""
+    """Return the command that makes a data set from a folder of videos or distorted images, for messages."""
     out = source.with_name(f"{source.name}_data")
     return f"r5dgs prepare {shlex.quote(str(source))} --out {shlex.quote(str(out))}"
 

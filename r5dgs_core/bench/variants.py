@@ -8,7 +8,7 @@ from typing import Any
 from ..config import config as configs
 from ..config.presets import PRESETS
 
-# The method trains identities jointly with the geometry (docs/results/field.md). Scaling all identity losses by 1/20
+# The method trains identities jointly with the geometry (docs/results/training.md). Scaling all identity losses by 1/20
 # protects the geometry; the encodings learn at the same rate, because their optimizer is invariant to the scale.
 _IDENTITIES = {"identity.training": "joint", "identity.weight": "0.05", "identity.spatial": "0.1"}
 _FIELD = {"train.representation": "field", **_IDENTITIES}

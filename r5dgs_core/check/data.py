@@ -36,7 +36,7 @@ def check(
 
     Args:
         root: The folder.
-        train_masks, min_registered: As of `dataset.read`.
+        train_masks, min_registered: As for `dataset.read`.
         pictures: Folder for pictures of faults of the capture; None to draw none.
     """
     collect = Collector(CODES, "D00")

@@ -1,8 +1,8 @@
 """Alignment of held-out cameras to a scene before it is measured.
 
-A training that refines its cameras fits the scene to the refined ones. A held-out camera is off by as much as the
-others were, so it is corrected by the same few parameters (pose, focal length, time, colours), fitted to its own images
-with the scene fixed.
+A run that refines its cameras fits the scene to the refined cameras. A held-out camera still has the errors that the
+others had. It is therefore corrected by the same parameters (pose, focal length, time, colours), which are fitted to
+its own images while the scene is fixed.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def corrections(
 ) -> dict[str, Correction]:
     """Return a correction for each camera of some views by its name.
 
-    Cameras that the training has refined keep their correction. Others are fitted to images up to ``t_max``, as later
-    ones also contain errors of the prediction, or to later ones if there are no others.
+    Cameras that training has refined keep their correction. Others are fitted to images up to ``t_max``, because later
+    images also contain errors of the prediction. Later images are used only if there are no others.
 
     Args:
         scene: The scene.

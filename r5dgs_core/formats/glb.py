@@ -2,8 +2,8 @@
 
 A root node turns the data set's world to glTF's y up. Below it, each motion group has one node at its anchor, with keys
 of translation and rotation; parts hang on the node of their parent. The Gaussians of an object in a group are a mesh of
-a child of the group's node. Everything else that our own programs read is in ``extras.r5dgs`` of the file's scene; such
-extras of nodes have the number of their group, object or camera.
+a child of the group's node. ``extras.r5dgs`` of the file's scene holds all other data for our own programs. The extras
+of a node hold the number of its group, object or camera.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Masks by SAM3: objects that phrases name, found and tracked through each video.
+"""Masks by SAM3: objects that are named by phrases, found and tracked through each video.
 
 A phrase names one object of the scene, so that its id is the same in all videos. If several things in a video fit a
 phrase, the one that is seen longest and most surely is the object, and the pixels of the others are unknown.
@@ -106,7 +106,7 @@ class _Track:
 def _follow(
     model: Sam3, video: Video, words: Sequence[str]
 ) -> Iterator[tuple[int, dict[int, int], dict[int, torch.Tensor], dict[int, float]]]:
-    """Find and track what the phrases name.
+    """Find and track the things that the phrases name.
 
     Yields:
         Index of an image, and by track: index of the phrase, logits [s, s], score.

@@ -1,1 +1,1 @@
-"""`r5dgs prepare`: turns videos or frames of calibrated cameras into a data set."""
+"""`r5dgs prepare`: turns videos or frames of calibrated or unknown cameras into a data set."""

@@ -50,7 +50,7 @@ def measure(sources: Sequence[CameraSource], distances: np.ndarray | None = None
 def _pair(
     one: CameraSource, other: CameraSource, envelope: tuple[float, np.ndarray], other_envelope: tuple[float, np.ndarray]
 ) -> tuple[float, float] | None:
-    """Return what to add to the other's times to get the one's, and its standard deviation, seconds; None if unsure."""
+    """Return the offset to add to the other's times, and its standard deviation, seconds; None if unsure."""
     coarse, height = _correlate(envelope[1], other_envelope[1])
     if height < PEAK:
         return None
@@ -120,7 +120,7 @@ def _envelope(source: CameraSource) -> tuple[float, np.ndarray]:
 
 
 def _samples(source: CameraSource, start: float, length: float) -> np.ndarray:
-    """Return mono sound from a time on the camera's clock on, at `RATE`."""
+    """Return mono sound that starts at a time on the camera's clock, at `RATE`."""
     result = np.zeros(int(length * RATE), np.float32)
     for begin, samples in _sound(source, start, start + length):
         at = round((begin - start) * RATE)

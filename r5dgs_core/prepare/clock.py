@@ -28,7 +28,7 @@ def solve_pairs(count: int, pairs: Sequence[tuple[int, int, float, float]], meth
 
     Args:
         count: Number of cameras.
-        pairs: For cameras a and b, what to add to the times of b to get those of a, and its standard deviation.
+        pairs: By cameras (a, b): offset to add to the times of b to get those of a, and its standard deviation.
         method: Method of the offsets.
 
     Returns:

@@ -22,7 +22,7 @@ class HoldOut:
         cameras: Names of held-out cameras; their frames up to t_max are `val`.
         every: Hold out every n-th moment as `val`, but neither the first nor the last; None for none.
         after: Frames later than this are `test`, seconds from the first moment; None for none.
-        horizon: Seconds that the scene continues after its last observed time; None for a quarter of the clip.
+        horizon: Seconds of the scene after its last observed time; None for a quarter of the observed time.
     """
 
     cameras: tuple[str, ...] = ()

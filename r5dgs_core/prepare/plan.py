@@ -32,7 +32,7 @@ class Request:
         offsets: Known offsets of clocks by camera, seconds.
         rate: Frames per second of recordings without usable times.
         overwrite: Replace a data set that was prepared with other settings.
-        unknown: What is known about cameras without a calibration.
+        unknown: Known facts about cameras without a calibration.
         up: Up of the world (`gauge.upright`), or None for that of the calibration.
         meters_per_unit: Length of a unit of the world, or None for that of the calibration.
     """
@@ -82,7 +82,7 @@ class Plan:
         return f"{IMAGES}/{self.cameras[camera].name}/{self.cameras[camera].source.frame_name(index)}"
 
     def rectifier(self, camera: int, index: int) -> rectify.Rectifier:
-        """Return what makes an image of a frame."""
+        """Return the rectifier of a camera's frame."""
         one = self.cameras[camera]
         return rectify.rectifier(one.lens(index), (one.source.width, one.source.height), self.size.lines)
 

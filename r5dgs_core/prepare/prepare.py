@@ -1,7 +1,7 @@
-"""Preparation of a data set from recordings of calibrated cameras, resumable, with memory that frames do not increase.
+"""Preparation of a data set from recordings: resumable, in memory that does not grow with the number of frames.
 
-The record ``capture.json`` is written before the images, with everything that was measured. The same command continues
-from it: it measures nothing again and writes only missing images, so that the result is that of an uninterrupted run.
+The record ``capture.json`` is written before the images and holds all measurements. The same command continues from it:
+it measures nothing again and writes only missing images, so that the result is that of an uninterrupted run.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def reconstruct(
     Args:
         source: Folder of videos or frames, or one video.
         out: Folder of the data set.
-        known: What is known about the cameras.
+        known: Known facts about the cameras.
         up: Up of the world (`gauge.upright`); that of the cameras if None.
         rate: Frames per second of recordings without usable times, or None.
         again: Replace an existing file.

@@ -22,7 +22,7 @@ class VideoFile:
         path: The file.
         width: Width after rotation, pixels.
         height: Height after rotation, pixels.
-        turns: Counter-clockwise quarter turns that its metadata asks for.
+        turns: Counter-clockwise quarter turns that make frames upright, from its metadata.
         codec: Name of the codec.
         pts: Time stamp of each frame in units of ``time_base``, increasing. [F] int64
         time_base: Seconds per unit.

@@ -28,7 +28,7 @@ def device_of(values: Array) -> str:
 
 
 def takes_kernels(values: Array) -> bool:
-    """Return True if numba kernels process the values: arrays, and tensors on the CPU. Others have twins in torch."""
+    """Return True if numba kernels process the values: arrays, and tensors on the CPU. Others need plain torch."""
     return device_of(values) == "cpu"
 
 

@@ -53,7 +53,7 @@ class CapturedWork:
     """Work on the current device as a CUDA graph.
 
     Args:
-        work: The work, without copies from or to the host. It is not done here.
+        work: The work, without copies from or to the host. It is captured, but not executed.
         pool: Memory pool that all graphs of a run share.
     """
 

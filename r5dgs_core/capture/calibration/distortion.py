@@ -132,7 +132,7 @@ MODELS = {
 
 
 def to_plane(plane: str, directions: np.ndarray) -> np.ndarray:
-    """Map directions in camera axes to a plane, NaN where it has no such point. [N, 3] -> [N, 2]"""
+    """Map directions in camera axes to a plane, NaN for directions without a point. [N, 3] -> [N, 2]"""
     x, y, z = directions.T
     if plane == TANGENT:
         in_front = z > 1e-9 * np.abs(directions).max(axis=1, initial=0.0)

@@ -113,7 +113,7 @@ class Lens:
             pixels: Pixels. [N, 2]
 
         Returns:
-            Unit directions in camera axes; NaN where the model has none. [N, 3]
+            Unit directions in camera axes; NaN for pixels that no direction reaches. [N, 3]
         """
         pixels = np.asarray(pixels, np.float64)
         b = (pixels[:, 1] - self.cy) / self.fy

@@ -112,7 +112,7 @@ class _Problem:
         return np.concatenate(parts)
 
     def sparsity(self) -> sparse.lil_matrix:
-        """Return which residuals depend on which parameters."""
+        """Return the sparsity pattern of the Jacobian of `residuals`."""
         count = sum(2 * len(view.rows) for views in self.by_camera for view in views)
         extra = self.size - self.first_lens
         pattern = sparse.lil_matrix((count + extra, self.size), dtype=np.int8)

@@ -21,7 +21,7 @@ _Candidates = dict[tuple[int, int], list[np.ndarray]]  # poses of the board by c
 def solve(
     names: Sequence[str], lenses: Sequence[Lens], sightings: Sequence[Sighting], points: np.ndarray, *, refine: bool
 ) -> Solution:
-    """Find the poses of cameras. The world is the first camera's.
+    """Find the poses of cameras. The world is the frame of the first camera.
 
     Args:
         names: Names of the cameras, for errors.

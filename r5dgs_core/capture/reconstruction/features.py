@@ -32,7 +32,7 @@ def reconstruct(recordings: Sequence[Recording], request: Request, work: Path) -
 
     Args:
         recordings: The cameras.
-        request: What is known about them.
+        request: Known facts about them.
         work: Folder for intermediate files; it is emptied.
 
     Returns:
@@ -72,7 +72,7 @@ def _write_images(recording: Recording, request: Request, work: Path) -> list[st
 
 
 def _write_image(work: Path, name: str, pixels: np.ndarray, usable: np.ndarray) -> str:
-    """Write an image and the mask that COLMAP expects for each; returns the name."""
+    """Write an image and its mask as COLMAP expects them; returns the name of the image."""
     images.write_png(work / "images" / name, pixels)
     images.write_png(work / "masks" / f"{name}.png", usable.astype(np.uint8) * 255)
     return name

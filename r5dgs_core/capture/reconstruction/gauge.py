@@ -1,4 +1,4 @@
-"""Scale and up of a reconstructed world, which images alone do not show."""
+"""Scale and up direction of a reconstructed world, which images alone do not determine."""
 
 from __future__ import annotations
 
@@ -38,13 +38,14 @@ def upright(calibration: Calibration, up: str, boards: list[np.ndarray] | None =
 
     Args:
         calibration: Cameras, with the points of the reconstruction for `PLANE`.
-        up: `CAMERAS`, the mean up of all images; `PLANE`, the normal of the largest plane that lies roughly level, by
-            the cameras; `BOARD`, the normal of the board where it rests longest; or a vector "x,y,z" of the world.
+        up: `CAMERAS`, the mean up of all images; `PLANE`, the normal of the largest plane that is roughly
+            perpendicular to it; `BOARD`, the normal of the board while it rests longest; or a vector "x,y,z" of the
+            world.
         boards: Poses of the board, board to world, for `BOARD`. [4, 4] each
 
     Raises:
         DatasetError: There is no such plane or board.
-        ConfigError: The vector is none.
+        ConfigError: The vector is invalid.
     """
     level = _of_cameras(calibration)
     if up == CAMERAS:

@@ -16,13 +16,13 @@ from .request import Request
 
 
 def reconstruct(recordings: Sequence[Recording], request: Request, work: Path) -> Calibration:
-    """Reconstruct lens and pose of every camera: from the board if there is one, else from image features.
+    """Reconstruct lens and pose of every camera: from the board if there is one, otherwise from image features.
 
     The recordings must share a clock, at least roughly, if a board is carried around.
 
     Args:
         recordings: The cameras.
-        request: What is known about them.
+        request: Known facts about them.
         work: Folder for intermediate files of features; it is emptied.
 
     Returns:

@@ -28,7 +28,7 @@ class Sighting:
         camera: Index of the camera.
         time: Index of the time.
         rows: Rows of the detector's points. [n]
-        pixels: Where they are, the first pixel's centre at 0.5. [n, 2]
+        pixels: Their positions, the first pixel's centre at 0.5. [n, 2]
     """
 
     camera: int

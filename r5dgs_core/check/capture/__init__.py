@@ -1,1 +1,1 @@
-"""Checks of a capture: mistakes of cameras, clocks and masks that training cannot repair, each with a picture."""
+"""Checks of a capture: mistakes of cameras, clocks and masks, each with a picture."""

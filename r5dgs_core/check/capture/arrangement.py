@@ -45,7 +45,7 @@ def check(found: Dataset, collect: Collector, album: Album) -> None:
 
 
 def focus(cameras: list[Camera]) -> np.ndarray:
-    """Return the point nearest to all optical axes; minimum norm from the cameras' centre if they are parallel. [3]"""
+    """Return the point nearest to all optical axes; of several, the one nearest to the cameras' centre. [3]"""
     centers = np.stack([camera.center for camera in cameras])
     axes = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -55,7 +55,7 @@ def focus(cameras: list[Camera]) -> np.ndarray:
 
 
 def common_views(cameras: list[Camera], middle: np.ndarray) -> np.ndarray:
-    """Return the share of each camera's view that the camera with the most common view sees. [C]"""
+    """Return the largest share of each camera's view that another camera sees. [C]"""
     distances = [float(np.linalg.norm(camera.center - middle)) for camera in cameras]
     typical = float(np.median(distances)) or 1.0
     best = np.zeros(len(cameras))

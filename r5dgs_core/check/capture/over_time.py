@@ -99,7 +99,7 @@ def _check_doubled(one: Recording, place: str, collect: Collector, album: Album)
 def _check_exposure(
     one: Recording, behind: np.ndarray, apart: np.ndarray, place: str, collect: Collector, album: Album
 ) -> None:
-    """Compare the still part of the images, where neither black nor white, with its median over time."""
+    """Compare static parts of the images that are neither black nor white with their median over time."""
     usable = ((behind > 24) & (behind < 230)).all(-1)
     quiet = np.median(apart, axis=0)
     usable &= quiet <= np.quantile(quiet[usable], 0.7) if usable.any() else usable
@@ -128,7 +128,7 @@ def _check_exposure(
 
 
 def _check_blur(one: Recording, apart: np.ndarray, place: str, collect: Collector, album: Album) -> None:
-    """Compare the sharpness of what moves between images: its sharpest images show that it has edges."""
+    """Compare the sharpness of moving parts between images; the sharpest images show that they have edges."""
     moving = apart > _MOVING
     counts = moving.sum((1, 2))
     seen = np.flatnonzero(counts >= _CELLS)

@@ -1,4 +1,4 @@
-"""Differences between the clocks of the cameras, and rolling shutters, from what moves in their common view."""
+"""Differences between the cameras' clocks, and rolling shutters, measured on motion in their common view."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class Clocks:
         )
 
     def check_record(self, record: Mapping[str, Any] | None) -> None:
-        """Report what ``r5dgs prepare`` could not measure, and gaps of the recordings."""
+        """Report offsets that ``r5dgs prepare`` could not measure, and gaps of the recordings."""
         cameras = [] if record is None else record.get("cameras", [])
         names = [one["name"] for one in cameras]
         unknown = [one["name"] for one in cameras if one.get("offset_sigma_ms") is None]

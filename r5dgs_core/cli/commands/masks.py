@@ -80,7 +80,7 @@ class Options:
         score: Minimum quality that SAM2 predicts for a mask.
         stability: Minimum stability score of a mask.
         max_area: Maximum area of an object, as a share of the image; larger masks are background.
-        device: Device that runs SAM2, "cpu" or "cuda".
+        device: Device that runs SAM2 or SAM3, "cpu" or "cuda".
         unknown: Source value of pixels whose object is unknown.
         overwrite: Replace existing masks.
     """

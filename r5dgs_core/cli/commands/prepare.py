@@ -1,4 +1,4 @@
-"""The command ``r5dgs prepare``: make a data set of videos or frames of calibrated cameras."""
+"""The command ``r5dgs prepare``: make a data set from videos or folders of frames."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from ...prepare.plan import Plan
 
 NAME = "prepare"
-SHORT = "make a data set of videos or frames"
+SHORT = "make a data set from videos or frames"
 LONG = (
-    "Make a data set of videos or folders of frames, one per camera: choose frames, compare clocks, undistort, make\n"
+    "Make a data set from videos or folders of frames, one per camera: choose frames, compare clocks, undistort, make\n"
     "masks, and check the capture. Run the same command again to continue an interrupted one."
 )
 EXAMPLE = "VIDEOS --calibration calibration.toml --out DATA"
@@ -78,7 +78,7 @@ def _add_hold_out(p: argparse.ArgumentParser) -> None:
     p.add_argument("--hold-out-every", type=options.at_least(2), metavar="N", help=every)
     after = "keep the frames after this time for evaluation, in seconds from the first frame"
     p.add_argument("--hold-out-after", type=options.positive, metavar="S", help=after)
-    horizon = "seconds that the scene goes on after its last observed time (default: a quarter of the clip)"
+    horizon = "seconds of the scene after its last observed time (default: a quarter of the observed time)"
     p.add_argument("--horizon", type=options.not_negative, metavar="S", help=horizon)
 
 

@@ -26,8 +26,8 @@ class TrainSection:
         sh_degree: Degree of the spherical harmonics of view-dependent colour, 0 to 3.
         sh_every: Steps between raising the trained degree by one, up to ``sh_degree`` (1000 in 3DGS). 0 trains all
             degrees from the start.
-        device: Device of the run: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``, which is a CUDA device if gsplat can use
-            one, and else the CPU.
+        device: Device of the run: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``: a CUDA device if gsplat can use one,
+            otherwise the CPU.
         graphs: On a GPU, launch the steps of tracks and fields as CUDA graphs, if the configuration permits.
         threads: CPU threads of torch. More threads do not make training faster, because the tensors are small.
         checkpoint_every: Steps between checkpoints.

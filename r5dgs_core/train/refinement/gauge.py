@@ -1,4 +1,4 @@
-"""Gauge of the poses: changes of the world that all cameras share are no correction of a rig.
+"""Gauge of the poses: a change of the world that all cameras share corrects nothing.
 
 A correction of a pose is x = (rotation, shift) in the camera's axes. A small similarity of the world, with rotation a,
 translation b and scale c, changes all corrections by J (a, b, c); the images do not determine it.

@@ -1,9 +1,9 @@
 """Corrections of the cameras, trained together with the Gaussians.
 
 The picture of a step is drawn by the corrected camera. A small motion of the camera is the opposite motion of all
-Gaussians, so the gradients by their means, rotations and sizes give those by pose and focal length; two more sets of
-posed Gaussians, slightly earlier and later, give the one by time. Each pose and each lens has its own moments of Adam,
-as most steps do not show it.
+Gaussians, so the gradients of pose and focal length follow from those of the Gaussians' means, rotations and sizes. The
+gradient of time follows from two more sets of posed Gaussians, slightly earlier and later. Each pose and each lens has
+its own moments of Adam, because most steps do not show it.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ class Refinement:
             values[row] += SMOOTH * (0.5 * (values[before] + values[after]) - values[row])
 
     def _fix(self) -> None:
-        """Keep what the images do not determine: the similarity of the world, and the means of the other parts."""
+        """Remove changes that no image determines: a similarity of the world, and the means of the other parts."""
         if self._gauge is not None and "camera_poses" in self.parts:
             self._poses.values = self._gauge.fix(self._poses.values)
         for rows in (self._focal, self._time, self._color):
@@ -263,7 +263,7 @@ class Refinement:
 
 
 def camera_gradient(view: TrainView, splats: PosedSplats, shift: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the gradient of a loss by the pose correction and the log focal length of the camera.
+    """Return the gradient of a loss with respect to pose correction and log focal length of the camera.
 
     Sizes of the Gaussians in the image change with the focal length as with their own sizes.
 
@@ -273,7 +273,7 @@ def camera_gradient(view: TrainView, splats: PosedSplats, shift: np.ndarray) -> 
         shift: Shift of the camera's present correction, the fixed point of its rotation. [3]
 
     Returns:
-        Gradient by rotation and shift in the camera's axes [6], and by the log focal length.
+        Gradient of rotation and shift in the camera's axes [6], and that of the log focal length.
     """
     like = splats.means
     assert like.grad is not None

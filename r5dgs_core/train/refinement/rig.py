@@ -53,7 +53,7 @@ def of(views: Sequence[TrainView] | Sequence[View]) -> Rig:
     """Return the rig of the training views.
 
     Cameras of a data set have the same name if they have the same pose; the poses of a moving camera are called NAME,
-    NAME@1, ... Views without names of cameras, all of different poses and one lens, are taken by one moving camera.
+    NAME@1, ... Views without camera names, with different poses and one lens, count as one moving camera.
     """
     names = list(dict.fromkeys(view.camera.name for view in views))
     place = {name: row for row, name in enumerate(names)}

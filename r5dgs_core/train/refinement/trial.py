@@ -2,7 +2,7 @@
 
 Pictures of some views are linearised in the corrections of their cameras (`render.camera_fit`). Corrections are fitted
 to one half of the pixels and measured on the other half, both ways. A part of the corrections (poses, focal lengths,
-time offsets, colours) is trained if the error on the pixels that were not fitted grows without it.
+time offsets, colours) is trained if the error on the pixels that were not fitted grows clearly without it.
 """
 
 from __future__ import annotations
@@ -39,10 +39,9 @@ _COLUMNS: dict[str, str] = dict(zip(PARTS, ("pose", "focal", "time", "color"), s
 def steps(config: Config) -> tuple[int, ...]:
     """Return the steps after which the cameras are examined.
 
-    There are none in runs of less than `SHORTEST` steps, or if the user has switched all parts off.
+    There are none in runs of fewer than `SHORTEST` steps, or if the user has switched all parts off.
 
-    The first is before other times than the first one enter: Gaussians that have seen little training have not yet
-    adapted to wrong cameras.
+    The first examination is before the second time enters, when Gaussians have not yet adapted to wrong cameras.
     """
     if config.train.iterations < SHORTEST or all(getattr(config.needs, part) == "off" for part in PARTS):
         return ()
@@ -53,7 +52,7 @@ def steps(config: Config) -> tuple[int, ...]:
 
 
 def after_step(trainer: Trainer) -> None:
-    """Examine the cameras of a run if it is time to, and more often for parts that are refined."""
+    """Examine the cameras of a run if an examination is due; parts that are refined are examined more often."""
     examinations, iteration = steps(trainer.config), trainer.iteration
     if iteration in examinations:
         decide(trainer, _possible(trainer))

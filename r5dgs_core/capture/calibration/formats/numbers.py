@@ -117,7 +117,7 @@ def rotation_matrix(place: str, rotation: np.ndarray) -> np.ndarray:
 
 
 def opencv_lens(place: str, matrix: np.ndarray, coefficients: Iterable[float], *, fisheye: bool = False) -> Lens:
-    """Return the lens of a camera matrix and OpenCV's coefficients. Raises DatasetError if they are none."""
+    """Return the lens of a camera matrix and OpenCV's coefficients. Raises DatasetError if they are invalid."""
     try:
         return Lens.from_opencv(matrix, tuple(coefficients), fisheye=fisheye)
     except ValueError as error:
@@ -125,7 +125,7 @@ def opencv_lens(place: str, matrix: np.ndarray, coefficients: Iterable[float], *
 
 
 def unique(path: Path, names: Iterable[str]) -> None:
-    """Raise DatasetError if no camera is named, or two have the same name apart from case."""
+    """Raise DatasetError if there is no name, or two are equal apart from case."""
     seen: set[str] = set()
     for name in names:
         if name.lower() in seen:
