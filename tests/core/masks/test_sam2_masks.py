@@ -54,7 +54,7 @@ def test_images_are_preprocessed_as_in_the_training_of_sam2(model):
     image[..., 0] = 255
     pixels = model.pixels(image)
     assert pixels.shape == (1, 3, tiny_sam2.SIZE, tiny_sam2.SIZE)
-    expected = (np.array([1.0, 0, 0]) - sam2_model.MEAN) / sam2_model.DEVIATION
+    expected = (np.array([1.0, 0, 0]) - model.MEAN) / model.DEVIATION
     np.testing.assert_allclose(pixels[0].mean((1, 2)), expected, atol=1e-5)
 
 
