@@ -40,7 +40,7 @@ def add_settings(p: argparse.ArgumentParser) -> None:
     p.add_argument("--iterations", type=at_least(1), metavar="N", help=steps)
     cap = "maximum number of Gaussians, from the first step on; same as densify.max_gaussians"
     p.add_argument("--max-gaussians", type=at_least(0), metavar="N", help=cap)
-    device = "device of the training: cpu, cuda, cuda:N or auto; same as train.device (default: auto)"
+    device = "device for training: cpu, cuda, cuda:N or auto; same as train.device (default: auto)"
     p.add_argument("--device", type=device_name, metavar="NAME", help=device)
     add_threads(p)
     add_progress(p)

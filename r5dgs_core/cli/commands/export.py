@@ -38,7 +38,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     when.add_argument("--time", type=float, metavar="T", help="scene time (default: t_max); may exceed t_max")
     frames = "range of Blender frames, both included; frame 1 is scene time 0"
     when.add_argument("--frames", type=frame_range, metavar="A:B", help=frames)
-    until = "last scene time of formats with motion, such as glb (default: a third of the observed span after t_max)"
+    until = "last scene time in files with motion (default: a third of the observed span after t_max, at least 1)"
     when.add_argument("--until", type=float, metavar="T", help=until)
     p.add_argument("--objects", metavar="WORDS", help="objects to export: 'red mug', 'all except the table'")
     p.add_argument("--overwrite", action="store_true", help="replace existing files")

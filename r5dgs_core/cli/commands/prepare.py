@@ -57,7 +57,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 def _add_cameras(p: argparse.ArgumentParser) -> None:
     calibration = "file or folder of the cameras' calibration (default: found in the source, else reconstructed)"
     p.add_argument("--calibration", type=Path, metavar="FILE", help=calibration)
-    board = "board that is carried through the views, to find the cameras with; see docs/reference/prepare.md"
+    board = "board in the recordings, from which the cameras are reconstructed; see docs/reference/prepare.md"
     p.add_argument("--board", metavar="KIND:COLUMNSxROWS:LENGTH:DETAIL:MARKERS", help=board)
     p.add_argument("--lenses", type=Path, metavar="FILE", help="calibration whose lenses, but not poses, are used")
     p.add_argument("--shared-lens", action="store_true", help="all cameras have the same lens and zoom")

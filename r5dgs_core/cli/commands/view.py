@@ -14,7 +14,7 @@ NAME = "view"
 SHORT = "show a scene in a web browser"
 LONG = (
     "Show a scene file in a web browser: play it past t_max, pick objects and find them by words.\n"
-    "The page is served from 127.0.0.1 to this computer alone, until Ctrl-C."
+    "The page is served on 127.0.0.1, which only this computer can reach, until you press Ctrl-C."
 )
 EXAMPLE = "scene.r5dgs"
 PAGE = "user/player.md"
@@ -25,7 +25,7 @@ HOST = "127.0.0.1"
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     p.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file")
-    until = "last scene time (default: a third of the observed span after t_max)"
+    until = "last scene time (default: a third of the observed span after t_max, at least 1)"
     p.add_argument("--until", type=float, metavar="T", help=until)
     p.add_argument("--objects", metavar="WORDS", help="objects to show: 'red mug', 'all except the table'")
     p.add_argument("--port", type=int, default=0, metavar="N", help="port to listen on (default: a free one)")
