@@ -16,7 +16,7 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(
         prog="r5dgs",
         description="Train semantic 4D Gaussians from multi-view video, bake them into a scene for Blender, and "
-        "evaluate it. Training runs on the CPU.",
+        "evaluate it. Training runs on a CPU or an NVIDIA GPU.",
         epilog=_epilog("r5dgs demo", "README.md and docs/reference/command_line.md"),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
