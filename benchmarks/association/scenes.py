@@ -71,7 +71,7 @@ class Scene:
         paths: Exact places. [N, T, 3]
         objects: Object of each Gaussian, 0 = floor. [N]
         sigmas: Size of each, world units. [N]
-        plan: What it was made from.
+        plan: Description from which it was made.
     """
 
     paths: np.ndarray

@@ -71,7 +71,7 @@ def _of_modes(
 ) -> tuple[list[Row], list[str]]:
     """Measure each playback mode except "hybrid", whose bodies move as in "rigid".
 
-    Where Gaussians move one by one, the pose of a body is the rigid fit to its Gaussians.
+    If Gaussians move one by one, the pose of a body is the rigid fit to its Gaussians.
     """
     times = bodies[0].times[later]
     last = float(times[-1])

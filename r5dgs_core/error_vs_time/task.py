@@ -66,7 +66,7 @@ class Panel:
         name: Label of a point.
         floor: Error at which smaller ones are drawn.
         factor: Factor on the errors.
-        subject: What takes the time.
+        subject: Work that takes the time.
         series: Key of the rows that share a color.
         in_line: True for the points that the line of their series connects; None for a panel without lines.
         line_name: Label of the line of a series; None for lines without labels.

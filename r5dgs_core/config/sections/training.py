@@ -36,7 +36,7 @@ class TrainSection:
         probe_views: Maximum number of held-out views to measure.
         shading: Learn the change of an object's colours as it turns in fixed light.
         shadows: Learn shadow Gaussians, which follow their objects on the supporting plane.
-        repair: Register rotations of the tracks anew where they have slipped into a neighbouring minimum.
+        repair: Register rotations of the tracks again that have slipped into a neighbouring minimum.
     """
 
     iterations: int = 6000

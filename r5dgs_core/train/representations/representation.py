@@ -60,7 +60,7 @@ class Representation:
         return self
 
     def path(self, t: float, draw: torch.Generator) -> Any:
-        """Return what `splats` takes in place of a time in a training step: a random path to it, or the time itself."""
+        """Return the argument of `splats` for a training step: a random path to the time, or the time itself."""
         return t
 
     def graph_state(self) -> tuple[Tensor | None, ...]:
@@ -68,7 +68,7 @@ class Representation:
         return ()
 
     def graph_kind(self, path: Any, iteration: int) -> tuple | None:
-        """Return what the operations of a step depend on besides shapes; None if the step cannot be a graph.
+        """Return the kind of a step, which determines its operations besides shapes; None if it cannot be a graph.
 
         Args:
             path: A result of `path`, with ``numbers`` and ``from_buffer``.
