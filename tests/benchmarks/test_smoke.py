@@ -46,6 +46,7 @@ LONG = (  # more than five seconds each
     "futures.textures",
     "playback",
     "raster.first_frame",
+    "raster.static_layer",
     "training.curve",
     "training.held_out_times",
     "training.memory",

@@ -67,6 +67,7 @@ def assert_quiet(browser, url):
     assert seen["log"] == [] and [request.partition("?")[0] for request in seen["requests"]] == [url]
 
 
+@pytest.mark.default_cases("parts")
 @pytest.mark.parametrize("made", [rich_scene, arms.make_arm], ids=["bodies", "parts"])
 def test_pictures_are_those_of_the_rasterizer(made, browser, tmp_path):
     scene = made()

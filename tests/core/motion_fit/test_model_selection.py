@@ -77,6 +77,7 @@ def test_uneven_times_and_gaps_are_supported(name):
     assert error.max() < 0.1
 
 
+@pytest.mark.slow
 def test_the_right_family_is_chosen_in_noise_and_beats_the_largest():
     rng = np.random.default_rng(2)
     right, ours, full = 0, [], []

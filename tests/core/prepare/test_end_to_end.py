@@ -19,6 +19,7 @@ WIDTH, HEIGHT, COUNT = 96, 72, 10
 OPTIONS = [text for override in tiny_datasets.SETTINGS for text in ("--set", override)]
 
 
+@pytest.mark.slow
 def test_videos_become_a_scene_that_plays_at_their_rate(tmp_path, capsys):
     rig = recordings.make_rig(4, WIDTH, HEIGHT, COEFFICIENTS)
     times = [tiny_datasets.T_MAX * np.arange(COUNT) / (COUNT - 1)] * 4

@@ -53,6 +53,7 @@ def test_a_board_replaces_the_calibration(recordings, tmp_path, monkeypatch):
         prepared(recordings, tmp_path / "data", unknown=known, overwrite=True)
 
 
+@pytest.mark.slow
 def test_lenses_of_a_calibration_are_kept(recordings, tmp_path):
     prepared(recordings, tmp_path / "first", unknown={"board": CHARUCO})
     file = tmp_path / "first" / unknown_cameras.FILE
@@ -62,6 +63,7 @@ def test_lenses_of_a_calibration_are_kept(recordings, tmp_path):
         np.testing.assert_allclose(view.camera.intrinsics, lenses[view.camera.name])
 
 
+@pytest.mark.slow
 def test_scale_and_up_replace_those_of_a_calibration(recordings, tmp_path):
     prepared(recordings, tmp_path / "first", unknown={"board": CHARUCO})
     file = tmp_path / "first" / unknown_cameras.FILE

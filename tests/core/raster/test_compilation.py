@@ -78,6 +78,7 @@ def test_the_users_choice_and_the_users_cache_come_first(tmp_path, monkeypatch):
     assert Path(kernel_cache.folder_of(str(blocked(tmp_path) / "deeper"))).parent == tmp_path / "user"
 
 
+@pytest.mark.slow
 def test_the_first_compilation_is_announced_once_and_loading_is_never_announced(tmp_path):
     first, second = (run_toy(tmp_path, NUMBA_CACHE_DIR=tmp_path / "cache") for _ in range(2))
     assert first.stderr.splitlines() == [compilation.NOTICE] and second.stderr == ""

@@ -128,6 +128,7 @@ def warm_ups(cold, cache):
     return calls
 
 
+@pytest.mark.slow
 def test_a_cold_worker_announces_compilation_in_the_background(cold):
     said = [header.get("event", header.get("id")) for header in cold]
     steps = [header["step"] for header in cold if header.get("event") == "progress"]
@@ -145,6 +146,7 @@ def test_a_warm_worker_announces_no_compilation(warm_ups, cache, scene_path):
     assert [header.get("event", header.get("id")) for header in talk(cache, scene_path)] == [0, 1, 2, 3]
 
 
+@pytest.mark.slow
 def test_the_command_compiles_missing_kernels_and_then_finds_them_ready(warm_ups, cache):
     (first, first_complaints), (second, second_complaints) = warm_ups
     notices = [[event for event in events if event["event"] == "notice"] for events in (first, second)]
@@ -157,6 +159,7 @@ def test_the_command_compiles_missing_kernels_and_then_finds_them_ready(warm_ups
     assert stages[0] == "splats" and {"gradients of splats", "sky", "loss"} <= set(stages)
 
 
+@pytest.mark.slow
 def test_after_warm_up_neither_pictures_nor_training_compile_anything(warm_ups, cache, tiny, scene_path, tmp_path):
     overrides = (*tiny_datasets.SETTINGS, "train.iterations=5", "identity.iterations=2")
     process = start(cache, "-c", USE_EVERYTHING, scene_path, tiny.root, tmp_path / "run", *overrides)
