@@ -1,4 +1,4 @@
-"""Locks of run folders: only one process at a time writes into a folder.
+"""Locks of run folders and of single files: only one process at a time writes into a folder.
 
 The system releases a lock when its process ends in any way. Readers take no lock.
 """
@@ -55,12 +55,30 @@ def hold(folder: Path) -> Iterator[bool]:
     try:
         yield locked
     finally:
-        if locked and os.name == "posix":
-            path.unlink(missing_ok=True)  # before the release, so that the next process creates its own file
-        os.close(descriptor)
-        if os.name != "posix":
-            with contextlib.suppress(OSError):  # Windows cannot remove a file that another process has open
-                path.unlink(missing_ok=True)
+        _release(path, descriptor, locked)
+
+
+@contextlib.contextmanager
+def try_file(path: Path) -> Iterator[bool]:
+    """Lock a file for the block if no other process has locked it; the file is removed afterwards.
+
+    Yields:
+        False if another process holds the lock.
+
+    Raises:
+        CheckpointError: The file cannot be created.
+    """
+    try:
+        descriptor, locked = _open(path)
+    except BlockingIOError:
+        yield False
+        return
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be created: {error}; choose another --out") from error
+    try:
+        yield True
+    finally:
+        _release(path, descriptor, locked)
 
 
 def hold_run_around(path: Path) -> contextlib.AbstractContextManager[object]:
@@ -132,6 +150,16 @@ def _open(path: Path) -> tuple[int, bool]:
             os.close(descriptor)
             raise
         return descriptor, locked
+
+
+def _release(path: Path, descriptor: int, locked: bool) -> None:
+    """Remove and close a file of `_open`."""
+    if locked and os.name == "posix":
+        path.unlink(missing_ok=True)  # before the release, so that the next process creates its own file
+    os.close(descriptor)
+    if os.name != "posix":
+        with contextlib.suppress(OSError):  # Windows cannot remove a file that another process has open
+            path.unlink(missing_ok=True)
 
 
 def _lock(descriptor: int, path: Path) -> bool:

@@ -68,6 +68,7 @@ ALLOWED = {
     "render": {"motion", "scene", "raster", "playback"},
     "importing": {"motion", "scene", "data", "formats", "model"},
     "evaluation": {"motion", "terminal", "scene", "data", "playback", "render"},
+    "film": {"motion", "scene", "data", "color", "formats", "raster", "playback", "render"},
     "language": {"scene", "data", "search", "playback", "render"},
     "train": {"motion", "motion_fit", "scene", "data", "raster", "config", "model", "render"},
     "masks": {"data", "language"},
@@ -106,6 +107,7 @@ ALLOWED = {
         "formats",
         "importing",
         "evaluation",
+        "film",
         "language",
         "train",
         "masks",
@@ -121,7 +123,7 @@ ALLOWED = {
 # Commands that import numpy or torch.
 COMMANDS = (
     *("associate", "bake", "bench", "demo", "evaluate", "export", "import_run", "info", "lookup", "masks", "name"),
-    *("objects", "prepare", "query", "report", "train", "view", "warm_up"),
+    *("objects", "prepare", "query", "render", "report", "train", "view", "warm_up"),
 )
 # Modules that may import modules of the project inside functions: the command line and the public functions, which
 # start fast, and the worker, which answers before torch is there and if it is missing.

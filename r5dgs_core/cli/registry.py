@@ -10,7 +10,7 @@ from .exit_status import ExitStatus
 
 MODULES = (  # modules of `commands`
     *("demo", "prepare", "train", "masks", "associate", "bake", "import_run", "evaluate", "report", "bench"),
-    *("export", "view", "info", "check", "objects", "lookup", "query", "name", "config", "warm_up"),
+    *("export", "render", "view", "info", "check", "objects", "lookup", "query", "name", "config", "warm_up"),
 )
 
 

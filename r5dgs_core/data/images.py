@@ -6,6 +6,7 @@ convention and are converted to sRGB on reading.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -130,14 +131,30 @@ def write_jpeg(path: Path, pixels: np.ndarray) -> None:
     _write(Path(path), pixels, {"Compression": f"jpeg:{JPEG_QUALITY}", "jpeg:subsampling": "4:4:4"})
 
 
-def _write(path: Path, pixels: np.ndarray, attributes: dict[str, int | str]) -> None:
+def write_exr(path: Path, channels: Mapping[str, np.ndarray], attributes: dict[str, int | str]) -> None:
+    """Write an OpenEXR image of 32-bit floats, atomically.
+
+    Args:
+        path: File to write; its folder is created if missing.
+        channels: Values by name. [H, W] each
+        attributes: Entries of the header.
+    """
+    pixels = np.stack([np.asarray(values, np.float32) for values in channels.values()], -1)
+    _write(Path(path), pixels, {"compression": "zip", **attributes}, tuple(channels))
+
+
+def _write(
+    path: Path, pixels: np.ndarray, attributes: dict[str, int | str], names: tuple[str, ...] | None = None
+) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise errors.DatasetError(f"{path}: cannot write the image: its folder cannot be created ({error})") from error
     height, width, channels = pixels.shape
-    kind = oiio.UINT8 if pixels.dtype == np.uint8 else oiio.UINT16
+    kind = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float32": oiio.FLOAT}[pixels.dtype.name]
     spec = oiio.ImageSpec(width, height, channels, kind)
+    if names is not None:
+        spec.channelnames = names
     for name, value in attributes.items():
         spec.attribute(name, value)
     try:

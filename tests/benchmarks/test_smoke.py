@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from r5dgs_core.scene import scene_file
 from r5dgs_core.train import run
 from tests.support import benchmark_modules, encoder_folders, tiny_datasets
 
@@ -36,6 +37,7 @@ PROGRAMS = {
     "raster.workloads": ("--workloads", "W0"),
     "futures.textures": ("--seeds", "1"),
     "playback": ("{field}", "--device", "cpu", "--gaussians", "2000", "--sizes", "24"),
+    "film": ("{scene}", "--gaussians", "2000", "--size", "64x36", "--frames", "2"),
     "words": ("--encoder", "{encoder}"),
 }
 LONG = (  # more than five seconds each
@@ -62,7 +64,9 @@ def figures(tree):
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in LONG)) for n in PROGRAMS])
-def test_a_benchmark_prints_a_table_and_writes_finite_figures(name, tiny, trained, tmp_path, monkeypatch, capsys):
+def test_a_benchmark_prints_a_table_and_writes_finite_figures(
+    name, tiny, trained, baked, tmp_path, monkeypatch, capsys
+):
     encoder = tmp_path / "encoder"
     if name == "words":
         pytest.importorskip("transformers", reason="needs transformers, which is not installed")
@@ -70,7 +74,10 @@ def test_a_benchmark_prints_a_table_and_writes_finite_figures(name, tiny, traine
     field = tmp_path / "field"
     if name == "training.network_playback":
         run.train(tiny.root, field, tiny_datasets.settings("train.representation='field'", "train.iterations=40"))
-    given = [text.format(data=tiny.root, run=trained.folder, encoder=encoder, field=field) for text in PROGRAMS[name]]
+    places = {"data": tiny.root, "run": trained.folder, "encoder": encoder, "field": field}
+    if name == "film":
+        places["scene"] = scene_file.write(baked, tmp_path / "scene.r5dgs")
+    given = [text.format(**places) for text in PROGRAMS[name]]
     target = tmp_path / "rows.json"
     if name == "association.synthetic":
         given += ["--out", str(target.with_suffix(""))]

@@ -201,7 +201,7 @@ def frame_range(text: str) -> tuple[int, int]:
     return first, last
 
 
-def object_ids(scene: Scene, words: str) -> frozenset[int]:
+def object_ids(scene: Scene, words: str, option: str = "--objects") -> frozenset[int]:
     """Return the ids of the objects that the words name or describe, without an encoder.
 
     Raises:
@@ -212,10 +212,10 @@ def object_ids(scene: Scene, words: str) -> frozenset[int]:
     from ...search import object_search
 
     if not object_search.phrases_of(words):
-        raise errors.UsageError(f"--objects {words!r}: expected words for the objects to export, such as 'red mug'")
+        raise errors.UsageError(f"{option} {words!r}: expected words for objects, such as 'red mug'")
     found = object_search.search(scene, words)
     missing = query.unanswered(scene, words) if found else [words]
     if missing:
         labels = [label for label in object_search.labels_of(scene) if label.object_id > 0]
-        raise errors.ConfigError(f"--objects {words!r}: {object_search.explain_nothing(labels, missing[0])}")
+        raise errors.ConfigError(f"{option} {words!r}: {object_search.explain_nothing(labels, missing[0])}")
     return frozenset(match.object_id for match in found)

@@ -462,6 +462,8 @@ NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, fo
     ["report"],
     ["bench", "nowhere", "--out", "tables"],
     ["bench", "nowhere", "--out", "tables", "--variants", "best"],
+    ["render", "nowhere", "--out", "film.mp4"],
+    ["render", "nowhere", "--out", "film.avi"],
     ["view", "nowhere"],
     ["view", "nowhere", "--port", "70000"],
     ["info", "nowhere"],

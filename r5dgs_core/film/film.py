@@ -1,0 +1,176 @@
+"""Films of scenes: a video, a picture or a folder of frames from settings."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import errors
+from ..data import dataset as datasets
+from ..data import images
+from ..scene import spherical_harmonics
+from ..scene.scene import Scene
+from . import frame_folder, frame_renderer, multilayer, schedule, side_by_side, time_marker, video
+from .schedule import Schedule, Shot
+from .settings import Settings
+
+Progress = Callable[[dict[str, Any]], None]
+_SINGLE = ("out", "frames", "share", "overwrite")  # settings in which processes that share a folder may differ
+
+
+@dataclass(frozen=True)
+class Result:
+    """Files of a film.
+
+    Attributes:
+        paths: Files that this process has written.
+        others: Number of frames that were there or that other processes have drawn.
+    """
+
+    paths: tuple[Path, ...]
+    others: int = 0
+
+
+def write(
+    scene: Scene,
+    settings: Settings,
+    *,
+    shown: Collection[int] | None = None,
+    hidden: Collection[int] | None = None,
+    dataset: datasets.Dataset | None = None,
+    progress: Progress = lambda event: None,
+) -> Result:
+    """Render a film and write it.
+
+    Args:
+        scene: The scene.
+        settings: Settings that passed `settings.check`.
+        shown: Ids of the objects to show; None for all.
+        hidden: Ids of the objects to leave out with their shadows, or None.
+        dataset: Data set whose images are shown beside the picture, relative to the scene's origin, or None.
+        progress: Receives an event per frame.
+
+    Raises:
+        ConfigError: Nothing is selected, a camera does not exist, times are outside, or a file exists or cannot be
+            written.
+        BackendError: An encoder is missing.
+    """
+    rows = _rows(scene, shown, hidden)
+    plan = schedule.make(scene, settings)
+    film = _Film(scene, settings, plan, rows, dataset)
+    if settings.is_folder:
+        key = {name: repr(value) for name, value in dataclasses.asdict(settings).items() if name not in _SINGLE}
+        chosen = "all" if rows is None else hashlib.sha256(rows.tobytes()).hexdigest()[:16]
+        return _folder(film, {"scene": _digest(scene), **key, "gaussians": chosen}, progress)
+    if settings.out.exists() and not settings.overwrite:
+        raise errors.ConfigError(
+            f"{settings.out}: the file exists; replace it with --overwrite, or choose another name"
+        )
+    if settings.is_video:
+        video.check(settings.suffix)
+        with video.writing(settings.out, plan.fps, alpha=settings.transparent) as append:
+            for shot in plan.shots:
+                append(film.picture(shot))
+                progress(_event(shot.number, len(plan.shots)))
+    else:
+        film.draw(plan.shots[0], settings.out)
+        progress(_event(1, 1))
+    return Result((settings.out,))
+
+
+def _folder(film: _Film, key: dict[str, str], progress: Progress) -> Result:
+    """Write frames to a folder."""
+    settings, folder = film.settings, film.settings.out
+    shots = film.plan.shots
+    if settings.frames is not None:
+        first, last = settings.frames
+        shots = tuple(shot for shot in shots if first <= shot.number <= last)
+        if not shots:
+            raise errors.ConfigError(f"--frames {first}:{last}: the film has the frames 1 to {len(film.plan.shots)}")
+    frame_folder.create(folder)
+    present = [path for shot in shots if (path := frame_folder.path_of(folder, shot.number, settings.suffix)).exists()]
+    if present and not (settings.overwrite or settings.share):
+        raise errors.ConfigError(
+            f"{present[0]}: the file exists; draw only missing frames with --share, or replace all with --overwrite"
+        )
+    if settings.share:
+        frame_folder.agree(folder, key)
+    else:
+        frame_folder.replace_settings(folder, key)
+    written: list[Path] = []
+    filled = frame_folder.fill(folder, shots, settings.suffix, film.draw, share=settings.share)
+    for done, (shot, drawn) in enumerate(filled, 1):
+        if drawn:
+            written.append(frame_folder.path_of(folder, shot.number, settings.suffix))
+        progress({**_event(done, len(shots)), "frame": shot.number, "drawn": drawn})
+    return Result(tuple(written), len(shots) - len(written))
+
+
+class _Film:
+    """A scene with settings and schedule: draws single frames."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        settings: Settings,
+        plan: Schedule,
+        rows: np.ndarray | None,
+        dataset: datasets.Dataset | None,
+    ):
+        self.scene, self.settings, self.plan = scene, settings, plan
+        options = {"rows": rows, "samples": settings.samples, "transparent": settings.transparent}
+        self._renderer = frame_renderer.FrameRenderer(scene, settings.mode, **options)
+        self._captured = None
+        if dataset is not None:
+            background = np.clip(spherical_harmonics.dc_to_rgb(scene.background_sh[0]), 0, 1)
+            self._captured = side_by_side.CapturedImages(dataset, plan.shots[0].camera.name, background)
+
+    def picture(self, shot: Shot) -> np.ndarray:
+        """Return the pixels of a frame of a video or PNG. [H, W, 3 or 4]"""
+        pixels = self._renderer.picture(shot.camera, shot.t)
+        pixels = np.clip(pixels if self.settings.transparent else pixels[..., :3], 0, 1)
+        if self._captured is not None:
+            pixels = side_by_side.joined([self._captured.at(shot), pixels])
+        if self.settings.marker:
+            pixels = time_marker.draw(pixels, shot.t, self.scene.t_max, self.plan.span)
+        return pixels
+
+    def draw(self, shot: Shot, path: Path) -> None:
+        """Write a frame as PNG or EXR, atomically."""
+        try:
+            if path.suffix.lower() == ".png":
+                images.write_png(path, self.picture(shot))
+                return
+            layers = self._renderer.layers(shot.camera, shot.t) if self.settings.passes else None
+            picture = self._renderer.picture(shot.camera, shot.t)
+            multilayer.write(path, multilayer.channels(self.scene, picture, layers, self.settings.passes), self.scene)
+        except errors.DatasetError as error:
+            raise errors.ConfigError(str(error)) from error
+
+
+def _rows(scene: Scene, shown: Collection[int] | None, hidden: Collection[int] | None) -> np.ndarray | None:
+    """Return the Gaussians to draw. Raises ConfigError if there are none."""
+    rows = frame_renderer.rows_of(scene, shown, hidden)
+    empty = [item.name for item in scene.objects if shown is not None and item.id in shown and item.count == 0]
+    if (rows is not None and len(rows) == 0) or not len(scene.gaussians.means):
+        reason = f"{', '.join(empty)}: no Gaussians" if empty else "no Gaussians are left"
+        raise errors.ConfigError(f"{reason}, so there is nothing to draw; choose other objects")
+    return rows
+
+
+def _digest(scene: Scene) -> str:
+    """Return a hash of what a scene shows."""
+    made = hashlib.sha256()
+    for values in (scene.gaussians.means, scene.gaussians.sh, scene.gaussians.opacity_logits, scene.tracks.poses):
+        made.update(np.ascontiguousarray(values).tobytes())
+    return made.hexdigest()[:16]
+
+
+def _event(done: int, total: int) -> dict[str, Any]:
+    return {"event": "render", "done": done, "total": total, "unit": "frames"}

@@ -1,0 +1,117 @@
+"""Folders of frames that several processes fill together, without losing or repeating a frame.
+
+A process holds a locked placeholder beside a frame while it draws it. The system releases the lock when the process
+ends in any way, so the frames of a process that was killed are drawn by the others. All processes must have the same
+settings: the first one writes them to ``render.json``, the others compare.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from .. import atomic_files, errors, folder_lock, strict_json
+from .schedule import Shot
+
+SETTINGS = "render.json"
+POLL_S = 0.5  # interval at which frames of other processes are looked at again
+
+
+def path_of(folder: Path, number: int, suffix: str) -> Path:
+    """Return the path of a frame."""
+    return folder / f"frame_{number:04d}{suffix}"
+
+
+def create(folder: Path) -> None:
+    """Create a folder if it is missing. Raises ConfigError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise errors.ConfigError(f"--out {folder}: the folder cannot be created ({error})") from error
+
+
+def fill(
+    folder: Path, shots: Sequence[Shot], suffix: str, draw: Callable[[Shot, Path], None], *, share: bool
+) -> Iterator[tuple[Shot, bool]]:
+    """Write the frames of a folder.
+
+    Args:
+        folder: The folder, which must exist.
+        shots: The frames.
+        suffix: Suffix of their files.
+        draw: Draws a frame and writes it atomically.
+        share: True to leave existing frames, and to wait for the frames of other processes at the end.
+
+    Yields:
+        Each frame when it is complete, and True if this process has drawn it.
+    """
+    waiting = list(shots)
+    while waiting:
+        left = []
+        for shot in waiting:
+            path, drawn = path_of(folder, shot.number, suffix), True
+            if share:
+                drawn = _draw_once(path, shot, draw)
+            else:
+                draw(shot, path)
+            if drawn is None:
+                left.append(shot)
+            else:
+                yield shot, drawn
+        if len(left) == len(waiting):
+            time.sleep(POLL_S)
+        waiting = left
+
+
+def agree(folder: Path, settings: dict[str, Any]) -> None:
+    """Write the settings of the frames of a folder, or compare them with those of another process.
+
+    Raises:
+        ConfigError: The folder has frames with other settings, or cannot be written.
+    """
+    path = folder / SETTINGS
+    temporary = folder / f".{SETTINGS}.{secrets.token_hex(8)}"
+    try:
+        temporary.write_text(json.dumps(settings, indent=1))
+        try:
+            os.link(temporary, path)  # fails if another process was faster, and never leaves half a file
+        finally:
+            temporary.unlink(missing_ok=True)
+    except FileExistsError:
+        found = strict_json.read(path, errors.ConfigError)
+        other = [key for key in settings if found.get(key) != settings[key]] if isinstance(found, dict) else ["all"]
+        if other:
+            raise errors.ConfigError(
+                f"--share: {path}: the folder has frames with other settings ({', '.join(other)}); use those, or "
+                "another folder"
+            ) from None
+    except OSError as error:
+        raise errors.ConfigError(f"--out {folder}: cannot be written ({error})") from error
+
+
+def replace_settings(folder: Path, settings: dict[str, Any]) -> None:
+    """Write the settings of a folder whose frames this process writes alone. Raises ConfigError."""
+    try:
+        atomic_files.write(folder / SETTINGS, json.dumps(settings, indent=1).encode())
+    except OSError as error:
+        raise errors.ConfigError(f"--out {folder}: cannot be written ({error})") from error
+
+
+def _draw_once(path: Path, shot: Shot, draw: Callable[[Shot, Path], None]) -> bool | None:
+    """Draw a frame unless it exists (False) or another process draws it (None)."""
+    if path.exists():
+        return False
+    with folder_lock.try_file(path.with_name(f".{path.name}.placeholder")) as held:
+        if not held:
+            return None
+        if path.exists():
+            return False
+        for left in path.parent.glob(f".{path.name}.*{path.suffix}"):  # of a process that was killed while it wrote
+            left.unlink(missing_ok=True)
+        draw(shot, path)
+    return True
