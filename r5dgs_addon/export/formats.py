@@ -46,8 +46,9 @@ def steps(
     numbers = tuple(frames) if every else None
     at = frames if every else [context.scene.frame_current_final]
     options = registry.Options(tuple(times.time(frame) for frame in at), numbers)
-    targets = format.paths(path, options)
-    edited = yield from scene.edited_steps(context, collection, clouds, further=len(targets))
+    further = len(numbers) if numbers and format.per_frame else 1
+    edited = yield from scene.edited_steps(context, collection, clouds, further=further)
+    targets = format.paths(path, options, edited.scene)
     yield Step(edited.done, edited.done + len(targets), f"writing {targets[0].name}", slow=True)
     try:
         for number, target in enumerate(format.write(edited.scene, path, options), edited.done + 1):

@@ -90,7 +90,7 @@ def write(
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
     """Write the Gaussians at each time, in the world of the scene file. Implements `registry.Format.write`."""
     player = Player(scene)
-    for t, target in zip(options.times, FORMAT.paths(path, options), strict=True):
+    for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
         splats = played_splats.at(player, t, options.object_ids)
         yield write(splats, target, origin=scene.origin, comments=_bands(scene, t, options.object_ids))
 

@@ -19,6 +19,9 @@ MODULES = {  # module of this room that defines `FORMAT`, by the name of the for
     "cameras": "camera_files",
     "glb": "glb",
     "html": "html",
+    "poses": "poses",
+    "poses_csv": "poses_csv",
+    "tum": "tum",
 }
 
 
@@ -53,6 +56,8 @@ class Format:
         loses: Parts of a scene that a file does not hold.
         write: Writes a scene and yields the path of each file when it is complete. Files are replaced atomically.
         per_frame: True if each frame is a file of its own.
+        has_times: True if a file holds all of `Options.times`.
+        parts: Returns names of the files if a scene is written to several, such as one for each object, or None.
         has_objects: True if a file holds objects, so that `Options.object_ids` applies.
         has_motion: True if a file holds the motion up to `Options.until`; `Options.times` then do not apply.
         has_still: True if a file holds `Options.still`.
@@ -68,6 +73,8 @@ class Format:
     loses: str
     write: Callable[[Scene, Path, Options], Iterator[Path]]
     per_frame: bool = False
+    has_times: bool = False
+    parts: Callable[[Scene, Options], list[str]] | None = None
     has_objects: bool = True
     has_motion: bool = False
     has_still: bool = False
@@ -90,8 +97,10 @@ class Format:
             f"{extras.command(str(self.extra))}, then use the command r5dgs export"
         )
 
-    def paths(self, path: Path, options: Options) -> list[Path]:
+    def paths(self, path: Path, options: Options, scene: Scene) -> list[Path]:
         """Return the files that `write` makes."""
+        if self.parts is not None:
+            return [path.with_name(f"{path.stem}_{part}{path.suffix}") for part in self.parts(scene, options)]
         if not self.per_frame or options.frames is None:
             return [path]
         return [numbered(path, frame) for frame in options.frames]

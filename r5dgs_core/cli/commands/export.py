@@ -23,6 +23,9 @@ EXAMPLE = "scene.r5dgs --to ply --out frame.ply --frames 1:60"
 PAGE = "user/export.md"
 
 STILL_SIDE = 480  # longest side of the picture in formats with one, pixels
+MOST_FRAMES = 1_000_000
+FARTHEST = 1e9  # scene times
+_ROUNDING = 1e-6  # of frame numbers
 log = logging.getLogger(__name__)
 
 
@@ -35,7 +38,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     out = "file to write; with --frames, formats with one file per frame insert the frame number into the name"
     p.add_argument("--out", type=Path, required=True, metavar="FILE", help=out)
     when = p.add_mutually_exclusive_group()
-    when.add_argument("--time", type=float, metavar="T", help="scene time (default: t_max); may exceed t_max")
+    time = "scene time (default: t_max), may exceed t_max; formats with poses take several, such as 0,0.5,1.2"
+    when.add_argument("--time", type=times, metavar="T", help=time)
     frames = "range of Blender frames, both included; frame 1 is scene time 0"
     when.add_argument("--frames", type=frame_range, metavar="A:B", help=frames)
     until = "last scene time in files with motion (default: a third of the observed span after t_max, at least 1)"
@@ -47,7 +51,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
-    given = {"t": args.time, "frames": args.frames, "until": args.until, "words": args.objects}
+    given = {"times": args.time, "frames": args.frames, "until": args.until, "words": args.objects}
     run_export(args.file, args.to, args.out, **given, overwrite=args.overwrite, progress_kind=args.progress)
 
 
@@ -57,7 +61,7 @@ def run_export(
     to: str,
     out: Path,
     *,
-    t: float | None = None,
+    times: tuple[float, ...] | None = None,
     frames: tuple[int, int] | None = None,
     until: float | None = None,
     words: str | None = None,
@@ -70,7 +74,8 @@ def run_export(
         path: The scene file.
         to: Name of the format, a key of `formats.registry.MODULES`.
         out: File to write; the frame number is inserted if each frame is a file of its own.
-        t: Scene time; t_max if neither ``t`` nor ``frames`` is given.
+        times: Scene times, one unless the format has several; if neither ``times`` nor ``frames`` is given, t_max, or
+            for a format with several the frames up to the end of the prediction.
         frames: First and last Blender frame; frame 1 is scene time 0.
         until: Last scene time of formats with motion (see `formats.registry.Options`).
         words: Objects to export, as in ``r5dgs query``; all if None.
@@ -90,12 +95,12 @@ def run_export(
     input_paths.check_output("--out", out)
     input_paths.check_scene(path)
     chosen = registry.usable(to)  # imports numpy
-    _check_arguments(chosen, out, words, t=t, frames=frames, until=until)
+    _check_arguments(chosen, out, words, times=times, frames=frames, until=until)
     from ...scene import scene_file
 
     scene = scene_file.read(path)
-    what = selection(chosen, scene, t=t, frames=frames, until=until, words=words)
-    targets = chosen.paths(out, what)
+    what = selection(chosen, scene, times=times, frames=frames, until=until, words=words)
+    targets = chosen.paths(out, what, scene)
     present = [target for target in targets if target.exists()]
     if present and not overwrite:
         raise errors.ConfigError(f"{present[0]}: the file exists; replace it with --overwrite, or choose another name")
@@ -112,7 +117,7 @@ def _write(chosen: registry.Format, scene: Scene, out: Path, what: registry.Opti
     """Write the files of a format with progress output and return their paths."""
     from ...progress import make
 
-    written, total = [], len(chosen.paths(out, what))
+    written, total = [], len(chosen.paths(out, what, scene))
     with make(progress_kind) as progress:
         for target in chosen.write(scene, out, what):
             written.append(target)
@@ -127,7 +132,7 @@ def _check_arguments(
     out: Path,
     words: str | None,
     *,
-    t: float | None,
+    times: tuple[float, ...] | None,
     frames: tuple[int, int] | None,
     until: float | None,
 ) -> None:
@@ -136,21 +141,25 @@ def _check_arguments(
         raise errors.UsageError(f"--out {out}: expected a name that ends in {chosen.suffix}")
     if words is not None and not chosen.has_objects:
         raise errors.UsageError(f"--objects: files of format {chosen.name} hold no objects; leave it out")
-    if chosen.has_motion and not (t is None and frames is None):
-        option = "--frames" if t is None else "--time"
+    if chosen.has_motion and not (times is None and frames is None):
+        option = "--frames" if times is None else "--time"
         raise errors.UsageError(f"{option}: files of format {chosen.name} hold the motion; give its end with --until")
     if until is not None and not chosen.has_motion:
         raise errors.UsageError(f"--until: files of format {chosen.name} hold no motion; leave it out")
-    for option, time in (("--time", t), ("--until", until)):
-        if time is not None and not math.isfinite(time):
-            raise errors.UsageError(f"{option} {time}: expected a finite number")
+    if frames is not None and frames[1] - frames[0] >= MOST_FRAMES:
+        raise errors.UsageError(f"--frames: expected at most {MOST_FRAMES} frames, got {frames[0]}:{frames[1]}")
+    if times is not None and len(times) > 1 and not chosen.has_times:
+        raise errors.UsageError(f"--time: files of format {chosen.name} hold one time; give one, or --frames")
+    for option, values in (("--time", times or ()), ("--until", () if until is None else (until,))):
+        if not all(math.isfinite(value) and abs(value) <= FARTHEST for value in values):
+            raise errors.UsageError(f"{option}: expected finite numbers up to {FARTHEST:g}")
 
 
 def selection(
     chosen: registry.Format,
     scene: Scene,
     *,
-    t: float | None = None,
+    times: tuple[float, ...] | None = None,
     frames: tuple[int, int] | None = None,
     until: float | None = None,
     words: str | None = None,
@@ -163,12 +172,15 @@ def selection(
     """
     if until is not None and not (math.isfinite(until) and until >= scene.t_max):
         raise errors.UsageError(f"--until {until:g}: expected a time from t_max on, which is {scene.t_max:g}")
+    if frames is None and times is None and chosen.has_times:
+        frames = default_frames(scene)
     numbers = None if frames is None else tuple(range(frames[0], frames[1] + 1))
-    times = (scene.t_max if t is None else t,)
     if numbers is not None:
         times = tuple((number - 1) / scene.frames_per_unit for number in numbers)
     ids = None if words is None else object_ids(scene, words)
-    return registry.Options(times, numbers, ids, until, _still(scene, ids) if chosen.has_still else None)
+    return registry.Options(
+        times or (scene.t_max,), numbers, ids, until, _still(scene, ids) if chosen.has_still else None
+    )
 
 
 def _still(scene: Scene, object_ids: frozenset[int] | None) -> bytes | None:
@@ -188,6 +200,22 @@ def _still(scene: Scene, object_ids: frozenset[int] | None) -> bytes | None:
         log.warning("the page has no picture for browsers without WebGL: %s", error)
         return None
     return image_files.png(images.to_uint8(color))
+
+
+def default_frames(scene: Scene) -> tuple[int, int]:
+    """Return the frames from the first observed time to the end of the prediction that Blender shows."""
+    from ...scene import predictability
+
+    first, last = (scene.frames_per_unit * t + 1 for t in (scene.tracks.times[0], predictability.horizon(scene)))
+    return math.ceil(first - _ROUNDING), math.floor(last + _ROUNDING)
+
+
+def times(text: str) -> tuple[float, ...]:
+    """Convert an argument T or T,T,... to numbers."""
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a number, or several such as 0,0.5,1.2, got {text!r}") from None
 
 
 def frame_range(text: str) -> tuple[int, int]:

@@ -69,7 +69,7 @@ def test_the_format_of_the_developers_page_appears_in_blender(blender, loaded, c
     assert blender.ops.r5dgs.export_format(format=csv, filepath=str(tmp_path / "a")) == {"FINISHED"}
     assert blender.context.scene.frame_current == 13
     time = 12 / loaded.r5dgs.frames_per_unit
-    (wanted,) = export_command.run_export(tmp_path / "scene.r5dgs", csv, tmp_path / "b.csv", t=time)
+    (wanted,) = export_command.run_export(tmp_path / "scene.r5dgs", csv, tmp_path / "b.csv", times=(time,))
     assert (tmp_path / "a.csv").read_bytes() == wanted.read_bytes()
 
 
@@ -88,7 +88,7 @@ def test_each_frame_of_the_range_is_a_file(blender, loaded, csv, tmp_path):
     assert blender.ops.r5dgs.export_format(filepath=str(tmp_path / "a.csv"), **options) == {"FINISHED"}
     for frame in (40, 50, 60):
         time = (frame - 1) / loaded.r5dgs.frames_per_unit
-        (wanted,) = export_command.run_export(tmp_path / "scene.r5dgs", csv, tmp_path / f"b{frame}.csv", t=time)
+        (wanted,) = export_command.run_export(tmp_path / "scene.r5dgs", csv, tmp_path / f"b{frame}.csv", times=(time,))
         assert (tmp_path / f"a_{frame:04d}.csv").read_bytes() == wanted.read_bytes()
     assert sorted(path.name for path in tmp_path.glob("a*")) == ["a_0040.csv", "a_0050.csv", "a_0060.csv"]
 
@@ -101,7 +101,9 @@ def test_edits_are_exported_and_hidden_or_unselected_objects_are_not(blender, lo
     blender.context.scene.frame_set(46)
     assert blender.ops.r5dgs.export_scene(filepath=str(tmp_path / "edited.r5dgs"), exact=True) == {"FINISHED"}
     time = 45 / loaded.r5dgs.frames_per_unit
-    wanted = ply.read(export_command.run_export(tmp_path / "edited.r5dgs", "ply", tmp_path / "wanted.ply", t=time)[0])
+    wanted = ply.read(
+        export_command.run_export(tmp_path / "edited.r5dgs", "ply", tmp_path / "wanted.ply", times=(time,))[0]
+    )
 
     def export(name, **options):
         path = tmp_path / name

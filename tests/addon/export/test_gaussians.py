@@ -333,7 +333,7 @@ def test_the_command_writes_the_gaussians_that_blender_exports(blender, loaded, 
     blender.context.scene.frame_set(frame)
     theirs = export(blender, tmp_path / "blender.ply", axes="FILE")
     (path,) = export_command.run_export(
-        tmp_path / "scene.r5dgs", "ply", tmp_path / "command.ply", t=(frame - 1) / loaded.r5dgs.frames_per_unit
+        tmp_path / "scene.r5dgs", "ply", tmp_path / "command.ply", times=((frame - 1) / loaded.r5dgs.frames_per_unit,)
     )
     ours = ply.read(path)
     assert len(ours.means) == len(theirs.means)
