@@ -166,6 +166,8 @@ LATE_IMPORTS = {
 }
 # The same of the add-on: OpenImageIO is optional there.
 LATE_ADDON_IMPORTS = {"capture.files": {"data.images"}}
+# Packages that rooms of the light tier may import inside functions, for files of other programs.
+LATE_PACKAGES = {"formats": {"pxr"}}
 # Which rooms of the add-on a room may import, itself aside, lower rooms first.
 ADDON_ALLOWED = {
     "compat": set(),
@@ -313,7 +315,8 @@ def core_problems(source: str, package: str, own: str) -> list[str]:
             problems.append(f"line {item.line}: {item.target} is not relative, so it breaks inside the extension")
         if other and other not in ALLOWED[own] | {own} | GROUND:
             problems.append(f"line {item.line}: {own} imports {item.target}")
-        if own in LIGHT and not item.relative and top not in sys.stdlib_module_names | {"numpy"}:
+        permitted = LATE_PACKAGES.get(own, set()) if item.late else set()
+        if own in LIGHT and not item.relative and top not in sys.stdlib_module_names | {"numpy"} | permitted:
             problems.append(f"line {item.line}: the light tier imports {item.target}")
     return problems
 

@@ -20,11 +20,11 @@ from .. import atomic_files, errors
 from ..motion import rotations
 from ..playback import modes
 from ..playback.scene_player import Player, available
-from ..scene import cameras, format_features, motion_words, predictability, row_runs, scene_json
+from ..scene import cameras, format_features, motion_words, predictability, scene_json
 from ..scene.scene import MotionGroup, Scene
 from ..scene.stored_embeddings import StoredEmbeddings
 from ..search import embedding_search
-from . import glb_motion, glb_splats, gltf, registry
+from . import glb_motion, glb_splats, gltf, registry, scene_nodes
 
 FORMAT_NAME, FORMAT_VERSION = "r5dgs glb", 1
 ELSEWHERE = ", in other programs"  # end of sentences about losses that our own programs do not have
@@ -122,28 +122,17 @@ class _Nodes:
 
 def _add_groups(scene: Scene, options: registry.Options, tree: _Nodes, arrays: gltf.Arrays) -> dict[int, int]:
     """Add a node for each motion group with selected Gaussians, and for their parents; returns their numbers."""
-    pieces = []
-    ids = scene.gaussians.object_ids
-    for start, stop, object_id in row_runs.runs(ids):
-        if options.object_ids is None or object_id in options.object_ids:
-            within = row_runs.runs(scene.gaussians.motion_ids[start:stop])
-            pieces += [(slice(start + first, start + last), object_id, g) for first, last, g in within]
-    if not pieces:
-        raise errors.ConfigError(f"{scene.name}: expected Gaussians to export, found none in the selected objects")
+    pieces = scene_nodes.pieces(scene, options.object_ids)
     numbers: dict[int, int] = {}
     names = {item.id: item.name for item in scene.objects}
-    bodies: dict[int, list[int]] = {item.id: [] for item in scene.objects}
-    for group in scene.groups:
-        if group.role == "body":
-            bodies[group.object_id].append(group.id)
+    group_names = scene_nodes.group_names(scene)
 
     def node_of(group: MotionGroup) -> int:
         if group.id not in numbers:
             parent = None if group.parent is None else node_of(scene.groups[group.parent])
             extras = {"r5dgs": {"group": group.id, "role": group.role}}
             place = glb_motion.home(scene.groups, group).tolist()
-            name = _group_name(group, names[group.object_id], bodies[group.object_id])
-            numbers[group.id] = tree.add(name, parent, translation=place, extras=extras)
+            numbers[group.id] = tree.add(group_names[group.id], parent, translation=place, extras=extras)
             if parent is None:
                 tree.roots.append(numbers[group.id])
         return numbers[group.id]
@@ -156,15 +145,6 @@ def _add_groups(scene: Scene, options: registry.Options, tree: _Nodes, arrays: g
         extras = {"r5dgs": {"group": motion_id, "object": object_id}}
         tree.add(name, node_of(group), mesh=len(tree.meshes) - 1, extras=extras)
     return numbers
-
-
-def _group_name(group: MotionGroup, name: str, bodies: list[int]) -> str:
-    """Name of a group's node: the name of its object, with the number of the part if there are several bodies."""
-    if group.role == "pinned":
-        return "static"
-    if group.role == "shadow":
-        return f"{name} (shadow)"
-    return name if len(bodies) < 2 else f"{name} (part {bodies.index(group.id) + 1})"
 
 
 def _add_cameras(scene: Scene, tree: _Nodes) -> None:

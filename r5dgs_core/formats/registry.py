@@ -19,6 +19,7 @@ MODULES = {  # module of this room that defines `FORMAT`, by the name of the for
     "cameras": "camera_files",
     "glb": "glb",
     "html": "html",
+    "usd": "usd",
     "poses": "poses",
     "poses_csv": "poses_csv",
     "tum": "tum",
