@@ -2,8 +2,8 @@
 
 Each camera has one image in Blender, which stores the times and paths of all images of this camera. A frame change
 handler replaces its path; that costs nothing until a view through the camera is drawn. The data set is a folder with
-`transforms_*.json` files, whose frames name their camera, or with images named like the cameras: ``CAMERA.png``, or a
-folder ``CAMERA`` of images in the order of time.
+`transforms_*.json` files, which list the images of each camera, or with images named like the cameras: ``CAMERA.png``,
+or a folder ``CAMERA`` of images in the order of time.
 """
 
 import json
@@ -110,17 +110,28 @@ def _named_in_files(folder: Path) -> dict[str, list[tuple[float, Path]]]:
     found: dict[str, list[tuple[float, Path]]] = {}
     for file in sorted(folder.glob("transforms*.json")):
         try:
-            frames = json.loads(file.read_text(encoding="utf-8"))["frames"]
-            listed = [(one, str(one["file_path"]), float(one.get("time", 0.0))) for one in frames]
-        except (OSError, ValueError, KeyError, TypeError):
+            listed = _listed(json.loads(file.read_text(encoding="utf-8")))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
             continue  # not a data set's file
-        for frame, given, t in listed:
+        for names, given, t in listed:
             path = _image(folder, given)
             if path is None or not math.isfinite(t):
                 continue
-            for name in {str(frame.get("view", frame.get("camera", ""))), Path(given).stem} - {""}:
+            for name in names - {""}:
                 found.setdefault(name, []).append((t, path))
     return found
+
+
+def _listed(content: dict) -> list[tuple[set[str], str, float]]:
+    """Names of the camera, path and time of each image that a file lists, by camera (``data``) or in one list."""
+    if "data" in content:
+        frames = [({str(name)}, one) for name, camera in content["data"].items() for one in camera["frames"]]
+    else:
+        frames = [
+            ({str(one.get("view", one.get("camera", ""))), Path(str(one["file_path"])).stem}, one)
+            for one in content["frames"]
+        ]
+    return [(names, str(one["file_path"]), float(one.get("time", 0.0))) for names, one in frames]
 
 
 def _image(folder: Path, given: str) -> Path | None:

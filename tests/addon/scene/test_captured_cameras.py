@@ -97,6 +97,22 @@ def test_images_of_the_current_time_are_backgrounds_of_their_cameras(blender, ca
     assert shown(home) == {"away": ["r_0.png"], "upright": ["r_2.png"]}
 
 
+def test_images_of_a_file_that_lists_them_by_camera_have_its_times(blender, captured, tmp_path):
+    collection = motions.load(blender, scene_file.write(captured, tmp_path / "scene.r5dgs"))
+    folder, home = tmp_path / "data", collection.children["Cameras"]
+    for number in range(3):
+        png(folder / "images" / "away" / f"{number:04d}.png", number)
+    for split, numbers in (("train", (0, 1)), ("test", (2,))):
+        frames = [{"file_path": f"images/away/{k:04d}.png", "time": scenes.T_MAX * (0.0, 1.0, 1.2)[k]} for k in numbers]
+        path = folder / f"transforms_{split}.json"
+        path.write_text(json.dumps({"data": {"away": {"fl_x": 50.0, "frames": frames}}}))
+    motions.go_to(blender, collection, scenes.T_MAX)
+    assert blender.ops.r5dgs.show_captured_images(directory=str(folder)) == {"FINISHED"}
+    assert shown(home) == {"away": ["0001.png"]}
+    motions.go_to(blender, collection, 1.2 * scenes.T_MAX)
+    assert shown(home) == {"away": ["0002.png"]}
+
+
 def test_images_follow_the_frame_after_undo_and_in_a_reopened_file(blender, captured, tmp_path):
     collection = motions.load(blender, scene_file.write(captured, tmp_path / "scene.r5dgs"))
     folder, name = tmp_path / "data", collection.name
