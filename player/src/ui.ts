@@ -11,7 +11,7 @@ const EYE = eyeOf('<path d="M2 12s4-7 10-7 10 7 10 7-4 7-10 7S2 12 2 12z"/><circ
 const CLOSED = eyeOf('<path d="M2 12s4 6 10 6 10-6 10-6M4 20 20 4"/>');
 const HELP: [string, string][] = [
   ["Space", "play or pause"], ["← →", "previous or next frame; with Shift ten frames"], ["Home, End", "first or last time"],
-  ["/", "find objects"], ["I", "isolate the picked object"], ["V", "show or hide the picked object"], ["Esc", "pick nothing, show all"],
+  ["/", "find objects"], ["I", "isolate the picked object"], ["V", "show or hide the picked object"], ["Esc", "pick nothing, end the isolation"],
   ["C", "next captured camera"], ["F", "fly or orbit"], ["W A S D, Q E", "fly: move"],
   ["Drag, wheel", "turn, zoom; right button or two fingers shift the view"], ["Click, tap", "pick an object"],
 ];
