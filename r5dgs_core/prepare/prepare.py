@@ -52,6 +52,11 @@ def prepare(request: Request, progress: Progress) -> Plan:
                 again=request.overwrite,
                 progress=progress,
             )
+    elif request.unknown != unknown_cameras.UnknownCameras():
+        raise errors.UsageError(
+            "--board, --lenses, --shared-lens, --moving and --distance apply to cameras without a calibration; leave "
+            f"them out, or remove the calibration ({file or 'found beside the recordings'})"
+        )
     progress({"event": "read", "text": "recordings and calibration"})
     up = request.up if file == request.calibration else None  # a reconstruction is upright
     opened, calibration = cameras.open_all(request.source, file, request.rate, up, request.meters_per_unit)
@@ -70,7 +75,7 @@ def _begin(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, A
     """Return the record of a run with the identity, or None; with ``overwrite``, remove that of another run."""
     present = capture_file.read(out)
     if present is None:
-        own = {folder_lock.LOCK_FILE, unknown_cameras.FILE}
+        own = {folder_lock.LOCK_FILE, unknown_cameras.FILE, unknown_cameras.WORK}
         foreign = [path.name for path in out.iterdir() if path.name not in own]
         if foreign:
             raise errors.DatasetError(

@@ -7,7 +7,7 @@ FOLDER/objects.json        names of the ids, optional
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,10 +54,12 @@ class SourceMasks:
                 f"{folder}: expected a folder of masks per camera ({', '.join(cameras)}), found "
                 f"{', '.join(folders) or 'none'}"
             )
+        files = [_masks_of(folders[matched[name]]) for name in cameras]
+        first = _first_number(self.folder, plan, files)
         self._found = {
             plan.image_name(number, index): (path, number, index)
-            for number, name in enumerate(cameras)
-            for index, path in _by_index(plan, number, folders[matched[name]]).items()
+            for number, present in enumerate(files)
+            for index, path in _by_index(plan, number, present, first).items()
         }
         if not self._found:
             example = plan.cameras[0].source.frame_name(int(plan.choice.indices[0][0]))
@@ -76,15 +78,52 @@ class SourceMasks:
             report((k + 1) / len(video.views))
 
 
-def _by_index(plan: Plan, number: int, folder: Path) -> dict[int, Path]:
-    """Find the mask of each chosen frame of a camera, by the frame's name or else by the number in the mask's name."""
+def _masks_of(folder: Path) -> dict[str, Path]:
+    """Return the masks of a camera by their names without the suffix."""
+    return {path.stem: path for path in folder.iterdir() if path.suffix.lower() == ".png"}
+
+
+def _numbered(present: Mapping[str, Path]) -> dict[int, Path]:
+    """Return masks by the last number in their names."""
+    return {int(found[-1]): path for stem, path in present.items() if (found := re.findall(r"\d+", stem))}
+
+
+def _first_number(folder: Path, plan: Plan, files: Sequence[Mapping[str, Path]]) -> int:
+    """Return the number of a recording's first frame in the names of masks, 0 or 1.
+
+    Raises:
+        DatasetError: Some frames lack masks, so the names permit both.
+    """
+    sources = [camera.source for camera in plan.cameras]
+    numbers = [_numbered(present).keys() for present in files]
+    if any(0 in found for found in numbers):
+        return 0
+    if any(len(source.times) in found for source, found in zip(sources, numbers, strict=True)):
+        return 1
+    for source, present in zip(sources, files, strict=True):
+        names = {source.frame_name(index) for index in range(len(source.times))}
+        if other := next((name for name in present if name not in names), None):
+            raise errors.DatasetError(
+                f"{folder}: masks such as {other}.png may be numbered from 0 or from 1, because the first and the last "
+                f"one are missing; name them like the frames, such as {source.frame_name(0)}.png for the first one"
+            )
+    return 0
+
+
+def _by_index(plan: Plan, number: int, present: Mapping[str, Path], first: int) -> dict[int, Path]:
+    """Return the mask of each chosen frame of a camera, by the frame's name or else by the number in the mask's name.
+
+    Args:
+        plan: The prepared data set.
+        number: Number of the camera.
+        present: Result of `_masks_of`.
+        first: Result of `_first_number`.
+    """
     source, chosen = plan.cameras[number].source, plan.choice.indices[number].tolist()
-    present = {path.stem: path for path in folder.iterdir() if path.suffix.lower() == ".png"}
     named = {index: present[source.frame_name(index)] for index in chosen if source.frame_name(index) in present}
-    if named:
+    if named and not (source.videos and first):
         return named
-    numbered = {int(found[-1]): path for stem, path in present.items() if (found := re.findall(r"\d+", stem))}
-    first = 0 if 0 in numbered else 1
+    numbered = _numbered(present)
     return {index: numbered[index + first] for index in chosen if index + first in numbered}
 
 

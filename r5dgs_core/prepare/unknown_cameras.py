@@ -19,7 +19,7 @@ from . import cameras, names
 from .camera_source import CameraSource
 
 FILE = r5dgs_json.FILES
-_WORK = "reconstruction"  # folder of intermediate files
+WORK = "reconstruction"  # folder of intermediate files
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,9 @@ def reconstruct(
     )
     text = "cameras from the board" if request.board else "cameras from image features; this can take minutes"
     progress({"event": "read", "text": text})
-    found = reconstruction.reconstruct(sources, request, out / _WORK)
+    found = reconstruction.reconstruct(sources, request, out / WORK)
     r5dgs_json.write(path, found)
-    shutil.rmtree(out / _WORK, ignore_errors=True)
+    shutil.rmtree(out / WORK, ignore_errors=True)
     return path
 
 

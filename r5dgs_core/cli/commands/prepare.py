@@ -152,6 +152,7 @@ def run_prepare(
     """
     window = window or {}
     _check(window, source, fields.get("calibration"))
+    _check_masks(masks, model, words)
     from ...prepare import data_splits, frame_choice, plan, prepare, unknown_cameras
     from ...progress import make
 
@@ -185,6 +186,14 @@ def _check(window: dict[str, Any], source: Path, calibration: Path | None) -> No
     input_paths.check_source(Path(source))
     if calibration is not None:
         input_paths.check_calibration(Path(calibration))
+
+
+def _check_masks(masks: str, model: Path | None, words: str | None) -> None:
+    """Raise UsageError for options that the choice of masks does not use."""
+    if words is not None and masks != "sam3":
+        raise errors.UsageError(f"--words {words}: applies to --masks sam3, found --masks {masks}")
+    if model is not None and masks not in ("sam2", "sam3"):
+        raise errors.UsageError(f"--model {model}: applies to --masks sam2 and sam3, found --masks {masks}")
 
 
 def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: str) -> None:

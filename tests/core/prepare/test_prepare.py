@@ -156,6 +156,35 @@ def test_masks_of_the_frames_are_undistorted_like_them(capture, tmp_path):
             assert ((ids == 3) != wanted).mean() < 0.01
 
 
+def test_options_of_unknown_cameras_beside_a_calibration_are_refused(capture, tmp_path):
+    with pytest.raises(errors.UsageError, match="--board.*remove the calibration"):
+        prepared(capture, tmp_path / "data", unknown={"shared_lens": True})
+
+
+def write_masks(folder, names):
+    """Write a mask of id k + 1 for each frame k, by its name."""
+    for camera in ("cam0", "cam1", "cam2"):
+        for k, name in names.items():
+            images.write_png(folder / camera / f"{name}.png", np.full((HEIGHT, WIDTH), k + 1, np.uint8))
+    return str(folder)
+
+
+@pytest.mark.parametrize("name", ["frame_{:03d}", "{:06d}"])
+@pytest.mark.parametrize("first", [0, 1])
+def test_masks_of_few_frames_belong_to_their_frames(capture, tmp_path, name, first):
+    end = COUNT - 1 if first else 0
+    folder = write_masks(tmp_path / "masks", {k: name.format(k + first) for k in (3, end)})
+    found = prepared(capture, tmp_path / "data", masks=folder)
+    ids = [dataset.load_mask(view) for view in found.train if view.camera.name == "cam0"]
+    assert {k: one.max() for k, one in enumerate(ids) if one is not None} == {3: 4, end: end + 1}
+
+
+def test_masks_that_may_be_numbered_from_0_or_1_are_refused(capture, tmp_path):
+    folder = write_masks(tmp_path / "masks", {3: "frame_4"})
+    with pytest.raises(errors.DatasetError, match=r"frame_4\.png may be numbered from 0 or from 1.*000000\.png"):
+        prepared(capture, tmp_path / "data", masks=folder)
+
+
 def test_pixels_beyond_the_frame_are_unknown_in_masks():
     lens = recordings.make_rig(1, WIDTH, HEIGHT, COEFFICIENTS).lenses[0]
     whole = undistort.undistortion(lens, (WIDTH, HEIGHT), field=1.0)

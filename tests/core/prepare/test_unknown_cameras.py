@@ -90,6 +90,11 @@ def test_lenses_of_other_cameras_are_refused(recordings, tmp_path):
         (["--moving", "drone"], "cameras drone: unknown"),
         (["--distance", "cam0", "cam1", "far"], "--distance: expected metres"),
         (["--board", CHARUCO, "--up", "north"], "--up north: expected cameras, plane, board, or a vector"),
+        (["--words", "mug"], "--words mug: applies to --masks sam3, found --masks none"),
+        (
+            ["--masks", "folder", "--model", "sam"],
+            "--model sam: applies to --masks sam2 and sam3, found --masks folder",
+        ),
     ],
 )
 def test_wrong_options_are_refused(recordings, tmp_path, capsys, arguments, message):
