@@ -3,9 +3,10 @@
 A knot is suspicious if the image error of the body is unusually large there, or if its rotation differs much from the
 rotation that constant spin between its neighbours predicts. Such a knot is registered again (`registration`) from its
 own pose and from the predicted one, and if the error remains large, from rotations of the prediction. The pose of
-least image error is taken; among similar errors, the one nearest to the prediction. After a repair, the neighbours
-become suspicious, so that a series of slipped knots is repaired from its ends. Other knots keep their poses bit for
-bit.
+least image error is taken; among similar errors, the one nearest to the prediction. If the error is unusually large in
+all of them, no pose explains the body, and it keeps its own: a body that bends would otherwise be registered to one of
+its parts at some knots and to another part at others. After a repair, the neighbours become suspicious, so that a
+series of slipped knots is repaired from its ends. Other knots keep their poses bit for bit.
 
 A knot is checked when it enters training, because a fast body is easily lost then, and in some rounds over all knots.
 """
@@ -26,7 +27,7 @@ from .trainer import Trainer
 
 log = logging.getLogger(__name__)
 
-ROUNDS = (0.4, 0.7)  # shares of the run after which all knots are checked
+ROUNDS = (0.45, 0.7)  # shares of the run after which all knots are checked; both follow the trial of residuals
 JUMP = np.radians(8.0)  # angle from the prediction above which a knot is suspicious
 UNUSUAL = 1.5  # image error above which a knot is suspicious, relative to the median over the knots of the body
 CLEARLY = 0.93  # largest image error of a new pose that is accepted, relative to that of the present one
@@ -128,7 +129,8 @@ def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit
         body: Row of the body.
         knot: The knot.
         seen: Knots that may predict it.
-        limit: Picture error above which turns of the prediction are tried.
+        limit: Picture error above which the body is not explained. Turns of the prediction are then tried; if they do
+            not explain it either, it may bend, and keeps its pose.
     """
     look = BodyRegistration(trainer, _tracks(trainer), body, knot, VIEWS)
     predicted = _predictions(trainer, body, knot, seen)
@@ -142,7 +144,7 @@ def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit
     least = min(error for _, error in found)
     near = [pose for pose, error in found if error <= SIMILAR * least]
     best = min(near, key=lambda pose: float(rotations.angle_between(pose[0], predicted[0][0])))
-    better = _apart(best, own) and least < CLEARLY * look.error(own)
+    better = _apart(best, own) and least < min(CLEARLY * look.error(own), limit)
     if better:
         look.write_pose(best)
     return better

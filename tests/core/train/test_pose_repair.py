@@ -60,6 +60,15 @@ def test_a_repair_leaves_other_bodies_alone(trainer):
     assert all(torch.equal(after[name], before[name]) for name in before if not name.startswith("tracks."))
 
 
+def test_a_body_that_no_pose_explains_keeps_its_bits(trainer, monkeypatch):
+    slip(trainer, BRICK, (3,), (0, 0, 1), 40)
+    before = trainer.state().tensors
+    monkeypatch.setattr(pose_repair, "UNUSUAL", 0.01)  # even the true poses have larger errors
+    assert pose_repair.repair(trainer) == 0
+    after = trainer.state().tensors
+    assert all(torch.equal(after[name], before[name]) for name in before)
+
+
 def test_a_sound_track_keeps_its_bits(trainer, monkeypatch):
     monkeypatch.setattr(pose_repair, "JUMP", 1e-9)  # every knot is registered
     monkeypatch.setattr(pose_repair, "CLEARLY", 0.0)  # and found to be right
