@@ -80,7 +80,7 @@ def read(path: Path, kind: type[R5dgsError], remedy: str = _DAMAGED, *, finite: 
             data = stream.read(MAX_BYTES + 1)
     except FileNotFoundError as error:
         raise kind(f"{path}: the file is missing") from error
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
         raise kind(f"{path}: cannot be read ({error})") from error
     return parse(data, str(path), kind, remedy, finite=finite, size=MAX_BYTES)
 

@@ -136,7 +136,7 @@ LATE_MODULES = {
 # Further modules of the core, and what each may import inside functions.
 LATE_IMPORTS = {
     # A layout is detected before numpy is imported.
-    "data.layouts.camera_files": {"data.transforms"},
+    "data.layouts.camera_files": {"data.array_file", "data.transforms"},
     "data.layouts.colmap": {"data.colmap_dataset"},
     # numba is optional, and torch is for gradients and odd dtypes.
     "raster.cpu.backend": {

@@ -31,6 +31,7 @@ CODES: dict[str, Code] = {
     "D22": Code(ERROR, "masks.json damaged", "make the masks again, or remove the file"),
     "D23": Code(ERROR, "key of a camera file out of range", "correct the key"),
     "D24": Code(ERROR, "no training image", "list at least one frame in transforms_train.json"),
+    "D25": Code(ERROR, "invalid points of a reconstruction", "prepare the data set again, or remove points.npy"),
     "D40": Code(WARNING, "image in several splits", "keep it in one; held-out images must not be trained on"),
     "D41": Code(WARNING, "val image outside the observed times", "move it to the test split"),
     "D42": Code(WARNING, "test image not later than the training images", "move it to the val split"),

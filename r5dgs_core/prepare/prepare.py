@@ -14,13 +14,14 @@ from typing import Any
 from .. import errors, folder_lock
 from ..capture.calibration.calibration import Calibration
 from ..data import images
+from ..data.layouts.camera_files import POINTS
 from . import cameras, capture_file, clocks, data_splits, frame_choice, image_size, record, unknown_cameras
 from .cameras import Camera
 from .frame_choice import Choice
 from .plan import IMAGES, Plan, Request
 
 _WRITTEN = (IMAGES, "object_mask", "check", "transforms_train.json", "transforms_val.json", "transforms_test.json")
-_WRITTEN += ("objects.json", capture_file.FILE)
+_WRITTEN += ("objects.json", POINTS, capture_file.FILE)
 Progress = Callable[[dict[str, Any]], None]
 
 
@@ -66,6 +67,7 @@ def prepare(request: Request, progress: Progress) -> Plan:
         plan = _plan(request, opened, calibration, known, progress)
         capture_file.write(out, record.content(plan, identity, finished=False))
         lost = _write_images(plan, out, progress)
+        record.write_points(plan, out)
         record.write_cameras(plan, out, lost)
         capture_file.write(out, record.content(plan, identity, finished=True, lost=lost))
     return plan

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import __version__
+from .. import __version__, atomic_files
 from ..capture.calibration.calibration import Calibration
+from ..data.layouts.camera_files import POINTS
 from ..data.splits import SPLITS
 from ..scene.cameras import OPENGL_TO_OPENCV
 from . import capture_file
@@ -126,6 +128,17 @@ def offsets_of(known: Mapping[str, Any]) -> list[Offset]:
         )
         for camera in known["cameras"]
     ]
+
+
+def write_points(plan: Plan, out: Path) -> None:
+    """Write the points of the reconstruction, from which training starts; remove those of another one."""
+    path, points, colors = out / POINTS, plan.calibration.points, plan.calibration.colors
+    if points is None or colors is None or len(points) == 0:
+        path.unlink(missing_ok=True)
+        return
+    content = io.BytesIO()
+    np.save(content, np.concatenate([points, colors], axis=1))
+    atomic_files.write(path, content.getvalue())
 
 
 def write_cameras(plan: Plan, out: Path, lost: Mapping[str, list[int]]) -> None:

@@ -32,7 +32,7 @@ from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, LookupTa
 from r5dgs_core.scene.scene import Scene
 from r5dgs_core.search import embedding_search, object_search
 from r5dgs_core.train import checkpoint, run_folder
-from tests.fuzz import mutations
+from tests.fuzz import calibration_readers, mutations
 from tests.fuzz.campaign import Files, Reader
 from tests.support import arms, colmap_files, foreign_runs, scenes
 
@@ -661,6 +661,8 @@ READERS: dict[str, Callable[[], Reader]] = {
     "cfg_args": knots_reader,
     "checkpoint": checkpoint_reader,
     "notes": notes_reader,
+    "calibration": lambda: calibration_readers.calibration_reader(made_in),
+    "capture": calibration_readers.capture_reader,
 }
 # Share of the inputs of each reader.
 SHARES = {
@@ -677,4 +679,6 @@ SHARES = {
     "cfg_args": 2,
     "checkpoint": 4,
     "notes": 3,
+    "calibration": 12,
+    "capture": 2,
 }

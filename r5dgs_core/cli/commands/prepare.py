@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +24,7 @@ LONG = (
 EXAMPLE = "VIDEOS --calibration calibration.toml --out DATA"
 PAGE = "user/your_data.md"
 SYNC = ("auto", "audio", "motion", "none")
+NOT_RECORDED = ("D53",)  # findings about the machine, not about the capture
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
@@ -176,6 +178,7 @@ def run_prepare(
     if progress_kind == "auto":
         terminal.print_lines(summary(made))
     _make_masks(made, masks, {"model": model, "words": words}, progress_kind)
+    _check_capture(made, progress_kind)
     return made
 
 
@@ -217,6 +220,23 @@ def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: st
         terminal.print_lines([f"{made.images} masks, {made.objects} objects"])
 
 
+def _check_capture(plan: Plan, progress_kind: str) -> None:
+    """Check the data set, and add the findings to its record."""
+    from ...check import check
+    from ...prepare import capture_file
+
+    out = Path(plan.request.out)
+    found = [one for one in check(out) if one.code not in NOT_RECORDED]
+    capture = capture_file.read(out)
+    assert capture is not None
+    rows = [dataclasses.asdict(one) for one in found]
+    # Places are relative, so that equal commands write equal files into any folder.
+    rows = [{k: v.replace(f"{out}/", "").replace(str(out), ".") for k, v in row.items()} for row in rows]
+    capture_file.write(out, {**capture, "checks": rows})
+    if progress_kind == "auto":
+        terminal.print_lines(map(str, found))
+
+
 def summary(plan: Plan) -> list[str]:
     """Return the lines that describe a prepared data set and the next command."""
     lines = []
@@ -241,7 +261,7 @@ def summary(plan: Plan) -> list[str]:
     seconds = timeline.t_max * timeline.seconds_per_unit
     lines.append(f"{seconds:.2f} s are observed; t_max is {timeline.t_max:.3g}")
     data = shlex.quote(str(plan.request.out))
-    lines.append(f"written: {plan.request.out}. Next: r5dgs check {data}, then r5dgs train {data} --out RUN")
+    lines.append(f"written: {plan.request.out}. Next: r5dgs train {data} --out RUN")
     return lines
 
 

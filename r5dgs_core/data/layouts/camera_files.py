@@ -5,12 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ... import findings
+import numpy as np
+
+from ... import errors, findings
 from .raw_dataset import RawDataset
 from .registry import CAMERAS_FILE
 
 if TYPE_CHECKING:
     from ..transforms import Entry
+
+REMEDY = "prepare the data set again or remove it"
+POINTS = "points.npy"  # points and colours of a reconstruction, world and sRGB in [0, 1]: [P, 6]
 
 
 def detect(root: Path) -> bool:
@@ -43,4 +48,22 @@ def read(root: Path, min_registered: float = 0.0, guard: findings.Guard = findin
             files.append(path)
             with guard():
                 transforms.check_perspective(path, header)
-    return RawDataset(entries, header, root, tuple(files))
+    points = None
+    if (root / POINTS).exists():
+        with guard():
+            points = _points(root / POINTS)
+        files.append(root / POINTS)
+    if points is None:
+        return RawDataset(entries, header, root, tuple(files))
+    return RawDataset(entries, header, root, tuple(files), points[:, :3], points[:, 3:].astype(np.float32))
+
+
+def _points(path: Path) -> np.ndarray:
+    """Read points and colours. [P, 6] float64"""
+    from .. import array_file
+
+    with findings.coded("D25"):
+        points = array_file.read(path, 6, REMEDY)
+        if not np.isfinite(points).all():
+            raise errors.DatasetError(f"{path}: expected finite numbers; {REMEDY}")
+    return points

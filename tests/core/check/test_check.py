@@ -220,6 +220,13 @@ def _(root):
     return cameras_changed(root, lambda content: content.update(frames=[]))
 
 
+@case("D25")
+def _(root):
+    write_flat(root)
+    np.save(root / "points.npy", np.zeros((4, 5)))
+    return root
+
+
 @case("D40")
 def _(root):
     return frame_changed(root, split="test", file_path="./train/r_000")

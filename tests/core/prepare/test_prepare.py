@@ -72,6 +72,13 @@ def test_the_record_has_the_input_and_the_camera_files_have_the_units(data):
     assert top["frames_per_unit"] == pytest.approx(10 * 0.5 / 0.8)
 
 
+def test_the_record_has_the_findings_of_the_check_with_relative_places(data):
+    checks = json.loads((data / "capture.json").read_text())["checks"]
+    assert "D72" in {row["code"] for row in checks}  # the clocks were not compared
+    assert not any(str(data) in value for row in checks for value in row.values())
+    assert {row["severity"] for row in checks} == {"warning"}
+
+
 def test_two_runs_are_equal_bit_for_bit(capture, tmp_path):
     for name in ("one", "two"):
         prepared(capture, tmp_path / name, lines=36)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from .... import errors
-from ....data import file_kinds, images
+from ....data import array_file, file_kinds, images
 from ..calibration import CalibratedCamera, CalibratedFrame, Calibration
 from ..lens import Lens
 from . import numbers
@@ -28,17 +28,14 @@ def detect(path: Path) -> Path | None:
 
 def read(path: Path) -> Calibration:
     """Read the cameras. Raises DatasetError if the file is damaged, or the rows do not fit the files beside it."""
-    try:
-        table = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise errors.DatasetError(f"{path}: damaged, no array of numpy ({error}); copy it again") from error
-    if table.ndim != 2 or table.shape[1] != 17 or not len(table) or table.dtype.kind not in "fiu":
-        raise errors.DatasetError(f"{path}: expected rows of 17 numbers, found {table.dtype} of shape {table.shape}")
+    table = array_file.read(path, 17)
+    if not len(table):
+        raise errors.DatasetError(f"{path}: expected rows of 17 numbers, found none; copy it again")
     if not np.isfinite(table).all():
         raise errors.DatasetError(f"{path}: expected finite numbers in row {int(np.argmin(np.isfinite(table).all(1)))}")
     files = _files(path, len(table))
     cameras = []
-    for index, (row, file) in enumerate(zip(table.astype(np.float64), files, strict=True)):
+    for index, (row, file) in enumerate(zip(table, files, strict=True)):
         place = f"{path}: row {index}"
         down, right, back, center, (height, width, focal) = row[:15].reshape(3, 5).T
         if focal <= 0:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from .... import errors, strict_json
-from ....data import images
+from ....data import array_file, images
 from ..calibration import Calibration
 from ..lens import Lens
 from . import numbers, shots
@@ -107,10 +107,5 @@ def _points(file: Path) -> np.ndarray | None:
     """Return the points of the background, or None if the file is missing or has none."""
     if not file.is_file():
         return None
-    try:
-        points = np.load(file, allow_pickle=False).astype(np.float64)
-    except (OSError, ValueError, EOFError) as error:
-        raise errors.DatasetError(f"{file}: damaged, no array of numpy ({error}); copy it again") from error
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise errors.DatasetError(f"{file}: expected points [P, 3], found shape {points.shape}")
+    points = array_file.read(file, 3)
     return points[np.isfinite(points).all(1)]

@@ -12,10 +12,12 @@ import numpy as np
 
 from .... import errors
 from ....motion import rotations
+from ....scene import cameras
 from ..lens import Lens
 
 MAX_BYTES = 16 << 20  # per TOML, XML or YAML file
 RIGID_TOLERANCE = 1e-3  # of the entries of R R^T - 1
+LONGEST_ROTATION = 1e3  # of a rotation vector, rad
 
 
 def text(path: Path) -> str:
@@ -36,7 +38,7 @@ def toml(path: Path) -> dict[str, Any]:
     """Read a TOML file."""
     try:
         return tomllib.loads(text(path))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # also for whole numbers of too many digits
         raise errors.DatasetError(f"{path}: damaged, not valid TOML: {error}; export the calibration again") from error
 
 
@@ -88,24 +90,38 @@ def pose_of_world_to_camera(place: str, rotation: np.ndarray, shift: np.ndarray)
     """
     matrix = rotation_matrix(place, rotation)
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = matrix.T, -matrix.T @ shift
+    pose[:3, :3], pose[:3, 3] = matrix.T, -matrix.T @ _near(place, shift)
     return pose
 
 
 def pose_of_center(place: str, axes: np.ndarray, center: np.ndarray) -> np.ndarray:
     """Return the camera-to-world matrix of a rotation from camera to world, OpenCV axes [3, 3], and a centre [3]."""
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation_matrix(place, axes), center
+    pose[:3, :3], pose[:3, 3] = rotation_matrix(place, axes), _near(place, center)
     return pose
+
+
+def _near(place: str, position: np.ndarray) -> np.ndarray:
+    """Return a position that is not beyond all reason. [3]"""
+    if not np.abs(position).max() <= cameras.FARTHEST:
+        raise errors.DatasetError(
+            f"{place}: expected a position within {cameras.FARTHEST:g} units, found {position.tolist()!s:.80}; "
+            "calibrate again"
+        )
+    return position
 
 
 def rotation_matrix(place: str, rotation: np.ndarray) -> np.ndarray:
     """Return the rotation matrix that is nearest to a matrix [3, 3], or that of a rotation vector [3].
 
     Raises:
-        DatasetError: The matrix is no rotation.
+        DatasetError: The matrix or vector is no rotation.
     """
     if rotation.size == 3:
+        if not np.abs(rotation).max() <= LONGEST_ROTATION:
+            raise errors.DatasetError(
+                f"{place}: expected a rotation vector in radians, found {rotation.tolist()!s:.80}; calibrate again"
+            )
         return rotations.quats_to_rotmats(rotations.rotvecs_to_quats(rotation.reshape(3)))
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not off < RIGID_TOLERANCE or np.linalg.det(rotation) < 0:

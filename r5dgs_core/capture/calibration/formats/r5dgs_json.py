@@ -1,7 +1,8 @@
 """``r5dgs_cameras.json``, in which `r5dgs prepare` keeps cameras that it reconstructed.
 
 ``cameras`` lists name, size, lens (`Lens`, with the first pixel's centre at 0.5), ``camera_to_world`` with OpenCV axes,
-and the ``frames`` of a moving camera with path, time in seconds, lens and pose.
+and the ``frames`` of a moving camera with path, time in seconds, lens and pose. ``points`` are those of the
+reconstruction, rows of x, y, z in the world and red, green, blue in [0, 1].
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import dataclasses
 import json
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from .... import atomic_files, errors, strict_json
 from ..calibration import CalibratedCamera, CalibratedFrame, Calibration
@@ -27,7 +30,10 @@ def detect(path: Path) -> Path | None:
 
 
 def write(path: Path, calibration: Calibration) -> None:
-    """Write cameras; the points of a reconstruction are left out."""
+    """Write cameras, and the points of the reconstruction."""
+    points: list[list[float]] = []
+    if calibration.points is not None and calibration.colors is not None:
+        points = np.round(np.concatenate([calibration.points, calibration.colors], axis=1), 6).tolist()
     content = {
         "format_version": _VERSION,
         "meters_per_unit": calibration.meters_per_unit,
@@ -50,6 +56,7 @@ def write(path: Path, calibration: Calibration) -> None:
             }
             for camera in calibration.cameras
         ],
+        "points": points,
     }
     with atomic_files.replacing_by_name(path) as temporary:
         Path(temporary).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -72,14 +79,20 @@ def read(path: Path) -> Calibration:
         raise errors.DatasetError(
             f"{path}: 'world_convention': expected blender, colmap or opengl, found {convention!r}"
         )
-    return Calibration(cameras, unit, "r5dgs_json", path, world_convention=convention, seconds_per_time=1.0)
+    points = colors = None
+    if content.get("points"):
+        table = numbers.array(str(path), content, "points", (-1, 6))
+        points, colors = table[:, :3], table[:, 3:].astype(np.float32)
+    return Calibration(cameras, unit, "r5dgs_json", path, convention, 1.0, points, colors)
 
 
 def _camera(place: str, table: Any) -> CalibratedCamera:
     if not isinstance(table, dict) or not isinstance(table.get("name"), str) or not table["name"]:
         raise errors.DatasetError(f"{place}: expected an object with a 'name'; prepare the data set again")
-    frames = []
-    for index, frame in enumerate(table.get("frames") or []):
+    frames, listed = [], table.get("frames", [])
+    if not isinstance(listed, list):
+        raise errors.DatasetError(f"{place}: 'frames': expected a list; prepare the data set again")
+    for index, frame in enumerate(listed):
         at = f"{place}, frame {index}"
         if not isinstance(frame, dict) or not isinstance(frame.get("path"), str):
             raise errors.DatasetError(f"{at}: expected an object with a 'path'; prepare the data set again")

@@ -24,7 +24,8 @@ def pose(seed: int) -> np.ndarray:
 def calibration() -> Calibration:
     frames = tuple(CalibratedFrame(Path(f"{k:06d}.png"), k / 3, LENS, pose(k)) for k in range(3))
     cameras = CalibratedCamera("a", 320, 240, LENS, pose(5)), CalibratedCamera("b", 320, 240, LENS, pose(0), frames)
-    return Calibration(cameras, 0.25, "features", Path(), world_convention="blender")
+    points, colors = np.arange(12.0).reshape(4, 3) / 7, np.full((4, 3), 0.25, np.float32)
+    return Calibration(cameras, 0.25, "features", Path(), "blender", points=points, colors=colors)
 
 
 def test_written_cameras_are_read_again(tmp_path):
@@ -32,6 +33,8 @@ def test_written_cameras_are_read_again(tmp_path):
     r5dgs_json.write(path, calibration())
     found = reading.read_calibration(tmp_path)
     assert (found.format, found.meters_per_unit, found.world_convention) == ("r5dgs_json", 0.25, "blender")
+    np.testing.assert_allclose(found.points, calibration().points, atol=1e-6)
+    np.testing.assert_array_equal(found.colors, calibration().colors)
     for new, old in zip(found.cameras, calibration().cameras, strict=True):
         assert (new.name, new.width, new.height, new.lens) == (old.name, old.width, old.height, old.lens)
         np.testing.assert_allclose(new.camera_to_world, old.camera_to_world, atol=1e-12)
@@ -47,6 +50,7 @@ def test_written_cameras_are_read_again(tmp_path):
         ('"blender"', '"north"', "'world_convention'"),
         ('"brown"', '"barrel"', "unknown lens model 'barrel'"),
         ('"name": "b"', '"name": "A"', "two cameras are named"),
+        ('"points": [\n  [', '"points": [\n  [1, ', "'points': expected"),
         ('"fx": 300.25', '"fx": "wide"', "'fx': expected a finite number"),
     ],
 )
