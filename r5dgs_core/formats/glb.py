@@ -8,8 +8,6 @@ of a node hold the number of its group, object or camera.
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,13 +18,11 @@ from .. import atomic_files, errors
 from ..motion import rotations
 from ..playback import modes
 from ..playback.scene_player import Player, available
-from ..scene import cameras, format_features, motion_words, predictability, scene_json
+from ..scene import cameras, predictability
 from ..scene.scene import MotionGroup, Scene
-from ..scene.stored_embeddings import StoredEmbeddings
-from ..search import embedding_search
-from . import glb_motion, glb_splats, gltf, registry, scene_nodes
+from . import glb_motion, glb_splats, gltf, registry, scene_nodes, scene_notes
 
-FORMAT_NAME, FORMAT_VERSION = "r5dgs glb", 1
+KIND = scene_notes.Kind("r5dgs glb", 1, "r5dgs export --to glb")
 ELSEWHERE = ", in other programs"  # end of sentences about losses that our own programs do not have
 _Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from Blender's z up
 
@@ -54,7 +50,7 @@ def build(scene: Scene, options: registry.Options) -> tuple[dict[str, Any], gltf
     up, size = _Y_UP @ cameras.WORLD_TO_BLENDER[scene.world_convention], scene.units.meters_per_unit
     scale = {} if size is None else {"scale": [size] * 3}
     root = tree.add(scene.name, None, rotation=_xyzw(up), **scale, children=tree.roots)
-    extras = _extras(scene, end) | {"modes": [mode for mode, _ in played], "lost": losses(scene)}
+    extras = scene_notes.of(scene, end, KIND) | {"modes": [mode for mode, _ in played], "lost": losses(scene)}
     content = {
         "asset": {"version": "2.0", "generator": "r5dgs"},
         "extensionsUsed": [glb_splats.EXTENSION],
@@ -161,36 +157,6 @@ def _add_cameras(scene: Scene, tree: _Nodes) -> None:
         extras = {"r5dgs": {"camera": number}}
         name = f"camera {camera.name or number}"
         tree.roots.append(tree.add(name, None, translation=place, rotation=turn, camera=number, extras=extras))
-
-
-def _extras(scene: Scene, end: float) -> dict[str, Any]:
-    """Content of ``extras.r5dgs``, for our own programs: entries of ``scene.json``, times, sky, words."""
-    bare = dataclasses.replace(scene, provenance={}, needs=(), vocabulary=(), lookup=None, hulls=())
-    head = {"format": FORMAT_NAME, "format_version": FORMAT_VERSION, "scene_version": format_features.version(bare)}
-    tree = json.loads(scene_json.dump(bare, head | format_features.to_json(bare)))
-    outlooks = predictability.outlooks(scene)
-    for item in tree["objects"]:
-        groups = [group for group in scene.groups if group.object_id == item["id"] and group.role == "body"]
-        item["motion"] = motion_words.motion_of(scene, groups)
-        item["prediction"] = outlooks[item["id"]].prediction()
-    return tree | {
-        "track_times": scene.tracks.times.tolist(),
-        "end": float(end),
-        "background_sh": scene.background_sh.astype(np.float64).tolist(),
-        "words": _words(scene),
-    }
-
-
-def _words(scene: Scene) -> list[list[Any]]:
-    """Stored words, each with the objects that it matches by meaning: id, score and cosine."""
-    embeddings = StoredEmbeddings.of(scene)
-    if embeddings is None:
-        return []
-    found = []
-    for word, query in zip(embeddings.vocabulary, embeddings.vocabulary_embeddings, strict=True):
-        answers = [one for one in embedding_search.ask(embeddings, query) if one.score >= embedding_search.PASS]
-        found.append([word, [[one.object_id, one.score, one.cosine] for one in answers if one.object_id >= 0]])
-    return found
 
 
 def _xyzw(rotation: np.ndarray) -> list[float]:

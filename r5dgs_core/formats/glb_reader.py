@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import __version__
 from ..motion import joint as joints
 from ..motion import rotations
 from ..playback import group_dynamics
-from ..scene import format_features, scene_json, validation
-from ..scene.json_row import Row
-from ..scene.scene import Gaussians, MotionGroup, Scene, SceneObject, Shading, Tracks
+from ..scene.scene import Gaussians, MotionGroup, Scene
 from ..scene.units import Units
-from . import glb, glb_motion, glb_splats, gltf
+from . import glb, glb_motion, glb_splats, gltf, scene_notes
 
 _MODE = "rigid"
 
@@ -29,47 +25,16 @@ def read(path: str | Path) -> Scene:
     ``extras.r5dgs``.
     """
     content = gltf.read(path)
-    top = _extras(content)
-    fields = scene_json.fields(top)
-    version = {"format_version": top.get("scene_version", int)}
-    features = Row(top.data | version, top.place)
-    format_features.check(features.data, top.place)
-    fields |= format_features.fields(features)
-    groups, times = fields["groups"], top.numbers("track_times", (len(top.get("track_times", list)),))
-    if len(times) == 0 or [group.id for group in groups] != list(range(len(groups))):
-        raise content.error("extras.r5dgs: expected observed times, and groups that are numbered from 0")
-    gaussians, shading = _gaussians(content, groups)
-    light = fields.pop("light_direction")
-    scene = Scene(
-        **fields
-        | {
-            "gaussians": gaussians,
-            "objects": _objects(fields["objects"], gaussians.object_ids),
-            "tracks": Tracks(times, _tracks(content, groups, times, fields["units"])),
-            "background_sh": np.asarray(_sky(top), np.float32),
-            "shading": None if shading is None or light is None else _shading(shading, light),
-            "provenance": {
-                "imported": {"layout": glb.FORMAT_NAME, "file": str(path)},
-                "versions": {"r5dgs": __version__},
-            },
-        }
-    )
-    scene = dataclasses.replace(scene, groups=tuple(_with_anchor(scene, group) for group in groups))
-    validation.check(scene, content.place)
-    return scene
-
-
-def _extras(content: gltf.Content) -> Row:
     scenes = content.items("scenes")
-    notes = scenes[0].get("extras") if scenes else None
-    found = notes.get("r5dgs") if isinstance(notes, dict) else None
-    if not isinstance(found, dict) or found.get("format") != glb.FORMAT_NAME:
-        raise content.error("expected a file of 'r5dgs export --to glb', found none of its extras")
-    if found.get("format_version") != glb.FORMAT_VERSION:
-        wanted = f"expected format_version {glb.FORMAT_VERSION}, found {found.get('format_version')!r:.60}"
-        raise content.error(f"extras.r5dgs: {wanted}; update R5DGS")
-    empty = {"vocabulary": [], "needs": [], "provenance": {}}
-    return Row(found | empty, f"{content.place}: extras.r5dgs")
+    extras = scenes[0].get("extras") if scenes else None
+    notes = extras.get("r5dgs") if isinstance(extras, dict) else None
+    return scene_notes.to_scene(
+        scene_notes.row(notes, glb.KIND, f"{content.place}: extras.r5dgs"),
+        glb.KIND,
+        str(path),
+        lambda groups: _gaussians(content, groups),
+        lambda groups, times, units: _tracks(content, groups, times, units),
+    )
 
 
 def _tagged(content: gltf.Content, key: str) -> list[tuple[int, dict[str, Any], dict[str, Any]]]:
@@ -112,13 +77,6 @@ def _gaussians(content: gltf.Content, groups: Sequence[MotionGroup]) -> tuple[Ga
     return Gaussians(**joined | arrays), vectors
 
 
-def _objects(table: Sequence[SceneObject], ids: np.ndarray) -> tuple[SceneObject, ...]:
-    """Table with the ranges of the Gaussians that the file holds."""
-    starts, stops = (np.searchsorted(ids, [item.id for item in table], side=side) for side in ("left", "right"))
-    rows = zip(table, starts.tolist(), stops.tolist(), strict=True)
-    return tuple(dataclasses.replace(item, start=start, count=stop - start) for item, start, stop in rows)
-
-
 def _tracks(content: gltf.Content, groups: Sequence[MotionGroup], times: np.ndarray, units: Units) -> np.ndarray:
     """Poses of all groups at the observed times, in the world. [G, S, 7]"""
     found = [item for item in content.items("animations") if item.get("name") == _MODE]
@@ -153,20 +111,3 @@ def _parts(content: gltf.Content, groups: Sequence[MotionGroup]) -> list[tuple[M
         return group_dynamics.parts_of(groups)
     except ValueError as error:
         raise content.error(str(error)) from error
-
-
-def _sky(top: Row) -> np.ndarray:
-    return top.numbers("background_sh", (len(top.get("background_sh", list)), 3))
-
-
-def _shading(columns: np.ndarray, light: np.ndarray) -> Shading:
-    rest = columns[:, 3]
-    return Shading(columns[:, :3].copy(), light, rest.copy() if (rest != 1).any() else None)
-
-
-def _with_anchor(scene: Scene, group: MotionGroup) -> MotionGroup:
-    """Group with a representative among the Gaussians that the file holds."""
-    rows = np.flatnonzero(scene.gaussians.motion_ids == group.id)
-    if len(rows) and not (0 <= group.anchor_index < len(scene.gaussians.means) and group.anchor_index in rows):
-        return dataclasses.replace(group, anchor_index=group_dynamics.representative(scene, rows))
-    return group if len(rows) else dataclasses.replace(group, anchor_index=-1)
