@@ -24,7 +24,9 @@ def check_run(folder: Path) -> None:
 def check_foreign_run(folder: Path) -> None:
     """Raise `CheckpointError` if a path is not a folder; the importer checks its layout."""
     if not _holds(folder.is_dir):
-        raise errors.CheckpointError(f"{folder}: expected a run folder or a .glb file, found {_found(folder)}")
+        raise errors.CheckpointError(
+            f"{folder}: expected a run folder, or a .glb or .4dgs file, found {_found(folder)}"
+        )
 
 
 def check_scene(path: Path) -> None:

@@ -167,7 +167,7 @@ LATE_IMPORTS = {
 # The same of the add-on: OpenImageIO is optional there.
 LATE_ADDON_IMPORTS = {"capture.files": {"data.images"}}
 # Packages that rooms of the light tier may import inside functions, for files of other programs.
-LATE_PACKAGES = {"formats": {"pxr"}}
+LATE_PACKAGES = {"formats": {"fourdgs", "gsply", "pxr"}}
 # Which rooms of the add-on a room may import, itself aside, lower rooms first.
 ADDON_ALLOWED = {
     "compat": set(),

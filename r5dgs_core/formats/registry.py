@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,9 @@ MODULES = {  # module of this room that defines `FORMAT`, by the name of the for
     "glb": "glb",
     "html": "html",
     "usd": "usd",
+    "4dgs": "fourdgs_file",
+    "spz": "spz",
+    "sog": "sog",
     "poses": "poses",
     "poses_csv": "poses_csv",
     "tum": "tum",
@@ -65,6 +69,8 @@ class Format:
         losses: Returns sentences about the parts of a given scene that a file does not hold.
         extra: Extra of ``pip install r5dgs[extra]`` that it needs, or None.
         packages: Packages of the extra that `write` imports.
+        program: Program that `write` runs, or None.
+        remedy: Command that installs the program.
     """
 
     name: str
@@ -82,6 +88,8 @@ class Format:
     losses: Callable[[Scene], list[str]] = lambda scene: []
     extra: str | None = None
     packages: tuple[str, ...] = ()
+    program: str | None = None
+    remedy: str = ""
 
     @property
     def summary(self) -> str:
@@ -90,6 +98,8 @@ class Format:
 
     def why_unavailable(self) -> str | None:
         """Return the reason and the remedy if this Python cannot write the format, else None."""
+        if self.program is not None and shutil.which(self.program) is None:
+            return f"{self.label} ({self.suffix}): {self.program} is not installed; remedy: {self.remedy}"
         missing = [name for name in self.packages if importlib.util.find_spec(name) is None]
         if not missing:
             return None

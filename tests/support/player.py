@@ -32,6 +32,14 @@ def validate(*paths: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in lines]
 
 
+def splat_transform() -> Path:
+    """Folder of the program splat-transform; skips the test without the player's packages."""
+    node()
+    if not (MODULES / ".bin" / "splat-transform").exists():
+        pytest.skip("splat-transform is not installed; remedy: npm --prefix player ci --ignore-scripts")
+    return MODULES / ".bin"
+
+
 class Browser:
     """Headless Chromium with software WebGL, driven by ``player/tests/drive.mjs``."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +22,13 @@ LONG = (
 EXAMPLE = "OUTPUT --data DATA --out scene.r5dgs"
 PAGE = "user/import.md"
 
-GLB = ".glb"
+FILES = {".glb": "glb_reader", ".4dgs": "fourdgs_reader"}  # module of `formats` that reads a file, by its suffix
 WORLDS = ("blender", "colmap", "opengl")  # of `scene.cameras`
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    p.add_argument("run", type=Path, help="run folder of the other program, or .glb file")
+    p.add_argument("run", type=Path, help="run folder of the other program, or .glb or .4dgs file")
     p.add_argument("--out", type=Path, required=True, metavar="FILE.r5dgs", help="scene file to write")
     p.add_argument("--iteration", type=options.at_least(0), metavar="N", help="iteration to read (default: last)")
     data = "data set of the run, which provides cameras, times and axes"
@@ -49,10 +50,10 @@ def run(args: argparse.Namespace) -> None:
 
 @folder_lock.writes("out")
 def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **fields: Any) -> None:
-    """Convert a run folder of another program (see `importing.importer.import_run`) or a .glb file to a scene file.
+    """Convert a run folder of another program (`importing.importer.import_run`), or an exported file, to a scene file.
 
     Args:
-        run_folder: Run folder of the other program, or file of ``r5dgs export --to glb``.
+        run_folder: Run folder of the other program, or file of ``r5dgs export --to glb`` or ``4dgs``.
         out: Scene file to write.
         progress_kind: Form of progress output (`progress.make`).
         **fields: Fields of `importing.importer.Options`; all None for a file.
@@ -62,7 +63,7 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **fi
     """
     input_paths.check_scene_output(out)
     given = {name: value for name, value in fields.items() if value is not None}
-    is_file = run_folder.suffix.lower() == GLB and run_folder.is_file()
+    is_file = run_folder.suffix.lower() in FILES and run_folder.is_file()
     if is_file and given:
         option = f"--{next(iter(given)).replace('_', '-')}"
         raise errors.UsageError(f"{option}: applies to run folders only, and {run_folder} is a file; leave it out")
@@ -85,9 +86,7 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **fi
 
 
 def _read_file(path: Path) -> Scene:
-    from ...formats import glb_reader
-
-    return glb_reader.read(path)
+    return importlib.import_module(f"...formats.{FILES[path.suffix.lower()]}", __package__).read(path)
 
 
 def _convert(run_folder: Path, given: dict[str, Any], progress: Any) -> Scene:

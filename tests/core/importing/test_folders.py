@@ -159,9 +159,9 @@ def test_the_last_complete_iteration_is_read_unless_another_is_named(deformed):
 
 
 def test_each_unusable_run_folder_is_refused_with_its_reason(tmp_path, deformed):
-    with pytest.raises(CheckpointError, match="expected a run folder or a .glb file, found nothing"):
+    with pytest.raises(CheckpointError, match="expected a run folder, or a .glb or .4dgs file, found nothing"):
         run_folder.open_run(tmp_path / "nowhere")
-    with pytest.raises(CheckpointError, match="expected a run folder or a .glb file, found a file"):
+    with pytest.raises(CheckpointError, match="expected a run folder, or a .glb or .4dgs file, found a file"):
         run_folder.open_run(deformed / "cfg_args")
     empty = tmp_path / "empty"
     empty.mkdir()

@@ -1,0 +1,176 @@
+"""Scenes as 4dgs files: the Object Table names what moves together, SE(3) tracks move it (docs/reference/4dgs.md).
+
+The Gaussians are those of t_max. Each piece of a scene that moves, or belongs to an object, is an object of the file;
+static Gaussians of the background are 0. A track maps the world at t_max to the world at a time, x' = R x + T.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import atomic_files, errors, extras
+from ..motion import rotations
+from ..playback import group_curves, played_splats
+from ..playback.group_dynamics import GroupMotion
+from ..playback.scene_player import Player, available
+from ..scene import predictability, spherical_harmonics
+from ..scene.scene import Scene
+from ..scene.splats import Splats, to_opacities
+from . import glb_motion, linear_times, registry, scene_nodes, scene_notes
+
+EXTRA, PACKAGE = "export", "fourdgs"
+KIND = scene_notes.Kind("r5dgs 4dgs", 1, "r5dgs export --to 4dgs")
+NOTES = "r5dgs"  # key of the header's attributes
+LOW, HIGH = -4.0, 4.0  # range of harmonics of degree 1 and more
+_ROUNDING = 1 / 510  # of stored colours
+_XYZW = [1, 2, 3, 0]
+_UP = {"blender": "z-up-right-handed", "colmap": "y-down-right-handed", "opengl": "y-up-right-handed"}
+
+
+def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
+    """Write a scene with its motion. Implements `registry.Format.write`."""
+    with extras.required("4dgs files", EXTRA):
+        import fourdgs
+    pieces = scene_nodes.pieces(scene, options.object_ids)
+    start = float(scene.tracks.times[0])
+    end = max(scene.t_max, predictability.horizon(scene) if options.until is None else options.until)
+    ids = {(piece.object_id, piece.group): number for number, piece in enumerate(_numbered(pieces), 1)}
+    rows = np.concatenate([np.arange(piece.rows.start, piece.rows.stop) for piece in pieces])
+    members = np.concatenate([np.full(p.rows.stop - p.rows.start, ids.get(p[1:], 0)) for p in pieces])
+    splats = played_splats.at(Player(scene), scene.t_max)
+    gaussians = _gaussians(fourdgs, Splats(**{f: getattr(splats, f)[rows] for f in _FIELDS}), members)
+    moving = {group: _track(scene, group, end) for group in {piece.group for piece in pieces} - {0}}
+    names = {item.id: item.name for item in scene.objects}
+    layer = fourdgs.ObjectLayer(
+        table=fourdgs.ObjectTable(
+            entries=[
+                fourdgs.ObjectTableEntry(object_id=k, label=names[o], anchor=tuple(scene.groups[g].home.tolist()))
+                for (o, g), k in ids.items()
+            ]
+        ),
+        tracks=[
+            fourdgs.ObjectTrack(object_id=k, times=times, rotations=turns, translations=moves)
+            for (_, g), k in ids.items()
+            if g in moving
+            for times, turns, moves in [moving[g]]
+        ],
+    )
+    settings = fourdgs.WriteOptions(profile="fine", objects=layer, metadata=_attributes(scene, end, ids))
+    duration = glb_motion.seconds_per_unit(scene.units) * (end - start)
+    try:
+        with atomic_files.replacing_by_name(path) as temporary:
+            fourdgs.write(str(temporary), gaussians, duration, options=settings)
+    except (OSError, fourdgs.FourdgsError) as error:
+        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
+    yield path
+
+
+_FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+
+def _numbered(pieces: list[scene_nodes.Piece]) -> list[scene_nodes.Piece]:
+    """Pieces with an id of their own: all but static Gaussians of the background."""
+    return [piece for piece in pieces if piece.group or piece.object_id]
+
+
+def _gaussians(fourdgs: Any, splats: Splats, members: np.ndarray) -> Any:
+    """The Gaussians as ``fourdgs.GaussianSet``, visible at all times."""
+    count, degree = len(splats.means), int(np.sqrt(splats.sh.shape[1])) - 1
+    rgb = spherical_harmonics.dc_to_rgb(splats.sh[:, 0].astype(np.float64)).clip(0, 1)
+    zeros = np.zeros(count, np.float32)
+    stored = np.rint((splats.sh[:, 1:] - LOW) / (HIGH - LOW) * 255).clip(0, 255).astype(np.uint8)
+    return fourdgs.GaussianSet(
+        positions=splats.means,
+        scales=np.exp(splats.log_scales),
+        rotations=splats.quats[:, _XYZW],
+        colors=np.concatenate([rgb, to_opacities(splats.opacity_logits)[:, None]], axis=1).astype(np.float32),
+        motions=np.zeros((count, 3), np.float32),
+        mu_t=zeros,
+        sigma_t=zeros + np.inf,
+        win_lo=np.zeros(count),
+        win_hi=np.full(count, np.inf),
+        sh=stored.transpose(0, 2, 1).reshape(count, -1) if degree else None,
+        sh_degree=degree,
+        object_id=members.astype(np.int64),
+    )
+
+
+def _track(scene: Scene, group: int, end: float) -> tuple[list[float], list[list[float]], list[list[float]]]:
+    """Seconds since the first observed time, rotations xyzw and translations of a group's track."""
+    motion, pivot = GroupMotion(scene), scene.groups[group].pivot
+
+    def sample(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        poses = [motion.poses(t) for t in times.tolist()]
+        quats, moves = np.array([q[group] for q, _ in poses]), np.array([d[group] for _, d in poses])
+        return quats, pivot + moves - rotations.rotate(quats, pivot)
+
+    first, number, reaches = np.asarray(scene.tracks.times), group, group_curves.reaches(scene)
+    while True:  # keys of the group and of those that carry it
+        curves = group_curves.curves(scene, number, end, float(reaches[number]))
+        first = np.union1d(first, np.concatenate([curves.location.times, curves.rotation.times]))
+        parent = scene.groups[number].parent
+        if parent is None:
+            break
+        number = parent
+    members = scene.gaussians.means[scene.gaussians.motion_ids == group]
+    reach = float(np.linalg.norm(members, axis=-1).max())  # the track turns about the origin
+    times = linear_times.refine(sample, first, linear_times.TOLERANCE * scene.extent, reach)
+    quats, moves = sample(times)
+    seconds = glb_motion.seconds_per_unit(scene.units) * (times - scene.tracks.times[0])
+    return seconds.tolist(), quats[:, _XYZW].tolist(), moves.tolist()
+
+
+def _attributes(scene: Scene, end: float, ids: dict[tuple[int, int], int]) -> dict[str, str]:
+    """Attributes of the header: conventions by the names of the library, and notes for our own programs."""
+    plain = dataclasses.replace(scene, shading=None, residuals=None, dynamics=None)
+    notes = scene_notes.of(plain, end, KIND) | {"pieces": [[k, o, g] for (o, g), k in ids.items()]}
+    size = scene.units.meters_per_unit
+    return {
+        "coordinate_system": _UP[scene.world_convention],
+        "color_space": "srgb-rec709-display",
+        **({} if size is None else {"meters_per_unit": repr(size)}),
+        NOTES: json.dumps(notes, separators=(",", ":"), allow_nan=False),
+    }
+
+
+def losses(scene: Scene) -> list[str]:
+    """Parts of this scene that a file does not hold, or that only our own programs read, as sentences."""
+    found = []
+    if scene.residuals is not None and len(scene.residuals.rows):
+        found.append(f"{len(scene.residuals.rows)} Gaussians bend: written as at t_max, they move rigidly")
+    if available(scene, "standard"):
+        found.append("motion of single Gaussians past t_max (modes standard and hybrid)")
+    if scene.shading is not None:
+        found.append("colours other than those of t_max")
+    dc = spherical_harmonics.dc_to_rgb(played_splats.at(Player(scene), scene.t_max).sh[:, 0])
+    outside = int(((dc < -_ROUNDING) | (dc > 1 + _ROUNDING)).any(1).sum())
+    if outside:
+        found.append(f"{outside} Gaussians have mean colours outside [0, 1], which are clipped")
+    clipped = int((np.abs(scene.gaussians.sh[:, 1:]) > HIGH).any((1, 2)).sum())
+    if clipped:
+        found.append(f"{clipped} Gaussians have harmonics beyond {HIGH:g}, which are clipped")
+    if len(scene.background_sh) > 1 or scene.background_sh.any():
+        found.append("the sky, in other programs")
+    if scene.gaussians.identities is not None:
+        found.append("identity encodings and their classifier")
+    return found
+
+
+FORMAT = registry.Format(
+    name="4dgs",
+    label="4DGS",
+    suffix=".4dgs",
+    keeps="objects with their tracks, Gaussians with harmonics (quantised), cameras, names, motion models and bands",
+    loses="bending of Gaussians, changing shading, modes other than rigid, encodings, embeddings, provenance",
+    write=export,
+    has_motion=True,
+    losses=losses,
+    extra=EXTRA,
+    packages=(PACKAGE,),
+)

@@ -1,0 +1,81 @@
+"""Gaussians as SPZ files of Niantic: one time, quantised, world x right, y up, z back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from .. import atomic_files, errors, extras
+from ..playback import played_splats
+from ..playback.scene_player import Player
+from ..scene import cameras
+from ..scene.scene import Scene
+from . import registry, turned_splats
+
+EXTRA, PACKAGE = "export", "gsply"
+_STEPS = (1 << 23) - 1  # largest fixed-point position
+_MOST_BITS = 20  # fraction of a position
+_DC = 127.5 / (0.15 * 255)  # largest stored coefficient of degree 0, and of the others
+_SH = 127 / 128
+_LOG_SCALES = (-10.0, 5.9375)
+
+
+def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
+    """Write the Gaussians at each time. Implements `registry.Format.write`."""
+    with extras.required("SPZ files", EXTRA):
+        import gsply
+    player = Player(scene)
+    axes = cameras.WORLD_TO_BLENDER["opengl"].T @ cameras.WORLD_TO_BLENDER[scene.world_convention]
+    for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
+        splats = turned_splats.turned(played_splats.at(player, t, options.object_ids), axes)
+        if len(splats.means) == 0:
+            raise errors.ConfigError(f"{scene.name}: expected Gaussians to export, found none in the selected objects")
+        content = gsply.GSData(
+            means=splats.means,
+            scales=splats.log_scales,
+            quats=splats.quats,
+            opacities=splats.opacity_logits,
+            sh0=np.ascontiguousarray(splats.sh[:, 0]),
+            shN=np.ascontiguousarray(splats.sh[:, 1:]),
+        )
+        farthest = max(float(np.abs(splats.means).max()), 2.0**-_MOST_BITS)
+        bits = min(math.floor(math.log2(_STEPS / farthest)), _MOST_BITS)
+        if bits < 0:
+            raise errors.SceneFileError(f"{target}: SPZ holds positions up to {_STEPS}, found {farthest:g}")
+        try:
+            with atomic_files.replacing_by_name(target) as temporary:
+                gsply.write_spz(temporary, content, fractional_bits=bits)
+        except OSError as error:
+            raise errors.SceneFileError(f"{target}: cannot be written: {error}") from error
+        yield target
+
+
+def losses(scene: Scene) -> list[str]:
+    """Parts of this scene that a file does not hold, as sentences; values are those of t_max."""
+    splats = played_splats.at(Player(scene), scene.t_max)
+    wrong = (np.abs(splats.sh[:, 0]) > _DC).any(-1) | (np.abs(splats.sh[:, 1:]) > _SH).any((1, 2))
+    low, high = _LOG_SCALES
+    sizes = ((splats.log_scales < low) | (splats.log_scales > high)).any(-1)
+    found = []
+    if wrong.any():
+        found.append(f"{int(wrong.sum())} Gaussians have colours beyond the range of SPZ, which are clipped")
+    if sizes.any():
+        found.append(f"{int(sizes.sum())} Gaussians have sizes beyond the range of SPZ, which are clipped")
+    return found
+
+
+FORMAT = registry.Format(
+    name="spz",
+    label="Compressed Gaussians",
+    suffix=".spz",
+    keeps="Gaussians of one time with their shading (quantised), y up; one file per frame",
+    loses="motion between frames, objects, names, sky, cameras",
+    write=export,
+    per_frame=True,
+    losses=losses,
+    extra=EXTRA,
+    packages=(PACKAGE,),
+)
