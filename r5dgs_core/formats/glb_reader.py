@@ -26,8 +26,8 @@ def read(path: str | Path) -> Scene:
     """
     content = gltf.read(path)
     scenes = content.items("scenes")
-    extras = scenes[0].get("extras") if scenes else None
-    notes = extras.get("r5dgs") if isinstance(extras, dict) else None
+    found = scenes[0].get("extras") if scenes else None
+    notes = found.get("r5dgs") if isinstance(found, dict) else None
     return scene_notes.to_scene(
         scene_notes.row(notes, glb.KIND, f"{content.place}: extras.r5dgs"),
         glb.KIND,

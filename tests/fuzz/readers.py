@@ -21,7 +21,7 @@ from r5dgs_core import errors
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset, images, mask_notes, masks
 from r5dgs_core.data.layouts import colmap
-from r5dgs_core.formats import glb, glb_reader, ply, registry
+from r5dgs_core.formats import fourdgs_file, fourdgs_reader, glb, glb_reader, ply, registry
 from r5dgs_core.importing import importer, weights
 from r5dgs_core.language.encoders import encoder_base
 from r5dgs_core.playback import scene_info, scene_player
@@ -627,6 +627,18 @@ def glb_reader_of_scenes() -> Reader:
     return Reader("glb", make, read)
 
 
+def fourdgs_reader_of_scenes() -> Reader:
+    """4dgs files of scenes."""
+    with tempfile.TemporaryDirectory() as folder:
+        (path,) = fourdgs_file.export(rich_scene(), Path(folder, "a.4dgs"), registry.Options((0.0,)))
+        base = path.read_bytes()
+
+    def read(folder: Path) -> None:
+        use_scene(fourdgs_reader.read(folder / "a.4dgs"), folder / "again.r5dgs")
+
+    return Reader("4dgs", lambda random: {"a.4dgs": mutations.data(random, base)}, read)
+
+
 def notes_reader() -> Reader:
     """JSON beside other files: configurations of encoders, and the evaluation of a scene."""
     scene = scenes.make_scene(n=COUNT)
@@ -651,6 +663,7 @@ READERS: dict[str, Callable[[], Reader]] = {
     "scene": scene_reader,
     "ply": ply_reader,
     "glb": glb_reader_of_scenes,
+    "4dgs": fourdgs_reader_of_scenes,
     "dataset": dataset_reader,
     "colmap": colmap_reader,
     "image": image_reader,
@@ -669,6 +682,7 @@ SHARES = {
     "scene": 32,
     "ply": 8,
     "glb": 8,
+    "4dgs": 1,
     "dataset": 8,
     "colmap": 8,
     "image": 5,

@@ -73,6 +73,16 @@ def test_the_format_of_the_developers_page_appears_in_blender(blender, loaded, c
     assert (tmp_path / "a.csv").read_bytes() == wanted.read_bytes()
 
 
+@pytest.mark.parametrize(("name", "suffix"), [("poses", "json"), ("tum", "txt"), ("glb", "glb"), ("usd", "usd")])
+def test_formats_with_motion_or_poses_are_written(blender, loaded, tmp_path, name, suffix):
+    if (reason := registry.get(name).why_unavailable()) is not None:
+        pytest.skip(reason)
+    path = tmp_path / f"a.{suffix}"
+    assert blender.ops.r5dgs.export_format(format=name, filepath=str(path), frames="RANGE") == {"FINISHED"}
+    found = sorted(tmp_path.glob(f"a*.{suffix}"))
+    assert len(found) == (3 if name == "tum" else 1) and all(one.stat().st_size for one in found)
+
+
 def test_without_the_format_there_is_no_button(blender, loaded, tmp_path, monkeypatch):
     monkeypatch.delitem(registry.MODULES, "csv", raising=False)
     said = drawn(blender)
@@ -138,7 +148,8 @@ def test_a_format_whose_package_is_missing_is_disabled_with_the_reason(blender, 
     enabled = []
     collected = property(fset=lambda row, value: enabled.append(value))
     monkeypatch.setattr(layouts.Layout, "enabled", collected, raising=False)
-    assert "Centers (.csv)" in drawn(blender) and enabled == [True] * (len(registry.MODULES) - 1) + [False]
+    usable = [registry.get(name).why_unavailable() is None for name in registry.MODULES]
+    assert "Centers (.csv)" in drawn(blender) and enabled == usable and not usable[-1] and any(usable)
     reason = "no_such_package is not installed; remedy: pip install 'r5dgs[tables]'"
     assert reason in tooltip(blender, csv)
     with pytest.raises(RuntimeError) as refused:
