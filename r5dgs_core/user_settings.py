@@ -10,13 +10,16 @@ import os
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 from . import atomic_files
 from .errors import ConfigError, UsageError
 
+LPIPS = "metrics.lpips_weights"
 MEANINGS = {
     "encoder": "folder of the text and image encoder, or 'text' (lookup and query --encoder)",
     "sam2": "folder of the SAM2 weights (masks --model)",
+    LPIPS: f"files of the LPIPS weights, separated by {os.pathsep!r} (evaluate, bench and report --lpips)",
     "worker_python": "Python program with r5dgs_core that Blender starts as worker",
 }
 
@@ -56,6 +59,7 @@ def read() -> dict[str, str]:
         found = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:  # the message has line and column
         raise ConfigError(f"{place}: not valid TOML: {error}; correct or remove the file") from None
+    found = _flat(found)
     for key, value in found.items():
         if key not in MEANINGS or not isinstance(value, str):
             expected = "text in quotes" if key in MEANINGS else f"one of the keys {', '.join(MEANINGS)}"
@@ -89,6 +93,14 @@ def write(key: str, value: str) -> Path:
     return place
 
 
+def _flat(content: dict[str, Any]) -> dict[str, Any]:
+    """Return a table with keys "section.key" for the tables in it."""
+    found: dict[str, Any] = {}
+    for key, value in content.items():
+        found |= {f"{key}.{name}": one for name, one in value.items()} if isinstance(value, dict) else {key: value}
+    return found
+
+
 def _quoted(text: str) -> str:
     """Return a TOML string, which unlike JSON also escapes DEL."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
@@ -97,6 +109,12 @@ def _quoted(text: str) -> str:
 def _checked(key: str, value: str) -> str:
     if (key, value) == ("encoder", "text"):
         return value
+    if key == LPIPS:
+        files = [Path(name).expanduser().absolute() for name in value.split(os.pathsep)]
+        missing = next((file for file in files if not file.is_file()), None)
+        if missing is not None:
+            raise ConfigError(f"config --user set {key}: {missing}: expected a file, found none")
+        return os.pathsep.join(map(str, files))
     # absolute(), not resolve(): the Python of a virtual environment is a link that must not be followed.
     place = Path(value).expanduser().absolute()
     wanted = place.is_file() if key == "worker_python" else place.is_dir()
@@ -110,6 +128,6 @@ def _checked(key: str, value: str) -> str:
 def _line(text: str, key: str) -> int:
     """Return the number of the line that sets a key or opens the table of that name; 1 if not found."""
     for number, line in enumerate(text.splitlines(), 1):
-        if line.lstrip(" \t[\"'").startswith(key):
+        if line.lstrip(" \t[\"'").startswith(key.partition(".")[0]):
             return number
     return 1

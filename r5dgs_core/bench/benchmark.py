@@ -13,7 +13,7 @@ from .. import terminal
 from ..bake import bake
 from ..data import dataset as datasets
 from ..errors import CheckpointError, R5dgsError, TrainingError
-from ..evaluation import evaluate
+from ..evaluation import evaluate, lpips
 from ..playback import scene_player
 from ..progress import make as make_progress
 from ..render import machine as machines
@@ -47,6 +47,8 @@ def run_bench(plan: BenchmarkRequest, *, remeasure: bool = False, progress_kind:
         Interrupted: SIGINT or SIGTERM was received; the same command resumes the benchmark.
     """
     planned = cases.make(plan)
+    if plan.lpips:
+        lpips.load(plan.lpips)  # reports damaged files before hours of training
     records: list[dict[str, Any]] = []
     failures: list[dict[str, Any]] = []
     result: dict[str, Any] = {}
@@ -88,7 +90,7 @@ def run_case(plan: BenchmarkRequest, case: Case, remeasure: bool, progress: Prog
         measured = {"checkpoint": stamp, "modes": {}}
     lacking = [mode for mode in plan.modes if mode not in measured["modes"] and mode not in measured.get("absent", [])]
     if lacking:
-        measured = _measure(case, measured, plan.modes, lacking, progress)
+        measured = _measure(plan, case, measured, lacking, progress)
         cases.write_record(case, {**record, "measured": measured})
     shared = {
         **case.names,
@@ -140,7 +142,7 @@ def _stamp(case: Case) -> list[int]:
 
 
 def _measure(
-    case: Case, measured: dict[str, Any], wanted: Sequence[str], lacking: Sequence[str], progress: Progress
+    plan: BenchmarkRequest, case: Case, measured: dict[str, Any], lacking: Sequence[str], progress: Progress
 ) -> dict[str, Any]:
     """Bake a run, write its scene, and measure the lacking modes that the scene supports."""
     progress({"event": "bake", "text": case.title})
@@ -157,6 +159,7 @@ def _measure(
         dataset,
         modes=modes,
         splits=SPLITS,
+        perceptual=lpips.load(plan.lpips) if plan.lpips else None,
         progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
     )
     played = playback_speed.measure(scene, dataset.test or dataset.val, modes)
@@ -175,7 +178,7 @@ def _measure(
         "objects": evaluation["objects"],
         "trained_on": {**run.platform, "torch_threads": run.config.train.threads, "versions": run.versions},
         "modes": {**measured["modes"], **found},
-        "absent": [mode for mode in wanted if mode not in there],
+        "absent": [mode for mode in plan.modes if mode not in there],
     }
 
 

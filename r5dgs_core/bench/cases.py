@@ -39,6 +39,7 @@ class BenchmarkRequest:
         preset: Named training settings.
         config_path: TOML configuration; overrides the preset.
         overrides: ``section.key=value``; override both.
+        lpips: Files of the weights of LPIPS; empty to leave it out.
     """
 
     scenes: tuple[Path, ...]
@@ -49,6 +50,7 @@ class BenchmarkRequest:
     preset: str | None = None
     config_path: Path | None = None
     overrides: tuple[str, ...] = ()
+    lpips: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .. import errors, input_paths
+from .. import errors, input_paths, user_settings
 from ..config import config
 from ..config.sections.training import DEVICES
+
+if TYPE_CHECKING:
+    from ..evaluation.lpips import Lpips
 
 _KEYS = {  # options that set one key of the configuration
     "iterations": "train.iterations",
@@ -44,6 +48,34 @@ def add_settings(p: argparse.ArgumentParser) -> None:
     p.add_argument("--device", type=device_name, metavar="NAME", help=device)
     add_threads(p)
     add_progress(p)
+
+
+def add_lpips(p: argparse.ArgumentParser) -> None:
+    """Add ``--lpips``."""
+    shown = "files of features and heads for LPIPS (default: the user's setting metrics.lpips_weights)"
+    p.add_argument("--lpips", type=Path, nargs="+", metavar="FILE", help=shown)
+
+
+def lpips_files(given: Sequence[Path] | None) -> tuple[Path, ...]:
+    """Return the files of ``--lpips`` or of the user's settings; empty if neither names some.
+
+    Raises:
+        ConfigError: A file does not exist.
+    """
+    stored = "" if given else user_settings.read().get(user_settings.LPIPS, "")
+    files = tuple(given or map(Path, filter(None, stored.split(os.pathsep))))
+    for path in files:
+        if not path.is_file():
+            place = "--lpips" if given else user_settings.LPIPS
+            raise errors.ConfigError(f"{place} {path}: expected a file with weights, found none")
+    return files
+
+
+def lpips_network(files: Sequence[Path]) -> Lpips | None:
+    """Return the network of `lpips_files`, or None without files. Raises `BackendError` if a file cannot be used."""
+    from ..evaluation import lpips
+
+    return lpips.load(files) if files else None
 
 
 def device_name(text: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from .. import timing
 from ..data.dataset import Dataset, View
-from ..evaluation import evaluate, ground_truth_poses
+from ..evaluation import evaluate, ground_truth_poses, lpips
 from ..motion import se3
 from ..playback import scene_player
 from ..render import scene_renderer
@@ -37,6 +36,7 @@ def measure(
     *,
     clock: str = "wall",
     backend: str = "auto",
+    perceptual: lpips.Lpips | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[list[Row], list[str]]:
     """Return the rows of the task "images".
@@ -48,15 +48,15 @@ def measure(
         rounds: Timing rounds.
         clock: Clock of the rows' ``ms``, from `timing.CLOCKS`.
         backend: Rasterizer.
+        perceptual: Network for LPIPS, or None.
         progress: Called with the number of measured images and the total.
 
     Returns:
         The rows, and the reasons for missing measurements.
     """
     rows, absent = [], []
-    moves: dict[str, evaluate.Move] = {
-        mode: scene_player.Player(scene, mode).frame for mode in scene_player.modes(scene)
-    }
+    known = scene_player.modes(scene)
+    moves: dict[str, evaluate.Move] = {mode: scene_player.Player(scene, mode).frame for mode in known}
     if len(moves) == 1:
         absent.append("images of other modes than rigid: the scene holds no dynamics of its Gaussians")
     oracle, why = true_move(scene, dataset, [view.t for split in splits for view in dataset.views(split)])
@@ -66,12 +66,7 @@ def measure(
         moves[ORACLE] = oracle
     plans = _plans(scene, dataset, splits, moves, absent)
     total = sum(len(dataset.views(split)) * len(plan) for split, plan in plans.items())
-    done = itertools.count(1)
-
-    def count() -> None:
-        if progress is not None:
-            progress(next(done), total)
-
+    count = evaluate.counter(progress, total)
     missing: dict[str, None] = {}
     for number, (split, plan) in enumerate(plans.items()):
         views = dataset.views(split)
@@ -80,7 +75,7 @@ def measure(
         name = "" if number == 0 else f"@{split}"
         times = _times(scene, views, {k: m for k, m in plan.items() if k != ORACLE}, rounds, backend, clock)
         for mode, move in plan.items():
-            found = evaluate.measure_views(scene, views, move, backend=backend, measured=count)
+            found = evaluate.measure_views(scene, views, move, backend=backend, perceptual=perceptual, measured=count)
             missing |= dict.fromkeys(kind for kind in KINDS if found[kind] is None)
             errors = {f"{kind}{name}": found[kind] for kind in KINDS if found[kind] is not None}
             shared = {"task": "images", "setting": split, "count": found["images"]}
@@ -181,7 +176,8 @@ def _times(
 
 def _measure(request: Request) -> Measured:
     options = {"clock": request.clock, "backend": request.backend, "progress": request.count}
-    return measure(request.scene, request.data, request.splits, request.rounds, **options)
+    given = request.scene, request.data, request.splits, request.rounds
+    return measure(*given, perceptual=request.perceptual, **options)
 
 
 def _beyond_true_poses(rows: Sequence[Row], pick: Row) -> str:

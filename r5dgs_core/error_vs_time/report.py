@@ -19,6 +19,7 @@ import numpy as np
 from .. import atomic_files, timing
 from ..data.dataset import Dataset
 from ..errors import ConfigError
+from ..evaluation import lpips
 from ..render import machine
 from ..scene.scene import Scene
 from . import pareto_plot, recommendation, report_rows, run_spread, scene_groups, tables, task_names, tasks
@@ -40,6 +41,7 @@ class Options:
         rounds: Timing rounds, over which medians and quartiles are taken.
         clock: "wall", or "cpu" for processor time, which is less sensitive to other load.
         backend: Rasterizer.
+        perceptual: Network for LPIPS, or None.
     """
 
     tasks: Sequence[str] = task_names.TASKS
@@ -47,6 +49,7 @@ class Options:
     rounds: int = ROUNDS
     clock: str = "wall"
     backend: str = "auto"
+    perceptual: lpips.Lpips | None = None
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,7 @@ def measure(
         progress({"event": "images", "done": done, "total": total})
 
     scope = (tuple(options.splits), options.rounds, options.clock, options.backend)
-    request = Request(scene, dataset, place, tau, *scope, count)
+    request = Request(scene, dataset, place, tau, *scope, count, perceptual=options.perceptual)
     absent = [f"{task}: not requested" for task in task_names.TASKS if task not in options.tasks]
     for task in (task for name, task in tasks.BY_NAME.items() if name in options.tasks):
         if not task.counts:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..data.dataset import Dataset
+from ..evaluation import lpips
 from ..scene.scene import Scene
 from .report_rows import Row
 
@@ -29,6 +30,7 @@ class Request:
         backend: Rasterizer.
         count: Called with the number of measured images and the total.
         rows: Rows of the tasks before this one.
+        perceptual: Network for LPIPS, or None.
     """
 
     scene: Scene
@@ -41,6 +43,7 @@ class Request:
     backend: str
     count: Callable[[int, int], None]
     rows: Sequence[Row] = ()
+    perceptual: lpips.Lpips | None = None
 
     @property
     def data(self) -> Dataset:

@@ -6,6 +6,7 @@ The result has a fixed form (docs/reference/evaluation.md) that is comparable ac
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -25,7 +26,7 @@ from ..scene import predictability
 from ..scene.camera_correction import Correction
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
-from . import alignment, ground_truth_poses, metrics, miou
+from . import alignment, ground_truth_poses, lpips, metrics, miou
 
 METRICS = (
     "psnr",
@@ -73,6 +74,7 @@ def evaluate(
     backend: str = "auto",
     train: dict[str, Any] | None = None,
     align: bool | None = None,
+    perceptual: lpips.Lpips | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Measure a scene on the held-out views of a data set.
@@ -86,6 +88,7 @@ def evaluate(
         backend: Rasterizer.
         train: Cost of training: "seconds", "iterations", "gaussians".
         align: True to measure with aligned cameras, too (`alignment`); None if the training has refined its cameras.
+        perceptual: Network for LPIPS, or None.
         progress: Called with the number of measured images and the total.
 
     Returns:
@@ -93,8 +96,7 @@ def evaluate(
         types. Values that cannot be computed are None.
     """
     background = truth_background(scene) if background is None else background
-    total = sum(len(dataset.views(split)) for split in splits) * len(modes)
-    done = 0
+    count = counter(progress, sum(len(dataset.views(split)) for split in splits) * len(modes))
     result: dict[str, Any] = {"scene": scene.name, "splits": {}, "objects": object_errors(scene, dataset.ground_truth)}
     result["horizon"] = predictability.horizon(scene)
     corrections = None
@@ -105,13 +107,6 @@ def evaluate(
         result["splits"][split] = {}
         views = dataset.views(split)
         for mode in modes:
-
-            def count() -> None:
-                nonlocal done
-                done += 1
-                if progress is not None:
-                    progress(done, total)
-
             result["splits"][split][mode] = measure_views(
                 scene,
                 views,
@@ -119,10 +114,19 @@ def evaluate(
                 background=background,
                 backend=backend,
                 corrections=corrections,
+                perceptual=perceptual,
                 measured=count,
             )
+    if perceptual is not None:
+        result["lpips_network"] = perceptual.name
     result["train"] = _cost(scene, train)
     return result
+
+
+def counter(progress: Callable[[int, int], None] | None, total: int) -> Callable[[], None]:
+    """Return a function that reports one more measured image with each call."""
+    done = itertools.count(1)
+    return lambda: None if progress is None else progress(next(done), total)
 
 
 def _cost(scene: Scene, train: dict[str, Any] | None) -> dict[str, Any]:
@@ -143,6 +147,7 @@ def measure_views(
     background: np.ndarray | None = None,
     backend: str = "auto",
     corrections: Mapping[str, Correction] | None = None,
+    perceptual: lpips.Lpips | None = None,
     measured: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
     """Measure pictures of a scene whose Gaussians are moved by a function.
@@ -154,13 +159,14 @@ def measure_views(
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
         backend: Rasterizer.
         corrections: Correction of each camera by its name, for ``psnr_aligned``; None leaves that out.
+        perceptual: Network for ``lpips``, or None.
         measured: Called after each image.
 
     Returns:
         METRICS; values that cannot be computed are None.
     """
     background = truth_background(scene) if background is None else background
-    tally = _Tally([item.id for item in scene.objects if item.id > 0])
+    tally = _Tally([item.id for item in scene.objects if item.id > 0], perceptual)
     for view in (views[0], views[-1]) if views else ():
         render_timed(
             scene, view.camera, view.t, move, backend=backend
@@ -292,7 +298,8 @@ def is_later(scene: Scene, t: float) -> bool:
 class _Tally:
     """Accumulator of the errors of a split's images."""
 
-    def __init__(self, ids: list[int]) -> None:
+    def __init__(self, ids: list[int], perceptual: lpips.Lpips | None = None) -> None:
+        self.perceptual = perceptual
         self.values: dict[str, list[float]] = {name: [] for name in METRICS}
         self.errors: list[float] = []
         self.overlap = miou.Overlap(ids)
@@ -307,6 +314,8 @@ class _Tally:
         flip = metrics.flip(rendering.color, truth)
         if flip is not None:
             self.values["flip"].append(flip)
+        if self.perceptual is not None:
+            self.values["lpips"].append(self.perceptual.distance(rendering.color, truth))
         if mask is not None:
             shown = miou.objects_of(mask)
             self.values["psnr_objects"].append(metrics.psnr(rendering.color, truth, shown))
@@ -321,7 +330,7 @@ class _Tally:
 
     def result(self) -> dict[str, Any]:
         out: dict[str, Any] = dict.fromkeys(METRICS)
-        for name in ("psnr", "psnr_aligned", "psnr_objects", "ssim", "ssim_objects", "flip"):
+        for name in ("psnr", "psnr_aligned", "psnr_objects", "ssim", "ssim_objects", "flip", "lpips"):
             out[name] = _mean(self.values[name])
         for name in ("ms_motion", "ms_raster"):
             out[name] = float(np.median(self.values[name])) if self.values[name] else None

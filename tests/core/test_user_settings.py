@@ -1,12 +1,14 @@
 """The user's settings file, and `r5dgs config`."""
 
 import json
+import os
 import sys
+from pathlib import Path
 
 import pytest
 
 from r5dgs_core import user_settings
-from r5dgs_core.cli import main
+from r5dgs_core.cli import main, options
 from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.config import config, config_keys
 from r5dgs_core.errors import ConfigError
@@ -67,7 +69,7 @@ def test_relative_paths_are_stored_absolute(place, tmp_path, monkeypatch):
         ('encoder = "a"\nsam2 = clip\n', "not valid TOML: .*line 2"),
         (
             'encoder = "a"\n\nsam3 = "b"\n',
-            "line 3: expected one of the keys encoder, sam2, worker_python, found 'sam3'",
+            "line 3: expected one of the keys encoder, sam2, metrics.lpips_weights, worker_python, found 'sam3'",
         ),
         ('encoder = "a"\nsam2 = 3\n', "line 2: expected text in quotes, found sam2 = 3"),
         ('[paths]\nsam2 = "b"\n', "line 1: expected one of the keys"),
@@ -163,3 +165,24 @@ def test_weights_come_from_the_settings_unless_an_option_names_others(place, tin
     assert str(weights) in complaint(capsys, "masks", tiny.root, "--backend", "sam2")
     other = complaint(capsys, "masks", tiny.root, "--backend", "sam2", "--model", tmp_path / "other")
     assert str(tmp_path / "other") in other
+
+
+def test_the_weights_of_lpips_are_one_or_several_files(place, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("features.pth", "heads.pth"):
+        (tmp_path / name).touch()
+    given = os.pathsep.join(("features.pth", "heads.pth"))
+    assert main.main(["config", "--user", "set", user_settings.LPIPS, given]) == 0
+    stored = os.pathsep.join(str(tmp_path / name) for name in ("features.pth", "heads.pth"))
+    assert user_settings.read() == {user_settings.LPIPS: stored}
+    files = (tmp_path / "features.pth", tmp_path / "heads.pth")
+    assert options.lpips_files(None) == files and options.lpips_files(files[:1]) == files[:1]
+    place.write_text(f'[metrics]\nlpips_weights = "{files[0]}"\n')
+    assert options.lpips_files(None) == files[:1]
+    files[0].unlink()
+    with pytest.raises(ConfigError, match=r"metrics\.lpips_weights .*features\.pth: expected a file"):
+        options.lpips_files(None)
+    line = complaint(capsys, "config", "--user", "set", user_settings.LPIPS, "heads.pth" + os.pathsep + "no.pth")
+    assert "no.pth: expected a file, found none" in line
+    with pytest.raises(ConfigError, match="--lpips no.pth"):
+        options.lpips_files([Path("no.pth")])

@@ -31,6 +31,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     played = f"playback modes to measure, of {', '.join(playback_modes.every())} (default: one of each base)"
     p.add_argument("--modes", nargs="+", metavar="MODE", help=played)
     p.add_argument("--remeasure", action="store_true", help="bake and measure finished runs again")
+    options.add_lpips(p)
     options.add_settings(p)
 
 
@@ -45,6 +46,7 @@ def run(args: argparse.Namespace) -> None:
         threads=args.threads,
         progress_kind=args.progress,
         seeds=args.seeds,
+        lpips=args.lpips,
         preset=args.preset,
         config_path=args.config,
         overrides=[*options.overrides(args), *([] if args.device is None else [f"train.device={args.device}"])],
@@ -59,6 +61,7 @@ def run_bench(
     modes: Sequence[str] | None,
     threads: int | None = None,
     remeasure: bool = False,
+    lpips: Sequence[Path] | None = None,
     progress_kind: str = "auto",
     **plan: Any,
 ) -> dict[str, Any]:
@@ -71,6 +74,7 @@ def run_bench(
         modes: Playback modes; one per base if None.
         threads: Threads of the kernels; see `options.use_threads`.
         remeasure: Bake and measure finished runs again.
+        lpips: Files of the weights of LPIPS; those of the user's settings if None.
         progress_kind: Form of progress output (`progress.make`).
         **plan: Other fields of `bench.cases.BenchmarkRequest`.
 
@@ -78,20 +82,23 @@ def run_bench(
         The content of ``bench.json`` (docs/user/bench.md).
     """
     variants, modes = variants or DEFAULT_VARIANTS, modes or playback_modes.MODES
-    for option, given, known in (
-        ("--variants", variants, tuple(VARIANTS)),
-        ("--modes", modes, playback_modes.every()),
-    ):
-        for name in given:
-            if name not in known:
-                raise errors.UsageError(f"{option} {name}: expected one or more of {', '.join(known)}")
+    _check_names("--variants", variants, tuple(VARIANTS))
+    _check_names("--modes", modes, playback_modes.every())
     config.load(plan["config_path"], plan["overrides"], plan["preset"])
     for scene in scenes:
         inputs.check_dataset(scene)
     input_paths.check_output_folder("--out", out)
+    plan["lpips"] = options.lpips_files(lpips)
     from ...bench import benchmark, cases
 
     options.use_threads(threads)
     plan |= {"overrides": tuple(plan["overrides"]), "seeds": tuple(plan["seeds"])}
     work = cases.BenchmarkRequest(scenes=tuple(scenes), out=out, variants=tuple(variants), modes=tuple(modes), **plan)
     return benchmark.run_bench(work, remeasure=remeasure, progress_kind=progress_kind)
+
+
+def _check_names(option: str, given: Sequence[str], known: Sequence[str]) -> None:
+    """Raise UsageError if a name is unknown."""
+    for name in given:
+        if name not in known:
+            raise errors.UsageError(f"{option} {name}: expected one or more of {', '.join(known)}")

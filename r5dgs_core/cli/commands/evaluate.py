@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     aligned = "align the held-out cameras to the scene for psnr_aligned (default: if training has refined its cameras)"
     p.add_argument("--align", action="store_true", default=None, help=aligned)
     p.add_argument("--json", type=Path, metavar="FILE", help="file to write instead of evaluation.json")
+    options.add_lpips(p)
     options.add_threads(p)
     options.add_progress(p)
 
@@ -33,7 +35,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
     given = {"modes": args.mode or ["rigid"], "align": args.align, "json_path": args.json, "threads": args.threads}
-    run_evaluate(args.target, args.data, **given, progress_kind=args.progress)
+    run_evaluate(args.target, args.data, **given, lpips=args.lpips, progress_kind=args.progress)
 
 
 @folder_lock.writes("json_path", "target")
@@ -44,6 +46,7 @@ def run_evaluate(
     modes: list[str],
     json_path: Path | None,
     align: bool | None = None,
+    lpips: Sequence[Path] | None = None,
     threads: int | None = None,
     progress_kind: str = "none",
 ) -> dict[str, Any]:
@@ -55,18 +58,15 @@ def run_evaluate(
         modes: Playback modes.
         json_path: File to write instead.
         align: As for `evaluate.evaluate`.
+        lpips: Files of the weights of LPIPS; those of the user's settings if None.
         threads: Threads of the kernels; see `options.use_threads`.
         progress_kind: Form of progress output (`progress.make`).
 
     Returns:
         The evaluation, in the form of ``evaluation.json``.
     """
-    for mode in modes:
-        inputs.check_mode(mode)
-    inputs.check_target(target, data)
-    input_paths.check_output("--json", json_path)
-    if data is None and not target.is_dir():
-        raise errors.UsageError(f"{target}: a scene file requires a data set: r5dgs evaluate {target} --data DIR")
+    _check(target, data, modes, json_path)
+    weights = options.lpips_files(lpips)
 
     from ...evaluation import evaluate, evaluation_table
     from ...progress import make
@@ -87,6 +87,7 @@ def run_evaluate(
             modes=modes,
             train=scene.provenance.get("train"),
             align=align,
+            perceptual=options.lpips_network(weights),
             progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
         )
     if progress_kind != "json":
@@ -96,3 +97,13 @@ def run_evaluate(
     if progress_kind != "json":
         print(f"written: {path}")
     return result
+
+
+def _check(target: Path, data: Path | None, modes: Sequence[str], json_path: Path | None) -> None:
+    """Raise R5dgsError if arguments of `run_evaluate` cannot be used."""
+    for mode in modes:
+        inputs.check_mode(mode)
+    inputs.check_target(target, data)
+    input_paths.check_output("--json", json_path)
+    if data is None and not target.is_dir():
+        raise errors.UsageError(f"{target}: a scene file requires a data set: r5dgs evaluate {target} --data DIR")

@@ -36,6 +36,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--repeats", type=options.at_least(1), metavar="N", help="timing rounds (default: 7)")
     clock = "clock for timings: wall (default), or cpu for processor time"
     p.add_argument("--clock", choices=("wall", "cpu"), default="wall", help=clock)
+    options.add_lpips(p)
     stability = "run the stiff and extreme cases instead; needs no scene"
     p.add_argument("--stability", action="store_true", help=stability)
     p.add_argument("--json", type=Path, metavar="FILE", help="write the results of --stability to this file")
@@ -45,7 +46,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> ExitStatus | None:
     """Run the command."""
-    measured = (args.paths or None, args.out, args.tasks, args.splits, args.repeats)
+    measured = (args.paths or None, args.out, args.tasks, args.splits, args.repeats, args.lpips)
     if args.stability and any(given is not None for given in measured):
         raise errors.UsageError("report --stability: takes no scene and no other output than --json FILE")
     if args.json is not None and not args.stability:
@@ -56,6 +57,7 @@ def run(args: argparse.Namespace) -> ExitStatus | None:
     if not args.paths or args.out is None:
         raise errors.UsageError("report: expected RUN|SCENE and --out DIR, or --stability")
     given = {"tasks": args.tasks, "splits": args.splits, "rounds": args.repeats, "clock": args.clock}
+    given["lpips"] = args.lpips
     run_report(pair(args.paths), args.out, **given, **shared)
     return None
 
@@ -84,6 +86,7 @@ def run_report(
     splits: Sequence[str] | None = None,
     rounds: int | None = None,
     clock: str = "wall",
+    lpips: Sequence[Path] | None = None,
     threads: int | None = None,
     progress_kind: str = "none",
 ) -> dict[str, Any]:
@@ -97,6 +100,7 @@ def run_report(
         splits: Splits whose images are compared; "test" if None.
         rounds: Timing rounds; `error_vs_time.report.ROUNDS` if None.
         clock: "wall", or "cpu" for processor time.
+        lpips: Files of the weights of LPIPS; those of the user's settings if None.
         threads: Threads of the kernels; see `options.use_threads`.
         progress_kind: Form of progress output (`progress.make`).
 
@@ -105,23 +109,25 @@ def run_report(
     """
     _check_targets(targets)
     input_paths.check_output_folder("--out", out)
+    weights = options.lpips_files(lpips)
     from ...error_vs_time import report, tables
-    from ...error_vs_time.tasks import BY_NAME
     from ...progress import make
 
     options.use_threads(threads)
     settings = report.Options(
-        tuple(tasks or task_names.TASKS), tuple(splits or ("test",)), rounds or report.ROUNDS, clock
+        tuple(tasks or task_names.TASKS),
+        tuple(splits or ("test",)),
+        rounds or report.ROUNDS,
+        clock,
+        perceptual=options.lpips_network(weights),
     )
     measured = []
     with make(progress_kind) as progress:
         for target, data in targets:
             progress({"event": "prepare", "text": str(target)})
             scene, dataset = inputs.open_target(target, data)
-            if dataset is None and tasks and all(BY_NAME[name].needs_data for name in tasks):
-                given = " ".join(tasks)
-                remedy = f"r5dgs report {target} DATA --out {out}"
-                raise errors.ConfigError(f"--tasks {given}: require the data set: {remedy}")
+            if dataset is None:
+                _check_tasks(tasks or (), f"r5dgs report {target} DATA --out {out}")
             measured.append(report.measure(scene, dataset, settings, place=target, progress=progress))
     result = report.collect(measured, settings)
     paths = report.write(result, out)
@@ -129,6 +135,14 @@ def run_report(
         tables.show(result)
         print("\n".join(f"written: {path}" for path in paths))
     return result
+
+
+def _check_tasks(tasks: Sequence[str], remedy: str) -> None:
+    """Raise ConfigError if all of some tasks need a data set."""
+    from ...error_vs_time.tasks import BY_NAME
+
+    if tasks and all(BY_NAME[name].needs_data for name in tasks):
+        raise errors.ConfigError(f"--tasks {' '.join(tasks)}: require the data set: {remedy}")
 
 
 def _check_targets(targets: Sequence[tuple[Path, Path | None]]) -> None:

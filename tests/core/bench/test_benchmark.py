@@ -1,12 +1,14 @@
 """A benchmark trains and measures only missing runs, and continues after failures."""
 
 import contextlib
+import dataclasses
 import json
 import shutil
 import signal
 
 import numpy as np
 import pytest
+import torch
 
 from r5dgs_core.bake import bake
 from r5dgs_core.bench import benchmark, cases, playback_speed, process, variants
@@ -20,7 +22,7 @@ from r5dgs_core.playback import modes, scene_player
 from r5dgs_core.render import machine
 from r5dgs_core.scene import scene_file
 from r5dgs_core.train import checkpoint, run_folder
-from tests.support import tiny_datasets
+from tests.support import lpips_weights, tiny_datasets
 
 pytestmark = pytest.mark.heavy
 
@@ -102,8 +104,10 @@ def test_finished_runs_are_neither_trained_nor_measured_again(made, monkeypatch)
 
 
 @pytest.mark.slow
-def test_remeasure_keeps_the_run_and_measures_it_again(made, monkeypatch):
+def test_remeasure_keeps_the_run_and_measures_it_again(made, tmp_path, monkeypatch):
     plan, case, _, result = made
+    torch.save(lpips_weights.tensors("alex"), tmp_path / "alex.pth")
+    plan = dataclasses.replace(plan, lpips=(tmp_path / "alex.pth",))
     monkeypatch.setattr(process, "train", None)
     monkeypatch.setattr(
         playback_speed, "measure", lambda *_: {"rigid": {**result["results"][0]["playback"], "fps": 123.0}}
@@ -112,6 +116,7 @@ def test_remeasure_keeps_the_run_and_measures_it_again(made, monkeypatch):
     assert again["results"][0]["playback"]["fps"] == 123.0
     (one,), (other,) = again["results"], result["results"]
     assert one["train"] == other["train"]
+    assert one["splits"]["test"]["lpips"] > 0 and other["splits"]["test"]["lpips"] is None
     assert all(one["splits"][split]["psnr"] == other["splits"][split]["psnr"] for split in ("val", "test"))
 
 

@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 import r5dgs_core
 from r5dgs_core import __version__, atomic_files, errors, progress
@@ -30,7 +31,7 @@ from r5dgs_core.raster import thread_pool
 from r5dgs_core.scene import scene_file
 from r5dgs_core.time_left import TimedProgress
 from r5dgs_core.train import checkpoint, run_folder
-from tests.support import pages, tiny_datasets
+from tests.support import lpips_weights, pages, tiny_datasets
 from tests.support.command_line import complaint
 
 pytestmark = pytest.mark.heavy
@@ -80,6 +81,17 @@ def test_evaluate_measures_a_run_and_a_scene(made, tiny, capsys, target):
     assert all(row["position_error"] is not None for row in result["objects"])
     assert result["train"]["iterations"] == 20
     assert str(path) in capsys.readouterr().out.replace("\n", "")
+
+
+def test_evaluate_computes_lpips_with_given_weights(made, tmp_path, capsys):
+    weights = tmp_path / "alex.pth"
+    torch.save(lpips_weights.tensors("alex"), weights)
+    given = ["evaluate", str(made[0]), "--json", str(tmp_path / "e.json")]
+    assert main.main([*given, "--lpips", str(weights)]) == 0
+    found = json.loads((tmp_path / "e.json").read_text())
+    assert 0 < found["splits"]["test"]["rigid"]["lpips"] < 5 and found["lpips_network"] == "alex"
+    assert "LPIPS" in capsys.readouterr().out
+    assert "--lpips no.pth: expected a file" in complaint(capsys, *given, "--lpips", "no.pth")
 
 
 def test_evaluate_writes_to_the_given_path(made, tmp_path, capsys):

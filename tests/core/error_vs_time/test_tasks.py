@@ -25,13 +25,13 @@ from r5dgs_core.error_vs_time import (
     tasks,
 )
 from r5dgs_core.error_vs_time import report as error_vs_time_report
-from r5dgs_core.evaluation import ground_truth_poses
+from r5dgs_core.evaluation import ground_truth_poses, lpips
 from r5dgs_core.motion import models, se3
 from r5dgs_core.motion.history import EMPTY, Band, History
 from r5dgs_core.motion_fit import candidates
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
-from tests.support import pictures, scenes
+from tests.support import lpips_weights, pictures, scenes
 from tests.support.command_line import complaint
 
 pytestmark = pytest.mark.heavy
@@ -266,7 +266,9 @@ def test_true_poses_are_the_oracle_of_a_scene_with_a_wrong_future(scene, data):
 
 def test_there_is_no_oracle_without_true_poses_at_the_times_of_the_views(scene, data):
     blind = dataclasses.replace(data, ground_truth=None)
-    rows, absent = image_task.measure(scene, blind, ("test",), 1, backend=BACKEND)
+    network = lpips.Lpips(lpips.NETWORKS["alex"], lpips_weights.tensors("alex"))
+    rows, absent = image_task.measure(scene, blind, ("test",), 1, backend=BACKEND, perceptual=network)
+    assert only(rows, error_kind="lpips").error == pytest.approx(0, abs=1e-3)  # its own pictures
     assert not pick(rows, method=image_task.ORACLE) and any("ground_truth.json" in text for text in absent)
     move, why = image_task.true_move(scene, data, [0.8])
     assert move is None and "t = 0.8" in why
