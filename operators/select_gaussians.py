@@ -1,4 +1,4 @@
-"""Select Gaussians operator: all, none, or the others."""
+"""Select Gaussians operator: all, none, or the inverse."""
 
 import bpy
 import numpy as np

@@ -1,4 +1,4 @@
-"""Viewport Render with Splats operator: picture or animation of a 3D view, which Blender's own render leaves empty."""
+"""Viewport Render with Splats operator: picture or animation of a 3D view; Blender's own omits Gaussians."""
 
 from pathlib import Path
 

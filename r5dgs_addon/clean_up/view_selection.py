@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-FRONT = 0.5  # a Gaussian is in front if the Gaussians before it let at least this share of its light through
+FRONT = 0.5  # a Gaussian is in front if those in front of it transmit at least this share of its light
 _DEPTH_BITS, _MIN_DEPTH_BITS = 32, 20  # resolution of depths in sorting
 _FINEST = 4.0  # smallest cell in which Gaussians hide each other, in pixels
 
@@ -82,7 +82,7 @@ def under_brush(pixels: np.ndarray, path: np.ndarray, radius: float) -> np.ndarr
 
 
 def is_in_front(pixels: np.ndarray, depths: np.ndarray, opacities: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Mask of the Gaussians that those before them leave visible.
+    """Mask of the Gaussians that are visible through those in front of them.
 
     The picture is divided into square cells, as large as most Gaussians. In each cell, Gaussians are passed from front
     to back; one is visible until the light of those before it falls below `FRONT`.

@@ -101,7 +101,7 @@ def _wanted(collection: bpy.types.Collection, key: str) -> set[Entry]:
 
 
 def _label(anchor: bpy.types.Object) -> str:
-    """Name of an anchor's object with Blender's number, which tells objects of several scenes apart."""
+    """Name of an anchor's object with Blender's number, which distinguishes objects of several scenes."""
     return re.sub(r" anchor(?=(\.\d+)?$)", "", anchor.name)
 
 

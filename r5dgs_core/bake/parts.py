@@ -48,7 +48,7 @@ def connect(scene: Scene, observed: np.ndarray) -> Scene:
 
 
 def _doubt(scene: Scene, group: MotionGroup) -> tuple[float, int]:
-    """Half width of the band at its end in radii, 0 for a body at rest; then, the number of members, negative."""
+    """Sort key, most predictable body first: half width at the band's end in radii, minus the member count."""
     band = group.history.band
     moves = bool(np.any(scene.tracks.poses[group.id, :, 1:] != 0))
     width = band.half_width[-1] / group.model.radius if moves and band is not None else 0.0 if not moves else np.inf

@@ -79,7 +79,7 @@ class Measured:
     """Errors of the observed poses of bodies, by group.
 
     Attributes:
-        errors: The errors; those of the rotations without unseen axes.
+        errors: The errors; those of rotations leave out unseen axes.
         unseen: Bodies with rotations that the images do not show.
     """
 

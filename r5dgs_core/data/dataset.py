@@ -51,7 +51,7 @@ class Dataset:
         units: Units of time and length, if known.
         has_alpha: True if images have transparent pixels (checked for three training images).
         digest: Hash of the camera files and of names, sizes and ends of the images, for provenance.
-        points: Points of a COLMAP reconstruction, world. [P, 3] float64 or None
+        points: Points of a reconstruction, world. [P, 3] float64 or None
         point_colors: Their colours, sRGB in [0, 1]. [P, 3] float32 or None
         mask_folder: Folder of the training views' masks; None if masks are ignored.
         own_ids: True if the folder defines its own ids, different from the data set's.

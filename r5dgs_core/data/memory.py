@@ -10,7 +10,7 @@ from .dataset import Dataset
 
 _BYTES_PER_PIXEL = 3  # of an image in memory; masks are not counted
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-_UNKNOWN = 8 * 2.0**30  # assumed on systems that do not tell
+_UNKNOWN = 8 * 2.0**30  # assumed on systems that do not report it
 
 
 def total() -> float:
@@ -22,7 +22,7 @@ def total() -> float:
 
 
 def available() -> float | None:
-    """Return the memory that new processes can use without swapping, bytes; None if the system does not tell."""
+    """Return the memory that new processes can use without swapping, bytes; None if the system does not report it."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
         kib = next(line.split()[1] for line in lines if line.startswith("MemAvailable:"))

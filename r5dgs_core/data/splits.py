@@ -1,4 +1,4 @@
-"""Splits of a data set. Only needs the standard library, for the command line."""
+"""Splits of a data set. Needs only the standard library, for the command line."""
 
 from __future__ import annotations
 

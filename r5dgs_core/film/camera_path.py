@@ -20,10 +20,10 @@ class CameraPath:
     """Path of a camera.
 
     Attributes:
-        cameras: Returns the cameras of a number of frames, all of one size.
-        moves: True if they differ.
+        cameras: Function from a number of frames to their cameras, all of one image size.
+        moves: True if these cameras differ.
         count: Number of frames that the path was made for, or None.
-        times: Scene times at even distances along the path, or None.
+        times: Scene times, evenly spaced along the path, or None.
         fps: Frames per second that the path was made for, or None.
     """
 
@@ -40,7 +40,7 @@ def still(camera: Camera) -> CameraPath:
 
 
 def orbit(scene: Scene) -> CameraPath:
-    """Return a circle around the objects of a scene, from its first camera on, about the vertical of its world.
+    """Return a circle around the objects of a scene about the vertical axis of its world, starting at its first camera.
 
     The last frame is one step before the first, so that the film can loop.
     """
@@ -60,17 +60,17 @@ def orbit(scene: Scene) -> CameraPath:
 
 
 def curve(keys: Sequence[Camera]) -> CameraPath:
-    """Return a smooth path through cameras, at a speed that changes little. The pictures have the first one's size."""
+    """Return a smooth path through cameras at a nearly constant speed, with the image size of the first camera."""
     return CameraPath(lambda count: _between(keys, count, smooth=True))
 
 
 def lines(keys: Sequence[Camera], times: np.ndarray | None, fps: float | None) -> CameraPath:
-    """Return a path straight from camera to camera, in equal steps; with as many frames as cameras it is exact."""
+    """Return a path of lines between cameras, in equal steps; with one frame per camera, frames have their poses."""
     return CameraPath(lambda count: _between(keys, count, smooth=False), True, len(keys), times, fps)
 
 
 def fitted(camera: Camera, width: int, height: int) -> Camera:
-    """Return a camera of another size that shows all that a camera shows, and more beside it in another aspect."""
+    """Return a camera with another image size and the whole view; another aspect ratio adds to two sides."""
     scale = min(width / camera.width, height / camera.height)
     inner = axes.resize(camera, max(round(scale * camera.width), 1), max(round(scale * camera.height), 1))
     return axes.crop(inner, (inner.width - width) // 2, (inner.height - height) // 2, width, height)

@@ -30,7 +30,7 @@ class Result:
 
     Attributes:
         paths: Files that this process has written.
-        others: Number of frames that were there or that other processes have drawn.
+        others: Number of frames that existed before or were drawn by other processes.
     """
 
     paths: tuple[Path, ...]
@@ -57,8 +57,8 @@ def write(
         progress: Receives an event per frame.
 
     Raises:
-        ConfigError: Nothing is selected, a camera does not exist, times are outside, or a file exists or cannot be
-            written.
+        ConfigError: Nothing is selected, a camera does not exist, a time is before the first observed one, or a file
+            exists or cannot be written.
         BackendError: An encoder is missing.
     """
     rows = _rows(scene, shown, hidden)

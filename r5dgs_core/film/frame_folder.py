@@ -19,7 +19,7 @@ from .. import atomic_files, errors, folder_lock, strict_json
 from .schedule import Shot
 
 SETTINGS = "render.json"
-POLL_S = 0.5  # interval at which frames of other processes are looked at again
+POLL_S = 0.5  # interval between two checks for frames of other processes
 
 
 def path_of(folder: Path, number: int, suffix: str) -> Path:

@@ -1,7 +1,7 @@
 """Multilayer OpenEXR pictures: colour, depth, object index, alpha and Cryptomatte, with Blender's names of channels.
 
 Colours are linear with premultiplied alpha, as compositors expect of EXR; the straight display-referred colour is
-linearised before it is premultiplied, so that straight alpha gives the blended colours back.
+linearised before it is premultiplied, so that dividing by alpha restores the blended colours.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ class Schedule:
     Attributes:
         shots: The frames, at least one.
         fps: Frames per second.
-        span: First and last time that the marker of time shows.
+        span: First and last time on the time marker.
     """
 
     shots: tuple[Shot, ...]
@@ -53,7 +53,7 @@ class Schedule:
 
 
 def make(scene: Scene, settings: Settings) -> Schedule:
-    """Return the frames that settings ask for.
+    """Return the frames of a film.
 
     Raises:
         ConfigError: A camera or camera path cannot be used, or the times are before the first observed one.

@@ -38,7 +38,7 @@ class CapturedImages:
         self._background = background
 
     def at(self, shot: Shot) -> np.ndarray:
-        """Return the image nearest in time to a frame, gray if the camera has none then. [H, W, 3] float32"""
+        """Return the image nearest in time to a frame, gray if the camera has none near that time. [H, W, 3] float32"""
         camera = shot.camera
         canvas = np.full((camera.height, camera.width, 3), EMPTY, np.float32)
         nearest = int(np.argmin(np.abs(self._times - shot.t)))

@@ -1,4 +1,4 @@
-"""Marker of time on pictures: a bar of the observed and the predicted time, and the word for the present one."""
+"""Time marker on pictures: a bar of the observed and the predicted time, and the word "observed" or "predicted"."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Videos by PyAV: H.264 in .mp4, ProRes 4444 in .mov and VP9 in .webm, the last two with alpha if wanted.
+"""Videos by PyAV: H.264 in .mp4, ProRes 4444 in .mov and VP9 in .webm, the last two with alpha if requested.
 
-Pictures are converted to BT.709 YUV of limited range, and files say so: primaries and matrix BT.709, transfer sRGB.
+Pictures are converted to BT.709 YUV of limited range, and files are tagged: primaries and matrix BT.709, transfer sRGB.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def check(suffix: str) -> None:
 def writing(path: Path, fps: float, *, alpha: bool = False) -> Iterator[Callable[[np.ndarray], None]]:
     """Yield a function that appends a picture, [H, W, 3 or 4] sRGB in [0, 1], straight alpha, to a video.
 
-    The file gets its name when the block ends without an error; otherwise nothing is left.
+    The file gets its name when the block ends without an error; otherwise it is deleted.
 
     Args:
         path: The video; its suffix is one of `CODECS`.

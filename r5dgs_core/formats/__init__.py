@@ -1,1 +1,1 @@
-"""File formats of other programs: PLY, transforms.json, COLMAP text, PNG, OpenEXR and Cryptomatte."""
+"""File formats of other programs: PLY, glTF, OpenUSD, HTML, poses, transforms.json, COLMAP text, PNG, OpenEXR."""

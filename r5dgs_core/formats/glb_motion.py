@@ -1,7 +1,7 @@
 """Motion of groups as glTF animations: CUBICSPLINE keys of the nodes of their anchors.
 
 The time of an animation is the scene time since the first observed time, in seconds; a unit of unknown length counts as
-one second. The two tangents of a key differ where the velocity jumps.
+one second. The two tangents of a key differ if the velocity jumps there.
 """
 
 from __future__ import annotations

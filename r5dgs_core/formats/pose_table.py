@@ -46,7 +46,7 @@ class Table:
 
 
 def make(scene: Scene, options: registry.Options) -> Table:
-    """Table of the selected objects and times, in seconds and metres if the scene knows them.
+    """Table of the selected objects and times, in seconds and metres if the scene stores these units.
 
     Raises:
         ConfigError: The selection has no object with Gaussians or motion.

@@ -4,8 +4,8 @@ The tree is that of `glb`: one Xform per motion group at its anchor, parts below
 prim with the Gaussians of each object in it. A time code is a frame of Blender. USD interpolates linearly, so each
 group has as many time samples as `linear_times` needs.
 
-The schema is part of OpenUSD since 26.03. Its attributes are written by name, so that older versions write it as well,
-such as those in Blender.
+The schema is part of OpenUSD since 26.03. Its attributes are written by name, so that older versions, such as those
+in Blender, write it as well.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Masks by SAM3: objects that are named by phrases, found and tracked through each video.
 
 A phrase names one object of the scene, so that its id is the same in all videos. If several things in a video fit a
-phrase, the one that is seen longest and most surely is the object, and the pixels of the others are unknown.
+phrase, the one with the largest sum of scores over the images is the object, and the pixels of the others are unknown.
 """
 
 from __future__ import annotations

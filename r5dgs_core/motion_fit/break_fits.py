@@ -47,7 +47,7 @@ class Breaks:
 
     @staticmethod
     def of(kinds: Sequence[tuple[Candidate, bool, bool]], low: np.ndarray, high: np.ndarray) -> Breaks:
-        """Each kind (its candidate, whether the body rests before it, whether it starts slowly) in each gap."""
+        """Breaks of each kind in each gap. Kinds: candidate, and `rests_before` and `starts_slowly` of its `Break`."""
         own = np.zeros((len(kinds), COUNT))
         for row, (candidate, _, _) in enumerate(kinds):
             own[row, rows_of(candidate)] = 1

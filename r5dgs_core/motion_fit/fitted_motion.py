@@ -135,7 +135,7 @@ def segments(
 
 
 def _parameters(solution: FittedCandidate, radius: float, span: float, last: bool) -> dict[str, np.ndarray]:
-    """Parameters of a segment beside the common rates: constants of its law, and in the last one all that it has."""
+    """Parameters of a segment beside the common rates: constants of its law, in the last also fields of its kind."""
     law = solution.candidate.law
     if not last and law is not solution.candidate:  # the law holds after the break alone
         return {}

@@ -30,7 +30,7 @@ SLACK = 0.05  # part of the range by which a prediction may exceed a limit
 _BOTH = math.sqrt(2.0)  # the pose at t_max is as noisy as the others
 _ROUNDS = 4  # reweighting rounds
 _MISFIT = 2.0  # maximum median of the squared errors of poses, relative to the expected one
-_CAP = 2.0  # squared error of a pose that counts at most, relative to the price of leaving it free
+_CAP = 2.0  # maximum counted squared error of a pose, relative to the cost of a free pose
 _HORIZON = 3.0  # time past t_max within which limits are respected, in observed spans
 
 

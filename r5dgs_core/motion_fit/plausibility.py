@@ -16,7 +16,7 @@ _RUNAWAY = 2.5  # distance in this time, relative to the largest observed, above
 
 
 def rises(solution: FittedCandidate, up: np.ndarray | None) -> bool:
-    """Return True if a support would have to hold a body that moves on a vertical line, as one thrown upwards."""
+    """Return True if a body slows down on a vertical line, as if thrown upwards, so that it needs a support."""
     candidate = solution.candidate
     if up is None or not models.KINDS[candidate.kind].needs_support or "w" in candidate.blocks:
         return False

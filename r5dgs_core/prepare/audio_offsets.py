@@ -34,7 +34,7 @@ def measure(sources: Sequence[CameraSource], distances: np.ndarray | None = None
         distances: Distances between the cameras, metres; None if unknown. [C, C]
 
     Returns:
-        One offset per camera as `clock.solve_pairs` returns them; None if no sounds belong together.
+        One offset per camera as `clock.solve_pairs` returns them; None if no sounds match.
     """
     envelopes = [_envelope(source) for source in sources]
     pairs: list[tuple[int, int, float, float]] = []

@@ -1,4 +1,4 @@
-"""Times of frames from ``timestamps.csv`` beside the videos, more reliable than the container of a re-encoded video.
+"""Times of frames from ``timestamps.csv`` beside the videos; a re-encoded container is less reliable.
 
     camera,frame,time          also cam_id or port; frame_index or sync_index; frame_time or timestamp, in seconds
     cam_0,0,25.0012            a suffix gives the unit: time_s, time_ms, time_us, time_ns

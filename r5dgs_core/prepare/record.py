@@ -21,7 +21,7 @@ from .cameras import Camera
 from .clock import Offset
 from .plan import Plan, Request
 
-_EDGE_BYTES = 1 << 16  # of a file that enter its fingerprint, at each end
+_EDGE_BYTES = 1 << 16  # bytes at each end of a file that enter its fingerprint
 
 
 def identity(request: Request, opened: Sequence[Camera], calibration: Calibration) -> dict[str, Any]:

@@ -6,7 +6,7 @@
     SOURCE/cam0/00000.png, ...               frames
     SOURCE/00000.png, ...                    frames of one camera
 
-Only needs the standard library.
+Needs only the standard library.
 """
 
 from __future__ import annotations

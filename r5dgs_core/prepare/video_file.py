@@ -170,7 +170,7 @@ def _stamps(container: Any, stream: Any, path: Path) -> tuple[np.ndarray, float]
             if packet.size and packet.pts is not None and not packet.is_discard:
                 found.append(packet.pts)
     except av.error.FFmpegError:
-        pass  # the file ends early; `declared` tells by how much
+        pass  # the file ends early; `declared` shows by how much
     if not found:
         raise errors.DatasetError(
             f"{path}: the video has no time stamps. Remedy: store it in a container that has them, for example with "

@@ -15,8 +15,8 @@ from .sightings import Sighting
 
 _EVALUATIONS = 60
 _LENS_SCALE = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3])  # of focal length, principal point (px), k1, k2
-# Expected changes of a lens: shares of the focal length for the first three. They only matter for what the board does
-# not show, for example if it is far from a camera in all frames.
+# Expected changes of a lens: shares of the focal length for the first three. They only matter for parameters that the
+# board does not determine, for example if it is far from a camera in all frames.
 _LENS_SPREAD = np.array([0.05, 0.04, 0.04, 0.1, 0.2])
 
 

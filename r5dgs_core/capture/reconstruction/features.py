@@ -20,9 +20,9 @@ from . import recording as recordings_module
 from .recording import Recording
 from .request import Request
 
-NEIGHBOURS = 8  # frames after a frame of a moving camera that it is matched with
+NEIGHBOURS = 8  # number of following frames with which a frame of a moving camera is matched
 LINKS = 12  # frames of a moving camera that are matched with those of the other cameras
-FEWEST_MATCHES = 20  # with which two images can be connected
+FEWEST_MATCHES = 20  # minimum number of matches that connects two images
 _FOCAL_RANGE = 0.4, 3.0  # plausible focal lengths in widths of the image
 _RADIAL_RANGE = 0.6  # largest plausible coefficient of radial distortion
 

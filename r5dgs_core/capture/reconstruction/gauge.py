@@ -14,7 +14,7 @@ CAMERAS, PLANE, BOARD = "cameras", "plane", "board"
 _TRIALS = 2000
 _NEAR = 0.01  # distance to a plane, of the points' spread
 _STEEPEST = 0.5  # cosine between the up of the cameras and the normal of a supporting plane
-_SAME_WAY = np.cos(np.radians(4))  # of normals of a resting board
+_SAME_WAY = np.cos(np.radians(4))  # cosine between the normals of a resting board
 
 
 def with_distance(calibration: Calibration, first: str, second: str, meters: float) -> Calibration:

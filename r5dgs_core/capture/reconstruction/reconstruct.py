@@ -30,7 +30,7 @@ def reconstruct(recordings: Sequence[Recording], request: Request, work: Path) -
 
     Raises:
         ConfigError: A name or option of the request is wrong.
-        DatasetError: Cameras cannot be connected; the error names them and what to film differently.
+        DatasetError: Cameras cannot be connected; the error names them and the remedy.
         BackendError: OpenCV or pycolmap is not installed, or fails.
     """
     names = [recording.name for recording in recordings]

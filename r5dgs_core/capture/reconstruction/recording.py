@@ -9,10 +9,10 @@ from typing import Protocol
 import numpy as np
 from scipy import ndimage
 
-STILLS = 15  # frames that the picture of a fixed camera is made of
+STILLS = 15  # number of frames in the median picture of a fixed camera
 _MOVED = 12  # difference from the median that marks a moving pixel, of 255
 _MARGIN = 2  # pixels around moving ones that are left out, at 480 lines
-_SHARE = 0.25  # of the frames in which a pixel must differ
+_SHARE = 0.25  # minimum share of the frames in which a moving pixel differs from the median
 
 
 class Recording(Protocol):

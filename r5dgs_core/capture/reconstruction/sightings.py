@@ -12,10 +12,10 @@ from ..calibration.lens import Lens
 from .board import Detector
 from .recording import Recording
 
-MOST_TIMES = 120  # at which boards are looked for
-FEWEST_CORNERS = 6  # of a sighting
-FEWEST_VIEWS = 6  # of a lens
-_LENS_VIEWS = 40  # of a lens; more take long and change little
+MOST_TIMES = 120  # maximum number of times at which boards are searched
+FEWEST_CORNERS = 6  # minimum number of corners in a sighting
+FEWEST_VIEWS = 6  # minimum number of sightings for a lens
+_LENS_VIEWS = 40  # maximum number of sightings for a lens; more take long and change little
 _WORST_LENS = 3.0  # px, rms error of a lens
 _WORST_POSE = 5.0  # px, rms error of a board's pose
 

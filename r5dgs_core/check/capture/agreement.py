@@ -19,8 +19,8 @@ from ...terminal import printable
 from . import pictures
 from .pictures import Album
 
-APART = 2.0  # distance from the epipolar line, in radii of the object, that is too far
-LEAST = 3  # times at which two cameras show an object
+APART = 2.0  # maximum distance from the epipolar line, in radii of the object
+LEAST = 3  # minimum number of times at which two cameras show an object
 
 
 @dataclass(frozen=True)

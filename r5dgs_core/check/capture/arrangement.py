@@ -14,7 +14,7 @@ from . import pictures
 from .pictures import Album
 
 COMMON = 0.02  # least share of a camera's view that another camera sees
-SMALL_DEG = 5.0  # largest angle between cameras of a rig that is too narrow
+SMALL_DEG = 5.0  # angle between the outermost cameras below which a rig is too narrow
 MOST_CAMERAS = 40  # compared cameras; more are thinned evenly
 _DEPTHS = np.geomspace(0.2, 3.0, 12)  # of the compared points, in distances to the middle
 _GRID = 7

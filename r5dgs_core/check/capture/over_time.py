@@ -17,13 +17,13 @@ from .pictures import Album
 from .recording import LEAST, Recording
 
 EXPOSURE, BALANCE = 0.15, 0.08  # allowed drift of brightness and of the ratio of two colours, stops
-BLURRED, BLURRED_SHARE = 0.5, 0.15  # of the usual sharpness of what moves, and of the images that show motion
-DROPPED = 1.5  # interval between two frames that lacks one, in usual intervals
-DOUBLED, MOVES = 0.1, 0.5  # change of a repeated image, and least change of its neighbours, in usual changes
+BLURRED, BLURRED_SHARE = 0.5, 0.15  # sharpness of a blurred image, of the usual one; share of such images for a finding
+DROPPED = 1.5  # interval above which a frame is missing, in usual intervals
+DOUBLED, MOVES = 0.1, 0.5  # maximum change of a repeated image, minimum change of its neighbours, in usual changes
 _REGULAR = 0.8  # least share of equal intervals for a camera with a constant rate
 _MOVING = 20  # difference from the background, levels
 _CELLS = 6  # least number of moving cells
-_SMOOTH = 5  # images of the running median of the exposure
+_SMOOTH = 5  # number of images in the running median of the exposure
 
 
 def check(one: Recording, place: str, seconds: float | None, collect: Collector, album: Album) -> None:

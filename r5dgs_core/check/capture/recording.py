@@ -11,7 +11,7 @@ from ...data import images
 from ...data.views import View
 from ...prepare import motion_tracks
 
-LEAST = 8  # images of a camera that rules about time need
+LEAST = 8  # minimum number of images of a camera for rules about time
 
 
 @dataclass(frozen=True)

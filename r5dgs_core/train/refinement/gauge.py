@@ -32,8 +32,8 @@ def similarity_slopes(camera: Camera) -> np.ndarray:
 def pixel_units(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Return pose corrections, as columns, each of which moves the image of the points by one pixel (rms).
 
-    The columns are the principal axes of the motion in the image, so that a rotation and the shift that looks almost
-    the same are told apart; weak axes are shortened.
+    The columns are the principal axes of the motion in the image, which separates a rotation from a shift that looks
+    almost the same; weak axes are shortened.
 
     Args:
         camera: The camera.

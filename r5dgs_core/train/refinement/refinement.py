@@ -25,7 +25,7 @@ from .rig import Rig
 
 PARTS = ("camera_poses", "focal_lengths", "time_offsets", "camera_colours")  # rows of the needs table
 BETAS, EPS = (0.9, 0.99), 1e-12
-REACH = 8.0  # path that the steps of a parameter allow, in its units
+REACH = 8.0  # maximum total change of a parameter over the run, in its units
 LOWEST, HIGHEST = 0.02, 0.15  # limits of a parameter's first step, units
 LAST = 0.05  # last step relative to the first
 SMOOTH = 0.02  # share by which a moving camera's correction approaches the mean of its neighbours, per step

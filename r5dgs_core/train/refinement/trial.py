@@ -27,7 +27,7 @@ from .refinement import PARTS
 
 log = logging.getLogger(__name__)
 
-SHORTEST = 100  # steps of a run whose cameras are examined; shorter ones explain too little of the images
+SHORTEST = 100  # minimum steps of a run for an examination; shorter runs explain too little of the images
 FOLLOW_UPS = 8  # number of examinations of refined parts while times enter
 ROUNDS = 3  # number of examinations once all times have entered
 POSES, VIEWS = 12, 3  # maximum number of poses that are examined, and of views of each

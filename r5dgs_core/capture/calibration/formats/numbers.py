@@ -102,7 +102,7 @@ def pose_of_center(place: str, axes: np.ndarray, center: np.ndarray) -> np.ndarr
 
 
 def _near(place: str, position: np.ndarray) -> np.ndarray:
-    """Return a position that is not beyond all reason. [3]"""
+    """Return a position after a check of its magnitude. [3]"""
     if not np.abs(position).max() <= cameras.FARTHEST:
         raise errors.DatasetError(
             f"{place}: expected a position within {cameras.FARTHEST:g} units, found {position.tolist()!s:.80}; "

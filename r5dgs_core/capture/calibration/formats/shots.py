@@ -11,7 +11,7 @@ import numpy as np
 from ..calibration import CalibratedCamera, CalibratedFrame
 from ..lens import Lens
 
-_SAME_POSE = 1e-7  # rounding of the poses of one fixed camera, of the largest coordinate
+_SAME_POSE = 1e-7  # rounding of the poses of one fixed camera, relative to the largest coordinate
 
 
 @dataclass(frozen=True, eq=False)
