@@ -1,4 +1,4 @@
-"""Kinds of files by suffix, lower case. Only needs the standard library, for the detection of layouts."""
+"""Kinds of files by suffix, lower case. Needs only the standard library, for the detection of layouts."""
 
 from __future__ import annotations
 
