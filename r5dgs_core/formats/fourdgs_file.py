@@ -141,9 +141,7 @@ def _attributes(scene: Scene, end: float, ids: dict[tuple[int, int], int]) -> di
 
 def losses(scene: Scene) -> list[str]:
     """Parts of this scene that a file does not hold, or that only our own programs read, as sentences."""
-    found = []
-    if scene.residuals is not None and len(scene.residuals.rows):
-        found.append(f"{len(scene.residuals.rows)} Gaussians bend: written as at t_max, they move rigidly")
+    found = scene_nodes.lost_bending(scene)
     if available(scene, "standard"):
         found.append("motion of single Gaussians past t_max (modes standard and hybrid)")
     if scene.shading is not None:

@@ -67,9 +67,7 @@ def build(scene: Scene, options: registry.Options) -> tuple[dict[str, Any], gltf
 
 def losses(scene: Scene) -> list[str]:
     """Parts of this scene that a file does not hold, or that only our own programs read, as sentences."""
-    found = []
-    if scene.residuals is not None and len(scene.residuals.rows):
-        found.append(f"{len(scene.residuals.rows)} Gaussians bend: written as at t_max, they move rigidly")
+    found = scene_nodes.lost_bending(scene)
     lost = [mode for mode in modes.MODES if mode != "rigid" and available(scene, mode)]
     if lost:
         found.append(f"motion of single Gaussians (modes {', '.join(lost)})")

@@ -21,7 +21,7 @@ from ..playback.scene_player import Player
 from ..scene import validation
 from ..scene.scene import Scene
 from ..scene.splats import Splats
-from . import registry
+from . import registry, scene_nodes
 
 _TYPES = {
     "char": "i1",
@@ -89,6 +89,7 @@ def write(
 
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
     """Write the Gaussians at each time, in the world of the scene file. Implements `registry.Format.write`."""
+    scene_nodes.check(scene, options.object_ids)
     player = Player(scene)
     for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
         splats = played_splats.at(player, t, options.object_ids)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import NamedTuple
 
+import numpy as np
+
 from .. import errors
 from ..scene import row_runs
 from ..scene.scene import Scene
@@ -18,19 +20,24 @@ class Piece(NamedTuple):
     group: int
 
 
+def check(scene: Scene, object_ids: Collection[int] | None) -> None:
+    """Raise ConfigError if the selected objects (all if None) have no Gaussians."""
+    if not any(item.count for item in scene.objects if object_ids is None or item.id in object_ids):
+        raise errors.ConfigError(f"{scene.name}: expected Gaussians to export, found none in the selected objects")
+
+
 def pieces(scene: Scene, object_ids: Collection[int] | None) -> list[Piece]:
     """Pieces of the selected objects (all if None), in the order of the rows.
 
     Raises:
         ConfigError: No Gaussian is selected.
     """
+    check(scene, object_ids)
     found = []
     for start, stop, object_id in row_runs.runs(scene.gaussians.object_ids):
         if object_ids is None or object_id in object_ids:
             within = row_runs.runs(scene.gaussians.motion_ids[start:stop])
             found += [Piece(slice(start + first, start + last), object_id, g) for first, last, g in within]
-    if not found:
-        raise errors.ConfigError(f"{scene.name}: expected Gaussians to export, found none in the selected objects")
     return found
 
 
@@ -51,3 +58,13 @@ def group_names(scene: Scene) -> list[str]:
         else:
             found.append(name if len(own) < 2 else f"{name} (part {own.index(group.id) + 1})")
     return found
+
+
+def lost_bending(scene: Scene) -> list[str]:
+    """Sentence about Gaussians that bend, for formats in which each piece is rigid; empty without them."""
+    residuals = scene.residuals
+    if residuals is None or len(residuals.rows) == 0:
+        return []
+    most = float(np.linalg.norm(residuals.offsets, axis=-1).max()) / scene.extent
+    count = len(residuals.rows)
+    return [f"{count} Gaussians bend, by up to {100 * most:.2g} % of the extent: as at t_max, they move rigidly"]

@@ -16,7 +16,7 @@ from ..playback import played_splats
 from ..playback.scene_player import Player
 from ..scene import cameras
 from ..scene.scene import Scene
-from . import ply, registry, turned_splats
+from . import ply, registry, scene_nodes, turned_splats
 
 PROGRAM = "splat-transform"
 REMEDY = "npm install -g @playcanvas/splat-transform@2.7.1"
@@ -24,14 +24,13 @@ REMEDY = "npm install -g @playcanvas/splat-transform@2.7.1"
 
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
     """Write the Gaussians at each time. Implements `registry.Format.write`."""
+    scene_nodes.check(scene, options.object_ids)
     player, program = Player(scene), shutil.which(PROGRAM)
     if program is None:
         raise errors.BackendError(str(FORMAT.why_unavailable()))
     axes = cameras.WORLD_TO_BLENDER["colmap"].T @ cameras.WORLD_TO_BLENDER[scene.world_convention]
     for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
         splats = turned_splats.turned(played_splats.at(player, t, options.object_ids), axes)
-        if len(splats.means) == 0:
-            raise errors.ConfigError(f"{scene.name}: expected Gaussians to export, found none in the selected objects")
         try:
             with tempfile.TemporaryDirectory() as folder, atomic_files.replacing_by_name(target) as temporary:
                 source = ply.write(splats, Path(folder) / "gaussians.ply", plain=True)

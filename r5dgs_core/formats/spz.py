@@ -13,7 +13,7 @@ from ..playback import played_splats
 from ..playback.scene_player import Player
 from ..scene import cameras
 from ..scene.scene import Scene
-from . import registry, turned_splats
+from . import registry, scene_nodes, turned_splats
 
 EXTRA, PACKAGE = "export", "gsply"
 _STEPS = (1 << 23) - 1  # largest fixed-point position
@@ -27,12 +27,11 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     """Write the Gaussians at each time. Implements `registry.Format.write`."""
     with extras.required("SPZ files", EXTRA):
         import gsply
+    scene_nodes.check(scene, options.object_ids)
     player = Player(scene)
     axes = cameras.WORLD_TO_BLENDER["opengl"].T @ cameras.WORLD_TO_BLENDER[scene.world_convention]
     for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
         splats = turned_splats.turned(played_splats.at(player, t, options.object_ids), axes)
-        if len(splats.means) == 0:
-            raise errors.ConfigError(f"{scene.name}: expected Gaussians to export, found none in the selected objects")
         content = gsply.GSData(
             means=splats.means,
             scales=splats.log_scales,

@@ -40,7 +40,8 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     stage = build(scene, options)
     try:
         with atomic_files.replacing_by_name(path) as temporary:
-            stage.GetRootLayer().Export(str(temporary))
+            if not stage.GetRootLayer().Export(str(temporary)):
+                raise OSError("OpenUSD failed")
     except (OSError, pxr.Tf.ErrorException) as error:
         raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
     yield path

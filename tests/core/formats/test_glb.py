@@ -306,9 +306,17 @@ def test_losses_of_a_scene_are_named():
     rows = np.array([50, 51], np.int32)
     shape = (2, len(scene.tracks.times))
     zeros, turns = np.zeros((*shape, 3), np.float32), np.tile(np.float32([1, 0, 0, 0]), (*shape, 1))
-    bent = dataclasses.replace(scene, residuals=Residuals(rows, zeros, turns, zeros))
+    offsets = zeros.copy()
+    offsets[0, 0, 1] = 0.1 * scene.extent
+    bent = dataclasses.replace(scene, residuals=Residuals(rows, offsets, turns, zeros))
     said = " ".join(glb.losses(bent.with_arrays(dynamics=np.zeros((100, 12), np.float32))))
-    for part in ("2 Gaussians bend", "modes hybrid, standard", "identity encodings", "colours other than", "sky"):
+    for part in (
+        "2 Gaussians bend, by up to 10 % of the extent",
+        "modes hybrid, standard",
+        "identity encodings",
+        "colours other than",
+        "sky",
+    ):
         assert part in said
     plain = scenes.make_scene(n=100, shading=False, identities=False)
     plain = plain.with_arrays(background_sh=np.zeros((1, 3), np.float32))

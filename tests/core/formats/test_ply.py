@@ -192,7 +192,7 @@ def test_ids_that_are_no_whole_numbers_of_32_bits_are_refused(tmp_path, value):
         ply.read(path)
 
 
-@pytest.mark.parametrize(("after", "object_ids", "expected"), [(0, None, 0), (1, None, 1), (1, frozenset(), 0)])
+@pytest.mark.parametrize(("after", "object_ids", "expected"), [(0, None, 0), (1, None, 1), (1, frozenset({0}), 0)])
 def test_predicted_frames_state_the_confidence_band(tmp_path, after, object_ids, expected):
     scene = make_scene()
     body = next(k for k, group in enumerate(scene.groups) if group.role == "body")

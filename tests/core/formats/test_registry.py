@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from r5dgs_core import errors
 from r5dgs_core.cli import main
 from r5dgs_core.formats import ply, registry
 from r5dgs_core.playback import scene_player
@@ -13,6 +14,7 @@ from r5dgs_core.scene import scene_file
 from tests.support import pages
 from tests.support.command_line import complaint
 
+POSES = ("poses", "poses_csv", "tum")  # which hold the motion of an object without Gaussians
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "user" / "export.md"
 
 
@@ -46,3 +48,26 @@ def test_a_format_without_its_package_is_refused_with_the_remedy(scene, tmp_path
     line = complaint(capsys, "export", path, "--to", "ply", "--out", tmp_path / "a.ply")
     assert "no_such_package is not installed" in line and "pip install 'r5dgs[tables]'" in line
     assert not (tmp_path / "a.ply").exists()
+
+
+@pytest.mark.parametrize("name", registry.MODULES)
+def test_folders_and_selections_that_do_not_suit_give_one_error_and_no_file(scene, tmp_path, name):
+    found = registry.get(name)
+    if (reason := found.why_unavailable()) is not None:
+        pytest.skip(reason)
+    missing = tmp_path / "missing" / f"a{found.suffix}"
+    with pytest.raises(errors.SceneFileError, match="cannot be written"):
+        list(found.write(scene, missing, registry.Options((0.3,))))
+    if found.has_objects:
+        item = scene.object(2)  # an object that has lost its Gaussians
+        gone = dataclasses.replace(item, count=0)
+        lost = dataclasses.replace(scene, objects=tuple(gone if one is item else one for one in scene.objects))
+        for given, ids in ((scene, {77}), (lost, {2})):
+            if name not in POSES or ids == {77}:
+                with pytest.raises(errors.ConfigError, match="found none in the select"):
+                    list(
+                        found.write(
+                            given, tmp_path / f"a{found.suffix}", registry.Options((0.3,), None, frozenset(ids))
+                        )
+                    )
+    assert not list(tmp_path.iterdir())
