@@ -1,1 +1,1 @@
-"""File formats of other programs: PLY, glTF, OpenUSD, HTML, poses, transforms.json, COLMAP text, PNG, OpenEXR."""
+"""File formats of other programs: PLY, SPZ, SOG, glTF, 4dgs, OpenUSD, HTML, poses, camera files, PNG and OpenEXR."""

@@ -1,4 +1,4 @@
-"""Scenes as 4dgs files: the Object Table names what moves together, SE(3) tracks move it (docs/reference/4dgs.md).
+"""Scenes as 4dgs files: an Object Table of pieces that move together, with SE(3) tracks (docs/reference/4dgs.md).
 
 The Gaussians are those of t_max. Each piece of a scene that moves, or belongs to an object, is an object of the file;
 static Gaussians of the background are 0. A track maps the world at t_max to the world at a time, x' = R x + T.

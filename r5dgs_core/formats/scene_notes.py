@@ -1,6 +1,6 @@
-"""What files of other formats hold of a scene for our own programs: names, groups, models, cameras, bands as JSON.
+"""Notes of a scene in files of other formats, for our own programs: names, groups, models, cameras, bands as JSON.
 
-The entries are those of ``scene.json``, and times, sky and stored words.
+They have the entries of ``scene.json`` and further ones for times, sky and stored words.
 """
 
 from __future__ import annotations
