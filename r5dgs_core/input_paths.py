@@ -1,4 +1,4 @@
-"""Checks of path arguments. Only needs the standard library, so that a wrong path is reported at once.
+"""Checks of path arguments. Needs only the standard library, so that a wrong path is reported at once.
 
 A path without read permission passes: the code that opens it reports the reason.
 """

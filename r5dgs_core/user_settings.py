@@ -1,6 +1,6 @@
 """User settings: paths of weights and of the worker's Python, in the platform's configuration folder.
 
-The file is TOML with one ``key = "value"`` per line. Only needs the standard library.
+The file is TOML with one ``key = "value"`` per line. Needs only the standard library.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Names of the tasks of the report, in its order. Only needs the standard library, for the command line."""
+"""Names of the tasks of the report, in its order. Needs only the standard library, for the command line."""
 
 from __future__ import annotations
 

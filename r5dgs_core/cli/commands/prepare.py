@@ -63,13 +63,13 @@ def _add_cameras(p: argparse.ArgumentParser) -> None:
     p.add_argument("--board", metavar="KIND:COLUMNSxROWS:LENGTH:DETAIL:MARKERS", help=board)
     p.add_argument("--lenses", type=Path, metavar="FILE", help="calibration whose lenses, but not poses, are used")
     p.add_argument("--shared-lens", action="store_true", help="all cameras have the same lens and zoom")
-    moving = "this camera moves; may be repeated (a single camera always does)"
+    moving = "this camera moves, as a single camera always does; may be repeated"
     p.add_argument("--moving", action="append", default=[], metavar="CAMERA", help=moving)
     distance = "distance between two cameras without a calibration, in metres"
     p.add_argument("--distance", nargs=3, metavar=("CAMERA", "CAMERA", "M"), help=distance)
     scale = "metres per unit of the cameras' world (default: that of the calibration)"
     p.add_argument("--scale", type=options.positive, metavar="M", help=scale)
-    up = "up of the world: cameras, plane, board or a vector x,y,z (default: that of the calibration, else cameras)"
+    up = "up direction of the world: cameras, plane, board or x,y,z (default: that of the calibration, else cameras)"
     p.add_argument("--up", metavar="UP", help=up)
 
 
