@@ -37,6 +37,7 @@ from scipy.spatial.transform import Rotation
 
 from r5dgs_core.motion import models
 from r5dgs_core.motion_fit import model_selection
+from r5dgs_core.motion_fit import noise as noises
 
 from . import scoring
 from . import simulated_tracks as simulated
@@ -74,7 +75,13 @@ def measure(name: str, noise: simulated.Noise, seed: int) -> dict[str, Any]:
     relative = track.turns * track.turns[-1].inv()
     start = time.process_time()
     fit = model_selection.fit(
-        track.times, _quats(relative), track.places - track.places[-1], radius=simulated.RADIUS, inertia=track.inertia
+        track.times,
+        _quats(relative),
+        track.places - track.places[-1],
+        radius=simulated.RADIUS,
+        inertia=track.inertia,
+        least_noise=noises.of_images(simulated.RADIUS) if noise.slow else (0.0, 0.0),
+        drift=track.claimed,
     )
     spent = 1e3 * (time.process_time() - start)
     tau = track.later - track.times[-1]

@@ -49,6 +49,11 @@ MOTIONS: dict[str, Maker] = {
 }
 
 
+SLOW_PLACE, SLOW_DEGREES = (0.0015, 0.015), (0.3, 3.0)  # ranges of slow errors: body sizes, degrees
+SLOW_LENGTH = (0.1, 1.5)  # range of their correlation length, in observed spans
+CLAIM = 1.9  # typical ratio of claimed to true slow errors, or its inverse
+
+
 @dataclass(frozen=True)
 class Noise:
     """Noise of observed poses.
@@ -58,12 +63,14 @@ class Noise:
         degrees: The same of rotations.
         correlation: Correlation with the previous pose.
         outliers: Share of poses that are ten times as noisy.
+        slow: True for additional `slow_errors`, as tracks from images have.
     """
 
     place: float
     degrees: float
     correlation: float = 0.0
     outliers: float = 0.0
+    slow: bool = False
 
 
 NOISES = {
@@ -72,6 +79,7 @@ NOISES = {
     "heavy": Noise(0.005, 0.8, outliers=0.05),
     "coarse": Noise(0.02, 3.0),
     "low": Noise(0.001, 0.2),
+    "slow": Noise(0.001, 0.2, slow=True),
 }
 
 
@@ -88,6 +96,7 @@ class Draw:
         true_turns: True rotations there. [H]
         motion: The motion.
         inertia: Inertia of the body in its last observed pose, world axes. [3, 3]
+        claimed: Standard deviations that are claimed for slow errors of places, world units, and rotations, rad.
     """
 
     times: np.ndarray
@@ -98,6 +107,28 @@ class Draw:
     true_turns: Rotation
     motion: Motion
     inertia: np.ndarray
+    claimed: tuple[float, float]
+
+
+def slow_errors(rng: np.random.Generator, times: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
+    """Draw errors that change slowly, with mean zero, and the standard deviations that are claimed for them.
+
+    Args:
+        rng: Random generator.
+        times: Observed times. [S]
+
+    Returns:
+        Errors of places, world units, and of rotations, rad [S, 6]; claimed deviations of both, per component.
+    """
+    place, degrees = (math.exp(rng.uniform(*np.log(x))) for x in (SLOW_PLACE, SLOW_DEGREES))
+    true = 2 * RADIUS * place, math.radians(degrees)
+    claimed = true[0] * CLAIM ** rng.normal(), true[1] * CLAIM ** rng.normal()
+    apart = np.abs(times[:, None] - times) / (times[-1] - times[0]) / math.exp(rng.uniform(*np.log(SLOW_LENGTH)))
+    kernel = np.exp(-apart) if rng.random() < 0.5 else np.exp(-0.5 * apart**2)
+    values = np.linalg.cholesky(kernel + 1e-9 * np.eye(len(times))) @ rng.normal(size=(len(times), 6))
+    values -= values.mean(0)
+    spread = np.sqrt((values**2).mean(0).reshape(2, 3).mean(1))
+    return values * np.repeat(np.array(true) / spread, 3), claimed
 
 
 def draw(name: str, noise: Noise, seed: int, poses: int = POSES) -> Draw:
@@ -113,15 +144,17 @@ def draw(name: str, noise: Noise, seed: int, poses: int = POSES) -> Draw:
     for i in range(1, poses):
         values[i] = rho * values[i - 1] + math.sqrt(1 - rho**2) * values[i]
     values *= np.where(rng.uniform(size=(poses, 1)) < noise.outliers, 10.0, 1.0)
+    slow, claimed = slow_errors(rng, times) if noise.slow else (np.zeros((poses, 6)), (0.0, 0.0))
     slip = np.where(np.arange(poses)[:, None] >= poses - motion.slipped, motion.slip, 0.0)
     return Draw(
         times,
-        places + noise.place * 2 * RADIUS * values[:, :3],
-        turned(math.radians(noise.degrees) * values[:, 3:]) * turns * turned(slip),
+        places + noise.place * 2 * RADIUS * values[:, :3] + slow[:, :3],
+        turned(math.radians(noise.degrees) * values[:, 3:] + slow[:, 3:]) * turns * turned(slip),
         later,
         *motion.path(later),
         motion,
         matrix @ box_inertia() @ matrix.T,
+        claimed,
     )
 
 
