@@ -1,0 +1,1 @@
+"""Exported glTF files in stock viewers."""
