@@ -66,10 +66,10 @@ class Trainer:
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         self.behind = train_views.behind(dataset, config)
         self.given_views = train_views.load(dataset, self.normalization, self.behind)
-        self.discovered_masks = None if discovered_masks is None else packed_masks.pack(discovered_masks)
-        shown = (
-            self.given_views if discovered_masks is None else train_views.with_masks(self.given_views, discovered_masks)
-        )
+        self.discovered_masks, shown = None, self.given_views
+        if discovered_masks is not None:
+            self.discovered_masks = packed_masks.pack(discovered_masks)
+            shown = train_views.with_masks(self.given_views, discovered_masks)
         motion = registry.configured(config, at_rest=still.applies(self.given_views, config))
         if not motion.moves:
             self.config = config = config.replace(**{"train.shading": False, "train.shadows": False})
@@ -96,6 +96,8 @@ class Trainer:
         self.distinct_cameras = [group[0].camera for group in train_views.by_camera(self.given_views, MAX_CAMERAS)]
         self._targets: dict[int, Tensor] = {}
         self.refinement = Refinement(rig.of(self.given_views), spacing(self.times), config.train.iterations)
+        if start.colors is not None:
+            self.refinement.begin_colors(start.colors)
         self.views = RefinedViews(self.given_views, self.refinement)  # corrects a camera on each access
         self._classes: Remembered[Tensor] = Remembered()  # of the motion groups of the Gaussians
         white = self.behind is not None and bool((self.behind == 1).all())
@@ -218,17 +220,7 @@ class Trainer:
         together = self.identity is not None and self.identity.with_geometry
         if self.identity is not None and together:
             colors, background = self.identity.channels(self.gaussians, colors, background)
-        image = rasterize_splats(
-            splats.means,
-            splats.quats,
-            splats.scales,
-            splats.opacities,
-            colors,
-            camera,
-            background,
-            settings=DRAFT,
-            stats=stats,
-        ).image
+        image = _rasterized(splats, colors, camera, background, stats)
         return (image[..., :3].contiguous(), image[..., 3:], splats) if together else (image, None, splats)
 
     def render(
@@ -236,17 +228,8 @@ class Trainer:
     ) -> Tensor:
         """Render a camera in normalised coordinates at a time, with the sky of another camera if given. [H, W, 3]"""
         splats = self.splats(camera, t)
-        return rasterize_splats(
-            splats.means,
-            splats.quats,
-            splats.scales,
-            splats.opacities,
-            splats.colors,
-            camera,
-            self.background.image(camera if behind is None else behind),
-            settings=DRAFT,
-            stats=stats,
-        ).image
+        background = self.background.image(camera if behind is None else behind)
+        return _rasterized(splats, splats.colors, camera, background, stats)
 
     def splats(self, camera: Camera, t: float) -> fused_posing.PosedSplats:
         """Return activated Gaussians in normalised coordinates at a time, as seen by a camera."""
@@ -304,7 +287,7 @@ class Trainer:
             tensors[checkpoint_content.FROZEN] = self.frozen
         tensors |= self.densifier.tensors() | self.refinement.tensors()
         tensors |= optimizers.tensors(self.optimizer)
-        x, y, z = (float(v) for v in self.dataset.origin + self.normalization.origin)
+        x, y, z = (self.dataset.origin + self.normalization.origin).tolist()
         return Checkpoint(
             tensors={n: t.detach().to("cpu", copy=True) for n, t in tensors.items()},
             representation=self.motion.name,
@@ -347,3 +330,15 @@ class Trainer:
         self.first_time = state.first_time
         self.curriculum.queue = list(state.queue)
         self._loss = RunningLoss(state.running_loss)
+
+
+def _rasterized(
+    splats: fused_posing.PosedSplats,
+    colors: Tensor,
+    camera: Camera,
+    background: Tensor | None,
+    stats: RasterStats | None,
+) -> Tensor:
+    """Return the picture of posed Gaussians with these colours. [H, W, C]"""
+    shapes = splats.means, splats.quats, splats.scales, splats.opacities
+    return rasterize_splats(*shapes, colors, camera, background, settings=DRAFT, stats=stats).image

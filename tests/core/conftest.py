@@ -54,7 +54,7 @@ def shared_starts():
         if any(view.mask is None for view in views) or len({view.t for view in views}) == 1:
             return start(views, config, motion, find_sky, rng, cloud)
         train = config.train
-        shown = (train.sh_degree, train.shadows, train.shading, train.representation)
+        shown = (train.sh_degree, train.shadows, train.shading, train.representation, config.needs.camera_colours)
         settings = (config.init, config.curriculum, shown, motion.name)
         given = (views, settings, find_sky, rng.bit_generator.state, cloud)
         key = hashlib.sha1(pickle.dumps(given)).digest()

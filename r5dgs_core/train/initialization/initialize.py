@@ -17,7 +17,17 @@ from ...model.gaussians import Gaussians
 from ...scene.sampling import spread
 from ..representations.representation import TRACKS, Representation
 from ..train_views import TrainView, by_camera, nearest_knot
-from . import background_images, evidence, place_gaussians, plane_sweep, scatter, shadows, triangulation, visual_hull
+from . import (
+    background_images,
+    color_balance,
+    evidence,
+    place_gaussians,
+    plane_sweep,
+    scatter,
+    shadows,
+    triangulation,
+    visual_hull,
+)
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +73,7 @@ class InitialState:
         plane: Unit normal and offset (n . x = h) of the supporting plane, or None.
         sky: Coefficients of the sky, or None if none was found. [9, 3]
         evidence: Evidence of the images on the objects' motion.
+        colors: Colours of the cameras; None if they were not compared or do not differ.
     """
 
     gaussians: Gaussians
@@ -73,6 +84,7 @@ class InitialState:
     plane: tuple[np.ndarray, float] | None
     sky: np.ndarray | None
     evidence: evidence.BodyEvidence
+    colors: color_balance.ColorBalance | None = None
 
 
 def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
@@ -129,11 +141,11 @@ def start(
     first = 0 if config.curriculum.start == "first" else _first_time(places, len(times))
     if by_motion and config.curriculum.start != "first":
         first = (len(times) - 1) // 2
-    centers, translations, clouds = _bodies(views, times, places, first, init, rng)
     backgrounds = background_images.compute(_at_once(views, times, first) if by_motion else views)
     # With random points, the sweep serves only to find the sky and the plane.
     swept = min(init.background_points, 5000) if init.placement == "random" else init.background_points
-    search = plane_sweep.Sweep(backgrounds, swept, init.sweep_depths)
+    views, backgrounds, search, colors = _balanced(views, backgrounds, swept, config)
+    centers, translations, clouds = _bodies(views, times, places, first, init, rng)
     eyes = np.stack([v.camera.center for v in views])
     plane = supporting_plane(search.distinct_points(), places, eyes, rng)
     placed = search.place(swept, plane, find_sky, rng)
@@ -156,7 +168,33 @@ def start(
     tracks = FirstTracks(times, centers, translations, casters, None if plane is None else plane[0], slope, to_light)
     ids = np.concatenate([[0], places.object_ids])
     seen = evidence.gather(views, places, times)
-    return InitialState(gaussians, tracks, ids, places, first, plane, placed.sky, seen)
+    return InitialState(gaussians, tracks, ids, places, first, plane, placed.sky, seen, colors)
+
+
+def _balanced(
+    views: Sequence[TrainView], backgrounds: Sequence[background_images.BackgroundImage], points: int, config: Config
+) -> tuple[
+    Sequence[TrainView],
+    Sequence[background_images.BackgroundImage],
+    plane_sweep.Sweep,
+    color_balance.ColorBalance | None,
+]:
+    """Sweep the background images for a number of points, with corrected colours if the fixed cameras differ.
+
+    Returns:
+        Views and background images in corrected colours, their sweep, and the colours of the cameras. These are None if
+        some camera has no background image, or the cameras do not differ.
+    """
+    depths, wanted = config.init.sweep_depths, config.needs.camera_colours
+    search = plane_sweep.Sweep(backgrounds, points, depths)
+    names = {view.camera.name for view in views}
+    if wanted == "off" or len(names) < 2 or names != {b.camera.name for b in backgrounds} or len(names) == len(views):
+        return views, backgrounds, search, None
+    colors = color_balance.find(backgrounds, search, depths, forced=wanted == "on")
+    if colors is None:
+        return views, backgrounds, search, None
+    balanced = colors.backgrounds(backgrounds)
+    return colors.views(views), balanced, plane_sweep.Sweep(balanced, points, depths), colors
 
 
 def _warn(views: Sequence[TrainView], motion: type[Representation]) -> None:

@@ -189,6 +189,26 @@ class Sweep:
         chosen = rng.choice(len(points), min(count, len(points)), replace=False, p=weights / weights.sum())
         return BackgroundPoints(points[chosen], color[usable][chosen], coefficients)
 
+    def matches(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return points that cameras see at one distinct depth.
+
+        Returns:
+            Points [P, 3], the background image of each [P], and a mask of the other background images that confirm it
+            [B, P].
+        """
+        eyes = [np.broadcast_to(self.backgrounds[r.image].camera.center, r.directions.shape) for r in self.rays]
+        if not self.rays:
+            return np.zeros((0, 3)), np.zeros(0, int), np.zeros((len(self.backgrounds), 0), bool)
+        depth = _flatten([r.depths for r in self.rays])
+        points = _flatten(eyes) + _flatten([r.directions for r in self.rays]) * depth[:, None]
+        agreed = self._agreed(points, depth)
+        clear = _flatten([(r.costs < GOOD) & ~r.flat & ~r.sky for r in self.rays])
+        clear &= agreed.sum(0) >= min(CONFIRMATIONS, len(self.rays) - 1)
+        seen = np.zeros((len(self.backgrounds), len(points)), bool)
+        seen[[r.image for r in self.rays]] = agreed
+        owners = np.concatenate([np.full(r.depths.size, r.image) for r in self.rays])
+        return points[clear], owners[clear], seen[:, clear]
+
     def _confirmed(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Mask of points at whose depth other cameras found a surface, too. [P] bool
 
@@ -200,9 +220,13 @@ class Sweep:
             points: Points on all rays, in the order of the rays. [P, 3]
             depth: Depth of each in its own camera. [P]
         """
+        return self._agreed(points, depth).sum(0) >= min(CONFIRMATIONS, len(self.rays) - 1)
+
+    def _agreed(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Mask of the other cameras with rays that found a surface at each point. Arguments of `_confirmed`. [K, P]"""
         owner = np.concatenate([np.full(r.depths.size, k) for k, r in enumerate(self.rays)])
         maps = np.split(depth, np.cumsum([r.depths.size for r in self.rays])[:-1])
-        agreed = np.zeros(len(points), int)
+        agreed = np.zeros((len(self.rays), len(points)), bool)
         for k, (rays, values) in enumerate(zip(self.rays, maps, strict=True)):
             camera = self.backgrounds[rays.image].camera
             height, width = rays.depths.shape
@@ -212,8 +236,8 @@ class Sweep:
             row, column = row[visible].astype(int), column[visible].astype(int)
             inverse = np.pad(1 / values.reshape(height, width), 1, mode="edge")
             beside = sliding_window_view(inverse, (3, 3)).reshape(height, width, 9)[row, column]
-            agreed[visible] += (np.abs(beside - 1 / z[visible, None]) <= self._step).any(1)
-        return agreed >= min(CONFIRMATIONS, len(self.rays) - 1)
+            agreed[k, visible] = (np.abs(beside - 1 / z[visible, None]) <= self._step).any(1)
+        return agreed
 
     def _up(self) -> np.ndarray:
         """Mean upward direction of the cameras, unit. [3]"""

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ...scene.camera_correction import POSE, Correction
+from ..initialization.color_balance import ColorBalance
 from ..representations.fused_posing import PosedSplats
 from ..train_views import TrainView
 from . import gauge
@@ -111,7 +112,7 @@ class Refinement:
             iteration: The step.
             changes: Change of the correction of some poses, as for `Correction.plus`; each [COUNT].
         """
-        if not self.active:
+        if self._gauge is None:
             self._begin = iteration
             chosen = points[:: max(1, len(points) // gauge.POINTS)]
             self._units = np.stack([gauge.pixel_units(camera, chosen) for camera in self.rig.cameras])
@@ -126,6 +127,14 @@ class Refinement:
             self._time.values[lens] += new.time / shared[lens]
             color = np.stack([np.diag(new.gain) - 1, new.offset], axis=1)
             self._color.values[lens] += color / shared[lens]
+        self._fix()
+
+    def begin_colors(self, balance: ColorBalance) -> None:
+        """Begin to train the colours of all lenses, from those of the background images."""
+        rows = [balance.names.index(name) for name in self.rig.lens_names]
+        self.parts |= {"camera_colours"}
+        self.gains = np.array([balance.gain_db if part == "camera_colours" else math.nan for part in PARTS])
+        self._color.values[:] = np.stack([balance.gains[rows] - 1, balance.offsets[rows]], axis=-1)
         self._fix()
 
     def correction(self, row: int) -> Correction:
@@ -239,7 +248,8 @@ class Refinement:
             "begin": np.array(self._begin),
         }
         if self.active:
-            named["units"] = self._units
+            if self._gauge is not None:
+                named["units"] = self._units
             for name, rows in self._kinds().items():
                 named |= {f"{name}.{field}": value for field, value in vars(rows).items()}
         return {PREFIX + name: torch.from_numpy(np.array(value)) for name, value in named.items()}
@@ -254,7 +264,7 @@ class Refinement:
         for name, rows in self._kinds().items():
             for field, values in vars(rows).items():
                 values[...] = named[f"{name}.{field}"] if self.active else 0.0
-        if self.active:
+        if "units" in named:
             self._units = named["units"]
             self._gauge = gauge.Gauge(self.rig.cameras, self._units)
 

@@ -10,7 +10,7 @@ from r5dgs_core.data import dataset as datasets
 from r5dgs_core.raster import rasterize_splats
 from r5dgs_core.scene import cameras
 from r5dgs_core.scene.camera_correction import Correction
-from r5dgs_core.train import run
+from r5dgs_core.train import run, train_views
 from r5dgs_core.train.refinement import refined_dataset, refinement, trial
 from r5dgs_core.train.refinement.refinement import PARTS
 from r5dgs_core.train.representations.fused_posing import PosedSplats
@@ -26,8 +26,9 @@ def jittered(data, sizes, seed=0):
     """The data set with wrong cameras: rotations (rad) and colours (gain)."""
     rng, turn, gain = np.random.default_rng(seed), sizes.get("turn", 0.0), sizes.get("gain", 0.0)
     given = datasets.read(data.root)
-    wrong = {name: Correction(rotvec=rng.normal(0, turn, 3)) for name in {v.camera.name for v in given.train}}
-    gains = {name: 1 + gain * rng.choice([-1, 1], 3) for name in sorted(wrong)}
+    names = sorted({v.camera.name for v in given.train})
+    wrong = {name: Correction(rotvec=rng.normal(0, turn, 3)) for name in names}
+    gains = {name: 1 + gain * rng.choice([-1, 1], 3) for name in names}
     train = tuple(dataclasses.replace(v, camera=wrong[v.camera.name].camera(v.camera)) for v in given.train)
     return dataclasses.replace(given, train=train), gains
 
@@ -120,6 +121,42 @@ def test_wrong_colours_are_found_and_corrected(tiny):
     true = np.stack([gains[name] for name in names])
     before, after = (np.abs(gain / gain.mean(0) - true / true.mean(0)).mean() for gain in (np.ones_like(true), found))
     assert after < 0.8 * before
+
+
+def test_colours_are_corrected_before_gaussians_are_placed(tiny, monkeypatch):
+    dataset, gains = jittered(tiny, {"gain": 0.15})
+    load = train_views.load
+
+    def recolored(*arguments):
+        return [
+            dataclasses.replace(
+                view, image=np.clip(np.round(view.image * gains[view.camera.name]), 0, 255).astype(np.uint8)
+            )
+            for view in load(*arguments)
+        ]
+
+    monkeypatch.setattr(train_views, "load", recolored)
+    trainer = Trainer(dataset, tiny_datasets.settings(*STEPS))
+    assert trainer.refinement.parts == {"camera_colours"}
+    names = trainer.refinement.rig.names
+
+    def error(trainer):
+        found = np.stack([np.diag(trainer.refinement.correction(row).gain) for row in range(len(names))])
+        true = np.stack([gains[name] for name in names])
+        return np.abs(found / found.mean(0) - true / true.mean(0)).mean()
+
+    untouched = np.mean([np.abs(gain - 1) for gain in gains.values()])
+    assert error(trainer) < 0.5 * untouched
+    resumed = Trainer(dataset, trainer.config)
+    resumed.restore(trainer.state())
+    for _ in range(3):
+        run.take_step(trainer, None, lambda event: None)
+        run.take_step(resumed, None, lambda event: None)
+    found = resumed.state().tensors
+    for name, tensor in trainer.state().tensors.items():
+        assert torch.equal(tensor, found[name]) or name == "refine.gains", name
+    off = Trainer(dataset, tiny_datasets.settings(*STEPS, "needs.camera_colours=off"))
+    assert not off.refinement.active
 
 
 def test_a_restored_run_continues_exactly(wrong, refined):
