@@ -38,7 +38,7 @@ def _check_folder(path: Path, pictures: Path | None) -> list[Finding]:
     if (path / input_paths.RUN_FILE).exists():
         from . import run
 
-        return run.check(path)
+        return run.check(path, pictures)
     from ..prepare import capture_file
     from . import data
 

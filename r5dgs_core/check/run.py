@@ -14,8 +14,8 @@ if TYPE_CHECKING:  # torch
     from ..train.run_folder import Run
 
 
-def check(folder: Path) -> list[Finding]:
-    """Return all faults of a run folder."""
+def check(folder: Path, pictures: Path | None = None) -> list[Finding]:
+    """Return all faults of a run folder and its data set; pictures of those of the capture go to a folder if given."""
     from ..train import run_folder
 
     collect = Collector(CODES, "R01")
@@ -34,7 +34,7 @@ def check(folder: Path) -> list[Finding]:
     for path in sorted(folder.glob("*.r5dgs")):
         collect.findings += scene.check(path)
     if run is not None:
-        _check_data(run, collect)
+        _check_data(run, collect, pictures)
     return collect.findings
 
 
@@ -59,7 +59,7 @@ def _check_checkpoints(folder: Path, collect: Collector) -> int | None:
     return steps
 
 
-def _check_data(run: Run, collect: Collector) -> None:
+def _check_data(run: Run, collect: Collector, pictures: Path | None) -> None:
     from ..data import dataset
 
     root = None
@@ -68,7 +68,7 @@ def _check_data(run: Run, collect: Collector) -> None:
     if root is None:
         return
     section = run.config.data
-    collect.findings += data.check(root, section.masks, section.min_registered)
+    collect.findings += data.check(root, section.masks, section.min_registered, pictures)
     try:
         found = dataset.read(root, section.masks, section.min_registered)
     except errors.R5dgsError:

@@ -62,9 +62,7 @@ def make(scene: Scene, settings: Settings) -> Schedule:
     fps = settings.fps or path.fps or FPS
     first, horizon = float(scene.tracks.times[0]), max(predictability.horizon(scene), scene.t_max)
     if settings.time is not None and settings.time[0] < first:
-        raise errors.ConfigError(
-            f"--time {settings.time[0]:g}: expected scene times from the first observed one, {first:g}, on"
-        )
+        raise errors.ConfigError(f"--time {settings.time[0]:g}: {_expected(first)}")
     if not settings.is_folder and not settings.is_video:
         t = scene.t_max if settings.time is None else settings.time[0]
         return Schedule((_shot(settings, 1, path.cameras(1)[0], t),), fps, (first, max(horizon, t)))
@@ -73,11 +71,17 @@ def make(scene: Scene, settings: Settings) -> Schedule:
     times = np.linspace(start, end, count)
     if settings.time is None and path.times is not None:
         own = path.times
+        if own.min() < first:
+            raise errors.ConfigError(f"--camera {settings.camera[0]}: 'render_time' {own.min():g}: {_expected(first)}")
         times = np.interp(np.linspace(0, len(own) - 1, count), np.arange(len(own)), own)
     found = zip(path.cameras(count), times.tolist(), strict=True)
     shots = tuple(_shot(settings, number, camera, t) for number, (camera, t) in enumerate(found, 1))
     low, high = float(times.min()), float(times.max())
     return Schedule(shots, fps, (low, high) if low < high else (first, max(horizon, high)))
+
+
+def _expected(first: float) -> str:
+    return f"expected scene times from the first observed one, {first:g}, on"
 
 
 def _path(scene: Scene, settings: Settings) -> CameraPath:

@@ -119,8 +119,9 @@ def _check_numbers(settings: Settings) -> None:
         raise errors.UsageError(f"--fps {settings.fps:g}: expected at most {MAX_FPS:g}")
     if settings.size is not None:
         width, height = settings.size
+        given = f"--size {width}x{height}" if width else f"--size {height}"
         sides = [side for side in settings.size if side]
         if not all(SIZES[0] <= side <= SIZES[1] for side in sides):
-            raise errors.UsageError(f"--size {width}x{height}: expected sides of {SIZES[0]} to {SIZES[1]} pixels")
+            raise errors.UsageError(f"{given}: expected sides of {SIZES[0]} to {SIZES[1]} pixels")
         if settings.even and (width % 2 or height % 2):
-            raise errors.UsageError(f"--size {width}x{height}: {settings.suffix} needs even numbers of pixels")
+            raise errors.UsageError(f"{given}: {settings.suffix} needs even numbers of pixels")

@@ -46,7 +46,7 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
 
 FORMAT = registry.Format(
     name="sog",
-    label="Compressed Gaussians",
+    label="Compressed Gaussians, SOG",
     suffix=".sog",
     keeps="Gaussians of one time with their shading (quantised), y down; one file per frame",
     loses="motion between frames, objects, names, sky, cameras",

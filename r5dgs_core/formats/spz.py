@@ -68,7 +68,7 @@ def losses(scene: Scene) -> list[str]:
 
 FORMAT = registry.Format(
     name="spz",
-    label="Compressed Gaussians",
+    label="Compressed Gaussians, SPZ",
     suffix=".spz",
     keeps="Gaussians of one time with their shading (quantised), y up; one file per frame",
     loses="motion between frames, objects, names, sky, cameras",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.film import schedule
+from r5dgs_core.film import camera_path, schedule
 from r5dgs_core.film.settings import Settings
 from r5dgs_core.scene import predictability
 from r5dgs_core.scene.units import Units
@@ -68,9 +68,13 @@ def test_pictures_have_the_size_that_is_asked_for(scene, out, size, found):
     assert (shot.camera.width, shot.camera.height) == found
 
 
-def test_times_before_the_first_observed_one_are_outside(scene):
+def test_times_before_the_first_observed_one_are_outside(scene, monkeypatch):
     with pytest.raises(errors.ConfigError, match="--time -0.5: expected scene times from the first observed one, 0"):
         made(scene, time=(-0.5, 0.5))
+    path = camera_path.lines([scene.cameras[0]] * 2, np.array([-1.0, 0.5]), None)
+    monkeypatch.setattr(schedule.path_file, "read", lambda *_: path)
+    with pytest.raises(errors.ConfigError, match="--camera path.json: 'render_time' -1: expected scene times"):
+        made(scene, camera=("path.json",))
     with pytest.raises(errors.ConfigError, match="more than 100000"):
         made(scene, seconds=1e6)
     with pytest.raises(errors.ConfigError, match="--camera 7: expected 0 to 1"):
