@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ... import errors, findings
 from .raw_dataset import RawDataset
 from .registry import CAMERAS_FILE
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # a layout is detected before numpy is imported
+    import numpy as np
+
     from ..transforms import Entry
 
 REMEDY = "prepare the data set again or remove it"
@@ -55,11 +55,13 @@ def read(root: Path, min_registered: float = 0.0, guard: findings.Guard = findin
         files.append(root / POINTS)
     if points is None:
         return RawDataset(entries, header, root, tuple(files))
-    return RawDataset(entries, header, root, tuple(files), points[:, :3], points[:, 3:].astype(np.float32))
+    return RawDataset(entries, header, root, tuple(files), points[:, :3], points[:, 3:].astype("float32"))
 
 
 def _points(path: Path) -> np.ndarray:
     """Read points and colours. [P, 6] float64"""
+    import numpy as np
+
     from .. import array_file
 
     with findings.coded("D25"):
