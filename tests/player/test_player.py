@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 
-from r5dgs_core.cli.commands import view
+from r5dgs_core.cli import page_server
 from r5dgs_core.formats import html, image_files, registry
 from r5dgs_core.scene.scene import Scene, Shading
 from tests.support import arms, player_checks, scenes
@@ -180,7 +180,8 @@ def test_without_webgl_a_picture_and_a_message_are_shown(browser, url):
 
 
 def test_view_serves_the_page(browser, scene):
-    with view.serving(html.page(scene, OPTIONS)) as server:
+    pages = {"/": page_server.Page(html.page(scene, OPTIONS))}
+    with page_server.serving(pages.get) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from r5dgs_core.cli.commands import view
+from r5dgs_core.cli import page_server
 from r5dgs_core.scene import scene_file
 from tests.support import scenes
 from tests.support.command_line import complaint
@@ -13,7 +13,7 @@ from tests.support.command_line import complaint
 
 @pytest.fixture
 def port():
-    with view.serving(b"the page") as server:
+    with page_server.serving({"/": page_server.Page(b"the page")}.get) as server:
         assert server.server_address[0] == "127.0.0.1"
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
