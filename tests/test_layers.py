@@ -129,7 +129,7 @@ COMMANDS = (
 # start fast, and the worker, which answers before torch is there and if it is missing.
 LATE_MODULES = {
     "api",
-    *("cli.inputs", "cli.options", "cli.pictures", *(f"cli.commands.{name}" for name in COMMANDS)),
+    *("cli.inputs", "cli.live_bake", "cli.options", "cli.pictures", *(f"cli.commands.{name}" for name in COMMANDS)),
     *("check", "check.run", "stability.training"),
     *("worker.further_layers", "worker.server", "worker.warming"),
 }
