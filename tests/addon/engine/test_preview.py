@@ -307,6 +307,7 @@ def test_an_error_of_a_preview_in_the_window_is_reported(blender, loaded, worker
     running = worker.current()
     os.kill(running.pid, signal.SIGSTOP)
     window = windowed()
+    patience.wait_until(lambda: window.operator._job.doing == "loading the scenes")  # an earlier death is no error
     os.kill(running.pid, signal.SIGKILL)
     window.operator._job.join()
     assert window.send("TIMER") == {"CANCELLED"} and window.removed == ["timer"]
