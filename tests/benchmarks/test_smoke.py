@@ -48,6 +48,7 @@ LONG = (  # more than five seconds each
     "futures.textures",
     "playback",
     "raster.first_frame",
+    "raster.frames",
     "raster.static_layer",
     "training.curve",
     "training.held_out_times",

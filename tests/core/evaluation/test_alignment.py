@@ -44,6 +44,7 @@ def test_refined_cameras_keep_their_corrections(data):
     assert found[data.val[0].camera.name].to_dict() == WRONG.to_dict()
 
 
+@pytest.mark.slow
 def test_corrections_of_a_run_travel_into_the_scene(tiny, tmp_path):
     settings = tiny_datasets.settings("train.iterations=100", "needs.camera_poses=on", "needs.camera_colours=on")
     made = run.train(tiny.root, tmp_path / "run", settings)

@@ -78,6 +78,7 @@ def test_processes_must_agree_on_the_settings(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == [frame_folder.SETTINGS]
 
 
+@pytest.mark.slow
 @pytest.mark.heavy
 def test_four_processes_of_which_one_is_killed_lose_and_double_no_frame(tmp_path):
     path, folder = scene_file.write(scenes.make_scene(n=2000), tmp_path / "a.r5dgs"), tmp_path / "frames"

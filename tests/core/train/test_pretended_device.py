@@ -72,7 +72,7 @@ GRAPHS = {
 }
 
 
-@pytest.mark.default_cases(*GRAPHS)
+@pytest.mark.default_cases("tracks")
 @pytest.mark.parametrize("name", GRAPHS)
 def test_steps_as_graphs_are_the_same_steps(tiny, name, monkeypatch):
     settings, kinds, weights = GRAPHS[name]
