@@ -49,6 +49,7 @@ LONG = (  # more than five seconds each
     "playback",
     "raster.first_frame",
     "raster.frames",
+    "raster.harmonics",
     "raster.static_layer",
     "training.curve",
     "training.held_out_times",

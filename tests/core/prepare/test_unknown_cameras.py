@@ -34,6 +34,7 @@ def unit(data):
     return json.loads((data / "transforms_train.json").read_text())["meters_per_unit"]
 
 
+@pytest.mark.slow
 def test_a_board_replaces_the_calibration(recordings, tmp_path, monkeypatch):
     known = {"board": CHARUCO, "distance": ("cam0", "cam2", 0.5)}
     found = prepared(recordings, tmp_path / "data", unknown=known, up="board")

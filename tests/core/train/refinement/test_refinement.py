@@ -96,6 +96,7 @@ def test_gradients_of_the_camera_are_those_of_the_picture():
     assert by_focal == pytest.approx(numeric[6], rel=0.1)
 
 
+@pytest.mark.slow
 def test_wrong_poses_are_found_and_corrected(tiny, wrong, refined):
     assert "camera_poses" in refined.refinement.parts
     truth = datasets.read(tiny.root)
@@ -159,6 +160,7 @@ def test_colours_are_corrected_before_gaussians_are_placed(tiny, monkeypatch):
     assert not off.refinement.active
 
 
+@pytest.mark.slow
 def test_a_restored_run_continues_exactly(wrong, refined):
     half = train(wrong[0], stop=90)
     resumed = Trainer(wrong[0], half.config)
@@ -171,6 +173,7 @@ def test_a_restored_run_continues_exactly(wrong, refined):
         assert torch.equal(tensor, found[name]), name
 
 
+@pytest.mark.slow
 def test_means_of_focal_lengths_clocks_and_colours_stay(refined):
     held = refined.refinement
     corrections = [held.correction(row) for row in range(held.rig.poses)]
@@ -179,6 +182,7 @@ def test_means_of_focal_lengths_clocks_and_colours_stay(refined):
     assert np.mean([c.log_focal for c in corrections]) == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_views_have_the_corrected_cameras(refined):
     row = int(refined.refinement.rig.pose_of[3])
     expected = refined.refinement.correction(row).camera(refined.given_views[3].camera)

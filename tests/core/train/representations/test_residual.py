@@ -377,7 +377,7 @@ def states(breathing, request):
     return settings, found
 
 
-@pytest.mark.default_cases("joint-0", "joint-1")
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [0, 1])
 def test_a_run_with_residuals_resumes_to_the_same_bits(breathing, states, tmp_path, k):
     settings, found = states
