@@ -153,6 +153,8 @@ LATE_IMPORTS = {
     # OpenImageIO is needed for images alone, not for words.
     "language.encoders.clip_encoder": {"data.images"},
     "language.encoders.open_clip_encoder": {"data.images"},
+    # matplotlib is slow to import and may be missing beside Blender; it draws the marker of time.
+    "film.film": {"film.time_marker"},
     # A scene at rest loads neither tracks nor networks.
     "bake.point_motion": {"train.representations.residual"},
     "train.representations.registry": {

@@ -16,7 +16,7 @@ from ..data import dataset as datasets
 from ..data import images
 from ..scene import spherical_harmonics
 from ..scene.scene import Scene
-from . import frame_folder, frame_renderer, multilayer, schedule, side_by_side, time_marker, video
+from . import frame_folder, frame_renderer, multilayer, schedule, side_by_side, video
 from .schedule import Schedule, Shot
 from .settings import Settings
 
@@ -138,6 +138,8 @@ class _Film:
         if self._captured is not None:
             pixels = side_by_side.joined([self._captured.at(shot), pixels])
         if self.settings.marker:
+            from . import time_marker  # imports matplotlib, which a plain picture does not need
+
             pixels = time_marker.draw(pixels, shot.t, self.scene.t_max, self.plan.span)
         return pixels
 
