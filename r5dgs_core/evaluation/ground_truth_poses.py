@@ -79,7 +79,7 @@ def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> t
         main = _body(scene, object_id)
         if main is None:
             continue
-        parts = [g for g in scene.groups if g.role == "body" and g.object_id == object_id]
+        parts = scene.bodies(object_id)
         groups = parts if parts and (every or len(rows) > 1) else [main]
         pairs = [[_paired(scene, ground_truth, group, row, observed) for row in rows] for group in groups]
         found += _matched(pairs, every)

@@ -71,10 +71,8 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
         views += [CameraFrame(f"images/{c.name}{end}", cameras.translated(c, scene.origin), t) for c in scene.cameras]
     if not views:
         raise errors.ConfigError(f"{scene.name}: expected cameras in the scene, found none; train it from a data set")
-    try:
+    with registry.writing(path):
         yield write_transforms(path, views)
-    except OSError as error:
-        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
 
 
 FORMAT = registry.Format(

@@ -7,19 +7,20 @@ static Gaussians of the background are 0. A track maps the world at t_max to the
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import atomic_files, errors, extras
+from .. import atomic_files, extras
 from ..motion import rotations
 from ..playback import group_curves, played_splats
 from ..playback.group_dynamics import GroupMotion
 from ..playback.scene_player import Player, available
-from ..scene import predictability, spherical_harmonics
+from ..scene import spherical_harmonics
 from ..scene.scene import Scene
 from ..scene.splats import Splats, to_opacities
 from . import glb_motion, linear_times, registry, scene_nodes, scene_notes
@@ -39,13 +40,14 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
         import fourdgs
     pieces = scene_nodes.pieces(scene, options.object_ids)
     start = float(scene.tracks.times[0])
-    end = max(scene.t_max, predictability.horizon(scene) if options.until is None else options.until)
+    end = scene_nodes.end(scene, options)
     ids = {(piece.object_id, piece.group): number for number, piece in enumerate(_numbered(pieces), 1)}
     rows = np.concatenate([np.arange(piece.rows.start, piece.rows.stop) for piece in pieces])
     members = np.concatenate([np.full(p.rows.stop - p.rows.start, ids.get(p[1:], 0)) for p in pieces])
     splats = played_splats.at(Player(scene), scene.t_max)
     gaussians = _gaussians(fourdgs, Splats(**{f: getattr(splats, f)[rows] for f in _FIELDS}), members)
-    moving = {group: _track(scene, group, end) for group in {piece.group for piece in pieces} - {0}}
+    poses_at = functools.cache(GroupMotion(scene).poses)  # of all groups; their tracks share most times
+    moving = {group: _track(scene, poses_at, group, end) for group in {piece.group for piece in pieces} - {0}}
     names = {item.id: item.name for item in scene.objects}
     layer = fourdgs.ObjectLayer(
         table=fourdgs.ObjectTable(
@@ -63,11 +65,8 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     )
     settings = fourdgs.WriteOptions(profile="fine", objects=layer, metadata=_attributes(scene, end, ids))
     duration = glb_motion.seconds_per_unit(scene.units) * (end - start)
-    try:
-        with atomic_files.replacing_by_name(path) as temporary:
-            fourdgs.write(str(temporary), gaussians, duration, options=settings)
-    except (OSError, fourdgs.FourdgsError) as error:
-        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
+    with registry.writing(path, (fourdgs.FourdgsError,)), atomic_files.replacing_by_name(path) as temporary:
+        fourdgs.write(str(temporary), gaussians, duration, options=settings)
     yield path
 
 
@@ -101,12 +100,14 @@ def _gaussians(fourdgs: Any, splats: Splats, members: np.ndarray) -> Any:
     )
 
 
-def _track(scene: Scene, group: int, end: float) -> tuple[list[float], list[list[float]], list[list[float]]]:
+def _track(
+    scene: Scene, poses_at: Callable[[float], tuple[np.ndarray, np.ndarray]], group: int, end: float
+) -> tuple[list[float], list[list[float]], list[list[float]]]:
     """Seconds since the first observed time, rotations xyzw and translations of a group's track."""
-    motion, pivot = GroupMotion(scene), scene.groups[group].pivot
+    pivot = scene.groups[group].pivot
 
     def sample(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        poses = [motion.poses(t) for t in times.tolist()]
+        poses = [poses_at(t) for t in times.tolist()]
         quats, moves = np.array([q[group] for q, _ in poses]), np.array([d[group] for _, d in poses])
         return quats, pivot + moves - rotations.rotate(quats, pivot)
 

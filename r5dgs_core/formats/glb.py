@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from .. import atomic_files, errors
+from .. import atomic_files
 from ..motion import rotations
 from ..playback import modes
 from ..playback.scene_player import Player, available
-from ..scene import cameras, predictability
+from ..scene import cameras
 from ..scene.scene import MotionGroup, Scene
 from . import glb_motion, glb_splats, gltf, registry, scene_nodes, scene_notes
 
@@ -29,12 +29,9 @@ _Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from Blender's z up
 
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
     """Write a scene with its motion. Implements `registry.Format.write`."""
-    try:
-        with atomic_files.replacing(path) as stream:
-            content, arrays = build(scene, options)
-            gltf.write(stream, content, arrays)
-    except OSError as error:
-        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
+    with registry.writing(path), atomic_files.replacing(path) as stream:
+        content, arrays = build(scene, options)
+        gltf.write(stream, content, arrays)
     yield path
 
 
@@ -44,7 +41,7 @@ def build(scene: Scene, options: registry.Options) -> tuple[dict[str, Any], gltf
     tree = _Nodes()
     groups = _add_groups(scene, options, tree, arrays)
     _add_cameras(scene, tree)
-    end = max(scene.t_max, predictability.horizon(scene) if options.until is None else options.until)
+    end = scene_nodes.end(scene, options)
     played = _modes(scene)
     animations = [glb_motion.animation(scene, groups, end, arrays, *mode) for mode in played]
     up, size = _Y_UP @ cameras.WORLD_TO_BLENDER[scene.world_convention], scene.units.meters_per_unit

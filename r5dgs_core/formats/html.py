@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from .. import atomic_files, errors
+from .. import atomic_files
 from ..scene.scene import Scene
 from . import glb, gltf, registry
 
@@ -32,10 +32,8 @@ def page(scene: Scene, options: registry.Options) -> bytes:
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
     """Write a page. Implements `registry.Format.write`."""
     content = page(scene, options)
-    try:
+    with registry.writing(path):
         atomic_files.write(path, content)
-    except OSError as error:
-        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
     yield path
 
 

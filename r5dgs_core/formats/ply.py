@@ -78,12 +78,9 @@ def write(
         header.append("comment origin " + " ".join(repr(float(value)) for value in origin))
     header += [f"comment {text}" for text in comments]
     header += [f"element vertex {len(data)}", *(f"property {kinds[kind]} {name}" for name, kind, _ in columns)]
-    try:
-        with atomic_files.replacing(path) as stream:
-            stream.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
-            stream.write(data.tobytes())
-    except OSError as error:
-        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
+    with registry.writing(path), atomic_files.replacing(path) as stream:
+        stream.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+        stream.write(data.tobytes())
     return path
 
 

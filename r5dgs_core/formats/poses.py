@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import atomic_files, errors
+from .. import atomic_files
 from ..playback.object_poses import ObjectPoses
 from ..scene.scene import Scene
 from . import pose_table, registry
@@ -28,10 +28,8 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
         "predicted": table.predicted.tolist(),
         "objects": [_entry(one) for one in table.objects],
     }
-    try:
+    with registry.writing(path):
         atomic_files.write(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
-    except OSError as error:
-        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
     yield path
 
 

@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from .. import atomic_files, errors
+from .. import atomic_files
 from ..scene.scene import Scene
 from . import pose_table, registry
 
@@ -36,10 +36,8 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
             known = one.level is not None and predicted
             band = (float(one.half_widths[k]), float(one.half_angles[k]), one.level) if known else ("", "", "")
             rows.writerow((*head, *values, *band))
-    try:
+    with registry.writing(path):
         atomic_files.write(path, stream.getvalue().encode())
-    except OSError as error:
-        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
     yield path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import shutil
@@ -133,3 +134,20 @@ def usable(name: str) -> Format:
 def numbered(path: Path, frame: int) -> Path:
     """Insert a frame number into a path: scene.ply -> scene_0012.ply."""
     return path.with_name(f"{path.stem}_{frame:04d}{path.suffix}")
+
+
+@contextlib.contextmanager
+def writing(path: Path, also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Convert an OSError of the block to a SceneFileError that names the file.
+
+    Args:
+        path: The file.
+        also: Further exception types that a library raises if it cannot write.
+
+    Raises:
+        SceneFileError: The block raises OSError, or one of ``also``.
+    """
+    try:
+        yield
+    except (OSError, *also) as error:
+        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error

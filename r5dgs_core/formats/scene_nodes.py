@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import errors
-from ..scene import row_runs
+from ..scene import predictability, row_runs
 from ..scene.scene import Scene
+from .registry import Options
 
 
 class Piece(NamedTuple):
@@ -24,6 +25,11 @@ def check(scene: Scene, object_ids: Collection[int] | None) -> None:
     """Raise ConfigError if the selected objects (all if None) have no Gaussians."""
     if not any(item.count for item in scene.objects if object_ids is None or item.id in object_ids):
         raise errors.ConfigError(f"{scene.name}: expected Gaussians to export, found none in the selected objects")
+
+
+def end(scene: Scene, options: Options) -> float:
+    """Last scene time of a file with motion: `Options.until`, by default the horizon, and at least t_max."""
+    return max(scene.t_max, predictability.horizon(scene) if options.until is None else options.until)
 
 
 def pieces(scene: Scene, object_ids: Collection[int] | None) -> list[Piece]:
@@ -44,10 +50,7 @@ def pieces(scene: Scene, object_ids: Collection[int] | None) -> list[Piece]:
 def group_names(scene: Scene) -> list[str]:
     """Names of the motion groups: that of the object, with the number of the part if it has several bodies."""
     names = {item.id: item.name for item in scene.objects}
-    bodies: dict[int, list[int]] = {item.id: [] for item in scene.objects}
-    for group in scene.groups:
-        if group.role == "body":
-            bodies[group.object_id].append(group.id)
+    bodies = {item.id: [group.id for group in scene.bodies(item.id)] for item in scene.objects}
     found = []
     for group in scene.groups:
         name, own = names[group.object_id], bodies[group.object_id]

@@ -38,8 +38,7 @@ def of(scene: Scene, end: float, kind: Kind) -> dict[str, Any]:
     tree = json.loads(scene_json.dump(bare, head | format_features.to_json(bare)))
     outlooks = predictability.outlooks(scene)
     for item in tree["objects"]:
-        groups = [group for group in scene.groups if group.object_id == item["id"] and group.role == "body"]
-        item["motion"] = motion_words.motion_of(scene, groups)
+        item["motion"] = motion_words.motion_of(scene, scene.bodies(item["id"]))
         item["prediction"] = outlooks[item["id"]].prediction()
     return tree | {
         "track_times": scene.tracks.times.tolist(),

@@ -31,16 +31,17 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     axes = cameras.WORLD_TO_BLENDER["colmap"].T @ cameras.WORLD_TO_BLENDER[scene.world_convention]
     for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
         splats = turned_splats.turned(played_splats.at(player, t, options.object_ids), axes)
-        try:
-            with tempfile.TemporaryDirectory() as folder, atomic_files.replacing_by_name(target) as temporary:
-                source = ply.write(splats, Path(folder) / "gaussians.ply", plain=True)
-                command = [program, "--quiet", "--overwrite", "--gpu", "cpu", source, temporary]
-                done = subprocess.run(command, capture_output=True, text=True)
-                if done.returncode or not temporary.stat().st_size:
-                    said = (done.stderr or done.stdout).strip().splitlines()
-                    raise errors.BackendError(f"{target}: {PROGRAM} failed: {said[-1] if said else done.returncode}")
-        except OSError as error:
-            raise errors.SceneFileError(f"{target}: cannot be written: {error}") from error
+        with (
+            registry.writing(target),
+            tempfile.TemporaryDirectory() as folder,
+            atomic_files.replacing_by_name(target) as temporary,
+        ):
+            source = ply.write(splats, Path(folder) / "gaussians.ply", plain=True)
+            command = [program, "--quiet", "--overwrite", "--gpu", "cpu", source, temporary]
+            done = subprocess.run(command, capture_output=True, text=True)
+            if done.returncode or not temporary.stat().st_size:
+                said = (done.stderr or done.stdout).strip().splitlines()
+                raise errors.BackendError(f"{target}: {PROGRAM} failed: {said[-1] if said else done.returncode}")
         yield target
 
 

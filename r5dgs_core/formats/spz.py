@@ -44,11 +44,8 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
         bits = min(math.floor(math.log2(_STEPS / farthest)), _MOST_BITS)
         if bits < 0:
             raise errors.SceneFileError(f"{target}: SPZ holds positions up to {_STEPS}, found {farthest:g}")
-        try:
-            with atomic_files.replacing_by_name(target) as temporary:
-                gsply.write_spz(temporary, content, fractional_bits=bits)
-        except OSError as error:
-            raise errors.SceneFileError(f"{target}: cannot be written: {error}") from error
+        with registry.writing(target), atomic_files.replacing_by_name(target) as temporary:
+            gsply.write_spz(temporary, content, fractional_bits=bits)
         yield target
 
 

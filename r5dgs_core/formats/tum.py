@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import atomic_files, errors
+from .. import atomic_files
 from ..scene.scene import Scene
 from . import pose_table, registry
 
@@ -26,10 +26,8 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
         rows = np.column_stack([table.times, one.positions, one.quats[:, [1, 2, 3, 0]]])[order]
         lines = [f"# object {one.object_id}: {one.label!r}", *head, f"# {COLUMNS}"]
         lines += [" ".join(map(repr, row)) for row in rows.tolist()]
-        try:
+        with registry.writing(target):
             atomic_files.write(target, ("\n".join(lines) + "\n").encode())
-        except OSError as error:
-            raise errors.SceneFileError(f"{target}: cannot be written: {error}") from error
         yield target
 
 

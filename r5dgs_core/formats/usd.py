@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from .. import atomic_files, errors, extras
+from .. import atomic_files, extras
 from ..color import tints
 from ..motion import cubic_curves, rotations
 from ..playback import group_curves
 from ..playback.scene_player import Player, available
-from ..scene import cameras, predictability
+from ..scene import cameras
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
 from . import glb_motion, linear_times, registry, scene_nodes
@@ -38,12 +38,9 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     """Write a scene with its motion. Implements `registry.Format.write`."""
     pxr = _pxr()
     stage = build(scene, options)
-    try:
-        with atomic_files.replacing_by_name(path) as temporary:
-            if not stage.GetRootLayer().Export(str(temporary)):
-                raise OSError("OpenUSD failed")
-    except (OSError, pxr.Tf.ErrorException) as error:
-        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
+    with registry.writing(path, (pxr.Tf.ErrorException,)), atomic_files.replacing_by_name(path) as temporary:
+        if not stage.GetRootLayer().Export(str(temporary)):
+            raise OSError("OpenUSD failed")
     yield path
 
 
@@ -51,7 +48,7 @@ def build(scene: Scene, options: registry.Options) -> Any:
     """Content of a file, as a ``Usd.Stage``. Raises ConfigError if no Gaussian is selected."""
     pxr = _pxr()
     pieces = scene_nodes.pieces(scene, options.object_ids)
-    end = max(scene.t_max, predictability.horizon(scene) if options.until is None else options.until)
+    end = scene_nodes.end(scene, options)
     stage = pxr.Usd.Stage.CreateInMemory(f"{scene.name}.usda")
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.z)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, scene.units.meters_per_unit or 1.0)

@@ -75,7 +75,7 @@ def at(scene: Scene, times: Sequence[float], object_ids: Collection[int] | None 
     for item in scene.objects:
         if item.id <= 0 or (object_ids is not None and item.id not in object_ids):
             continue
-        own = [group for group in scene.groups if group.role == "body" and group.object_id == item.id]
+        own = scene.bodies(item.id)
         for number, group in enumerate(own, 1):
             q = quats[:, :, group.id]
             p = group.pivot + rotations.rotate(q, group.home - group.pivot) + moves[:, :, group.id]

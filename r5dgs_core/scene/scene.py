@@ -337,6 +337,10 @@ class Scene:
                 return candidate
         raise KeyError(object_id)
 
+    def bodies(self, object_id: int) -> list[MotionGroup]:
+        """Return the motion groups of an object's own bodies: one, several for an object with parts, or none."""
+        return [group for group in self.groups if group.role == "body" and group.object_id == object_id]
+
 
 def grouped(arrays: Mapping[str, np.ndarray | None]) -> dict[str, Any]:
     """Return fields of `Scene` from arrays by their names in a file.

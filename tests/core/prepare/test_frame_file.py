@@ -41,7 +41,9 @@ def test_transparent_pixels_are_white(tmp_path):
 
 
 def test_heic_frames_are_read(tmp_path):
-    pillow_heif = pytest.importorskip("pillow_heif")
+    pillow_heif = pytest.importorskip(
+        "pillow_heif", reason="pillow-heif is not installed; it comes with the extra 'heic'"
+    )
     pixels = np.full((64, 96, 3), (200, 90, 40), np.uint8)
     pillow_heif.from_bytes("RGB", (96, 64), pixels.tobytes()).save(tmp_path / "a.heic", quality=95)
     assert frame_file.size(tmp_path / "a.heic") == (96, 64)
