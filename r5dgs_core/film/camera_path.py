@@ -71,9 +71,15 @@ def lines(keys: Sequence[Camera], times: np.ndarray | None, fps: float | None) -
 
 def fitted(camera: Camera, width: int, height: int) -> Camera:
     """Return a camera with another image size and the whole view; another aspect ratio adds to two sides."""
-    scale = min(width / camera.width, height / camera.height)
-    inner = axes.resize(camera, max(round(scale * camera.width), 1), max(round(scale * camera.height), 1))
-    return axes.crop(inner, (inner.width - width) // 2, (inner.height - height) // 2, width, height)
+    size, left, top = placement((camera.width, camera.height), (width, height))
+    return axes.crop(axes.resize(camera, *size), -left, -top, width, height)
+
+
+def placement(size: tuple[int, int], into: tuple[int, int]) -> tuple[tuple[int, int], int, int]:
+    """Return size, left and top of a picture that is scaled as a whole into the middle of another one, in pixels."""
+    scale = min(into[0] / size[0], into[1] / size[1])
+    width, height = (max(round(scale * side), 1) for side in size)
+    return (width, height), -((width - into[0]) // 2), -((height - into[1]) // 2)
 
 
 def _between(keys: Sequence[Camera], count: int, *, smooth: bool) -> list[Camera]:

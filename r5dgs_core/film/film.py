@@ -73,7 +73,6 @@ def write(
             f"{settings.out}: the file exists; replace it with --overwrite, or choose another name"
         )
     if settings.is_video:
-        video.check(settings.suffix)
         with video.writing(settings.out, plan.fps, alpha=settings.transparent) as append:
             for shot in plan.shots:
                 append(film.picture(shot))

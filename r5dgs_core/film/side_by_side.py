@@ -9,7 +9,9 @@ import OpenImageIO as oiio
 
 from .. import errors
 from ..data import dataset as datasets
+from ..data.splits import SPLITS
 from ..scene import sampling
+from . import camera_path
 from .schedule import Shot
 
 EMPTY = 0.16  # gray of times without an image
@@ -28,7 +30,7 @@ class CapturedImages:
     """
 
     def __init__(self, dataset: datasets.Dataset, camera: str, background: np.ndarray):
-        views = [view for split in ("train", "val", "test") for view in dataset.views(split)]
+        views = [view for split in SPLITS for view in dataset.views(split)]
         self._views = sorted((view for view in views if view.camera.name == camera), key=lambda view: view.t)
         if not self._views:
             known = ", ".join(camera.name for camera in dataset.cameras[:8])
@@ -56,9 +58,7 @@ def joined(pictures: Sequence[np.ndarray]) -> np.ndarray:
 def _placed(image: np.ndarray, canvas: np.ndarray) -> np.ndarray:
     """Return an image scaled into the middle of a canvas, as `camera_path.fitted` places the camera's picture."""
     height, width = canvas.shape[:2]
-    scale = min(width / image.shape[1], height / image.shape[0])
-    size = max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1)
-    left, top = -((size[0] - width) // 2), -((size[1] - height) // 2)
+    size, left, top = camera_path.placement((image.shape[1], image.shape[0]), (width, height))
     source = oiio.ImageBuf(np.ascontiguousarray(image, np.float32))
     scaled = oiio.ImageBufAlgo.resize(source, roi=oiio.ROI(0, size[0], 0, size[1], 0, 1, 0, 3))
     pixels = np.asarray(scaled.get_pixels(oiio.FLOAT))

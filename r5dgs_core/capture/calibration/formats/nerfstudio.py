@@ -16,6 +16,7 @@ import numpy as np
 
 from .... import errors, strict_json
 from ....data import images, transforms
+from ....data.splits import SPLITS
 from ....data.transforms import Entry
 from ....scene import cameras as core_cameras
 from ..calibration import Calibration
@@ -52,7 +53,7 @@ def _read_file(path: Path) -> list[Shot]:
     groups = [content] if isinstance(content.get("frames"), list) else content["data"].values()
     frames = [frame for group in groups for frame in group["frames"]]
     splits = {}
-    for split in ("train", "val", "test"):
+    for split in SPLITS:
         listed = header.get(f"{split}_filenames", [])
         splits |= {name: split for name in listed if isinstance(name, str)} if isinstance(listed, list) else {}
     found = []
