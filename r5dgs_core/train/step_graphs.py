@@ -182,8 +182,7 @@ class StepGraphs:
             self._frozen.copy_(trainer.frozen)
             trainer.frozen = self._frozen
         self._numbers.copy_(torch.tensor(inputs.path.numbers, dtype=torch.float64), non_blocking=True)
-        groups = trainer.optimizer.param_groups
-        rates = torch.tensor([trainer.rates.at(group["name"], trainer.iteration) for group in groups])
+        rates = torch.tensor([group["lr"] for group in trainer.optimizer.param_groups])  # set by the trainer's step
         self._rates.copy_(rates, non_blocking=True)
 
     def _work(self, like: Any) -> None:
