@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NoReturn
 
 from .. import errors, findings
+from .array_types import EMBEDDINGS
 from .lookup_table import LookupTable
-from .scene import EMBEDDINGS, IDENTITY_DIM, MotionGroup, SceneObject
+from .scene import IDENTITY_DIM, MotionGroup, SceneObject
 
 SH_BASES = (1, 4, 9, 16)
 _PER_GAUSSIAN = ("quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids")  # besides means

@@ -19,7 +19,8 @@ import numpy as np
 from .. import atomic_files, errors, findings, strict_json
 from . import array_shapes, format_features, scene_json, validation
 from .archive import Archive, Header, max_content_bytes
-from .scene import DTYPES, EMBEDDINGS, Scene, grouped
+from .array_types import DTYPES, EMBEDDINGS
+from .scene import Scene, grouped
 from .stored_embeddings import StoredEmbeddings
 
 FORMAT = "r5dgs scene"

@@ -15,9 +15,10 @@ import numpy as np
 
 from .. import errors, findings
 from . import array_shapes, cameras, hull_json, model_checks, part_checks
+from .array_types import DTYPES, EMBEDDINGS
 from .lookup_table import LookupTable
 from .row_runs import runs
-from .scene import DTYPES, EMBEDDINGS, GROUPS, ROLES, MotionGroup, Scene
+from .scene import GROUPS, ROLES, MotionGroup, Scene
 
 _fail = array_shapes.fail
 _UNIT_TOLERANCE = 1e-3

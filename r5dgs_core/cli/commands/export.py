@@ -104,7 +104,7 @@ def run_export(
     present = [target for target in targets if target.exists()]
     if present and not overwrite:
         raise errors.ConfigError(f"{present[0]}: the file exists; replace it with --overwrite, or choose another name")
-    written = _write(chosen, scene, out, what, progress_kind)
+    written = _write(chosen, scene, out, what, len(targets), progress_kind)
     if progress_kind != "json":
         print(f"written: {written[0]}" + (f" to {written[-1].name}" if len(written) > 1 else ""))
         print(f"not kept: {chosen.loses}")
@@ -113,11 +113,13 @@ def run_export(
     return written
 
 
-def _write(chosen: registry.Format, scene: Scene, out: Path, what: registry.Options, progress_kind: str) -> list[Path]:
-    """Write the files of a format with progress output and return their paths."""
+def _write(
+    chosen: registry.Format, scene: Scene, out: Path, what: registry.Options, total: int, progress_kind: str
+) -> list[Path]:
+    """Write a number of files of a format with progress output and return their paths."""
     from ...progress import make
 
-    written, total = [], len(chosen.paths(out, what, scene))
+    written = []
     with make(progress_kind) as progress:
         for target in chosen.write(scene, out, what):
             written.append(target)

@@ -10,7 +10,7 @@ from r5dgs_core import check, errors, findings
 from r5dgs_core.config import config
 from r5dgs_core.formats import ply
 from r5dgs_core.scene import scene_file
-from r5dgs_core.scene.scene import DTYPES
+from r5dgs_core.scene.array_types import DTYPES
 from tests.core.formats.test_ply import COLUMNS, ROW, header
 from tests.core.scene.test_scene_file import npy, rewrite
 from tests.fuzz.readers import rich_scene
