@@ -214,7 +214,8 @@ def model(anchor: bpy.types.Object) -> MotionModel:
     if changed:
         values.update(offset_rotvec=np.zeros(3), offset_displacement=np.zeros(3))
     if "kind" in changed:
-        values.update(kind=state.kind, inertia=inertia(anchor) if models.KINDS[state.kind].needs_inertia else None)
+        body = inertia(anchor) if models.KINDS[state.kind].needs_inertia else None
+        values.update(kind=state.kind, inertia=body, knots=None)
     try:
         return confidence.with_exact_fields(replace(base, **values), changed)
     except ValueError as error:

@@ -234,16 +234,15 @@ def _go_on(
         for model in (*given, source.model):
             turned = _turned_model(model, course.parent)
             if shown(*models.evaluate(turned, later)):
-                band = source.history if model is source.model else replace(source.history, band=None)
-                history = band if (course.parent == np.eye(3)).all() else band.transformed(*_turn_of(course.parent))
-                history = history if course.same else replace(history, errors=None)
-                return replace(source, **known, model=turned, history=history), course.same and turned == source.model
+                known |= _kept_fields(source, model, course)
+                return replace(source, **known, model=turned), course.same and turned == source.model
     model, error = fit_drawn_curve.fit(later, quats, moves, course.reach, course.allowed)
     if error > 10 * course.allowed:
         miss = f"the nearest one deviates by up to {error:.3g}"
         notes.append(f"{first.name}: no motion model matches its curves past t_max; {miss}")
     history = replace(source.history, band=None, errors=None)
-    return replace(source, **known, model=model, follows=None, follow_matrix=None, history=history), False
+    known |= {"smooth": None, "history": history}
+    return replace(source, **known, model=model, follows=None, follow_matrix=None), False
 
 
 def _known_fields(cluster: Cluster, course: _Course) -> dict[str, Any]:
@@ -255,6 +254,17 @@ def _known_fields(cluster: Cluster, course: _Course) -> dict[str, Any]:
     if source.id == 0:
         known |= {"role": "body", "object_id": cluster.first.object_id, "rigid_rms": 0.0, "rigid_max": 0.0}
     return known
+
+
+def _kept_fields(source: MotionGroup, model: MotionModel, course: _Course) -> dict[str, Any]:
+    """History of a group that goes on with a known model, and its smooth motion if that is the file's."""
+    band = source.history if model is source.model else replace(source.history, band=None)
+    history = band if (course.parent == np.eye(3)).all() else band.transformed(*_turn_of(course.parent))
+    smooth = source.smooth if model == source.model else None
+    return {
+        "history": history if course.same else replace(history, errors=None),
+        "smooth": None if smooth is None else _turned_model(smooth, course.parent),
+    }
 
 
 def _played(scene: Scene, group: int, later: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@
     "features": [{"name": "origin", "required": true, "since": "0.2.0"}]
 
 A reader rejects a file with a required feature that it does not support, and skips an optional one. Names reserved for
-later releases: trajectory, quantised.
+later releases: quantised.
 """
 
 from __future__ import annotations
@@ -43,16 +43,18 @@ MOTIONS = Feature("motions", required=True, since="0.2.0")
 EVENTS = Feature("events", required=False, since="0.2.0")
 PARTS = Feature("parts", required=False, since="0.2.0")
 HULLS = Feature("hulls", required=False, since="0.2.0")
-_KNOWN_NAMES = {ORIGIN.name, MOTIONS.name, EVENTS.name, PARTS.name, HULLS.name}
+TRAJECTORY = Feature("trajectory", required=False, since="0.2.0")
+_KNOWN_NAMES = {ORIGIN.name, MOTIONS.name, EVENTS.name, PARTS.name, HULLS.name, TRAJECTORY.name}
 
 
 def _used(scene: Scene) -> list[Feature]:
     """Features that a scene needs."""
     found = [ORIGIN] if scene.origin.any() else []
-    found += [MOTIONS] if any(not group.model.is_basic for group in scene.groups) else []
+    found += [MOTIONS] if any(not (group.smooth or group.model).is_basic for group in scene.groups) else []
     found += [EVENTS] if any(group.history.events for group in scene.groups) else []
     found += [PARTS] if any(group.joint is not None for group in scene.groups) else []
-    return found + ([HULLS] if scene.hulls else [])
+    found += [HULLS] if scene.hulls else []
+    return found + ([TRAJECTORY] if any(group.smooth is not None for group in scene.groups) else [])
 
 
 def version(scene: Scene) -> int:

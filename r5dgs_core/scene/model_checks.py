@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .. import findings
-from ..motion import models
+from ..motion import knots, models
 from . import cameras
 from .array_shapes import fail
 
@@ -23,6 +23,14 @@ def _limit(unit: models.Unit) -> float:
 
 
 _LIMITS = {name: _limit(unit) for name, unit in {**models.VECTORS, **models.SCALARS}.items()}
+_COLUMNS = {
+    "knot times": (knots.TIME, MAX_TIME),
+    "knot places": (knots.PLACE, cameras.FARTHEST),
+    "velocities before knots": (knots.VELOCITY[0], cameras.FARTHEST),
+    "velocities after knots": (knots.VELOCITY[1], cameras.FARTHEST),
+    "spins before knots": (knots.SPIN[0], SPIN),
+    "spins after knots": (knots.SPIN[1], SPIN),
+}
 _LIMITS |= {"fade_time": MAX_TIME, "radius": cameras.FARTHEST}
 
 
@@ -33,6 +41,19 @@ def check(model: models.MotionModel, place: str, guard: findings.Guard) -> None:
             value = np.max(np.abs(getattr(model, name)))
             if not value <= limit:
                 fail(place, name, f"numbers up to {limit:g}", f"{value:g}")
+    if model.knots is not None:
+        _check_knots(model.knots, place, guard)
     with guard():
         if model.radius < MIN_LENGTH or model.fade_time < MIN_STEP:
             fail(place, "radius and fade_time", f"{MIN_LENGTH:g} and {MIN_STEP:g} or more", "less")
+
+
+def _check_knots(rows: np.ndarray, place: str, guard: findings.Guard) -> None:
+    for name, (part, limit) in _COLUMNS.items():
+        with guard():
+            value = np.abs(rows[:, part]).max()
+            if not value <= limit:
+                fail(place, name, f"numbers up to {limit:g}", f"{value:g}")
+    with guard():
+        if (np.diff(rows[:, knots.TIME]) < MIN_STEP).any():
+            fail(place, "knots", f"times that increase by {MIN_STEP:g} or more", "less")

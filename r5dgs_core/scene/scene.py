@@ -72,6 +72,7 @@ class MotionGroup:
         history: Events in the observed time, and the confidence band of the motion past t_max.
         parent: Group of another part of the same object that carries this one past t_max and in Blender, or None.
         joint: Joint with the parent; None without a parent.
+        smooth: Motion past t_max without contacts, if ``model`` is a trajectory that has them; else None.
     """
 
     id: int
@@ -88,6 +89,7 @@ class MotionGroup:
     history: history.History = history.EMPTY
     parent: int | None = None
     joint: Joint | None = None
+    smooth: MotionModel | None = None
 
     @property
     def home(self) -> np.ndarray:

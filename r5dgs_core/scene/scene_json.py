@@ -122,8 +122,12 @@ def _read_object(row: Row) -> SceneObject:
 
 
 def _read_group(row: Row) -> MotionGroup:
+    smooth, model = None, findings.attempt(row.guard, lambda: _model(row, "model"))
+    if not row.lacks("trajectory"):
+        smooth, model = model, findings.attempt(row.guard, lambda: _model(row, "trajectory"))
     return MotionGroup(
-        model=findings.attempt(row.guard, lambda: _model(row)),
+        model=model,
+        smooth=smooth,
         id=row.get("id", int),
         object_id=row.get("object_id", int),
         role=row.get("role", str),
@@ -146,14 +150,14 @@ def _read_joint(row: Row) -> Joint | None:
     )
 
 
-def _model(row: Row) -> MotionModel:
-    tree = row.get("model", dict)
+def _model(row: Row, key: str) -> MotionModel:
+    tree = row.get(key, dict)
     if tree is findings.UNREAD:
         return findings.UNREAD
     try:
         return MotionModel.from_dict(tree)
     except ValueError as error:
-        raise errors.SceneFileError(f"{row.place}: model: {error}") from error
+        raise errors.SceneFileError(f"{row.place}: {key}: {error}") from error
 
 
 def _read_camera(row: Row) -> Camera:
@@ -196,13 +200,14 @@ def _group_tree(group: MotionGroup) -> dict[str, Any]:
         "role": group.role,
         "anchor_index": group.anchor_index,
         "pivot": np.asarray(group.pivot, np.float64).tolist(),
-        "model": group.model.to_dict(),
+        "model": (group.smooth or group.model).to_dict(),
         "follows": group.follows,
         "follow_matrix": None if matrix is None else np.asarray(matrix, np.float64).tolist(),
         "rigid_rms": float(group.rigid_rms),
         "rigid_max": float(group.rigid_max),
         "seen": None if group.seen is None else [float(t) for t in group.seen],
         **history_json.to_json(group.history),
+        **({} if group.smooth is None else {"trajectory": group.model.to_dict()}),
         **({} if group.joint is None else {"parent": group.parent, "joint": joint_json.to_json(group.joint)}),
     }
 

@@ -303,6 +303,8 @@ def _check_group(
         if not (0 <= group.rigid_rms <= farthest and 0 <= group.rigid_max <= farthest):
             _fail(place, where, f"rigid residuals from 0 to {farthest:g}", (group.rigid_rms, group.rigid_max))
     model_checks.check(group.model, f"{place}: {where}: model", guard)
+    if group.smooth is not None and group.smooth is not findings.UNREAD:
+        model_checks.check(group.smooth, f"{place}: {where}: smooth model", guard)
     if group.joint is not None and group.joint is not findings.UNREAD:
         model_checks.check(group.joint.model, f"{place}: {where}: joint: model", guard)
     with guard():

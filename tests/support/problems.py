@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from r5dgs_core.motion import models, rotations
+from r5dgs_core.motion import knots, models, rotations
 from r5dgs_core.motion.models import MotionModel
 
 T_MAX = 0.75
@@ -152,6 +152,16 @@ TUMBLING = MotionModel(
     angular_velocity=[3.0, 3.5, -1.5],
     inertia=[[0.40, 0.02, 0.0], [0.02, 0.80, -0.03], [0.0, -0.03, 1.0]],
     radius=RADIUS,
+)
+
+
+# A box that is thrown, hits the floor at 0.5 and goes on with another spin.
+_TURNS = rotations.rotvecs_to_quats(np.array([[0, 0, 0], [0.5, 1.0, 0.2], [0.1, 1.9, 0.0]]))
+_PLACES = np.array([[0, 0, 0], [0.5, 0.1, -0.6], [0.7, 0.1, -0.5]])
+_SPEEDS = np.array([[1, 0.2, 0.3], [1, 0.2, -2.5], [0.5, 0, -0.6]]), np.array([[1, 0.2, 0.3], [0.5, 0, 0.9], [0, 1, 0]])
+_SPINS = np.array([[1, 2, 0.5], [1, 2, 0.5], [-1, 2.5, 0]]), np.array([[1, 2, 0.5], [-1, 3, 0], [0, 1, 0]])
+TOSSED = MotionModel(
+    "trajectory", radius=RADIUS, knots=knots.pack(np.array([0.0, 0.5, 0.9]), (_TURNS, _PLACES), _SPEEDS, _SPINS)
 )
 
 

@@ -99,6 +99,7 @@ class MotionKind:
         word: Name in the output of ``r5dgs objects`` and ``r5dgs info``.
         fields: Fields of `MotionModel` that users edit.
         needs_inertia: True if `MotionModel.inertia` is needed.
+        needs_knots: True if `MotionModel.knots` are needed.
         center_on_axis: True if any point of the axis may serve as the centre.
         fits: Name -> free blocks of the candidates with which `motion_fit` identifies this kind, beside the pose at
             t_max (r, e).
@@ -115,6 +116,7 @@ class MotionKind:
     word: str
     fields: tuple[str, ...] = ()
     needs_inertia = False
+    needs_knots = False
     center_on_axis = False
     fits: Mapping[str, tuple[str, ...]] = {}
     blocks: Mapping[str, Block] = {}

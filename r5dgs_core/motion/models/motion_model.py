@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .. import knots as trajectories
 from .registry import KINDS
 
 
@@ -65,6 +66,7 @@ class MotionModel:
         restitution: Speed after an impact / speed before it, in [0, 1].
         second_velocity: As `velocity`, of the second oscillation of the kind "two_oscillations"; likewise the others.
         inertia: J in the world at tau = 0, up to a factor, of kinds that need it; None for others. [3, 3]
+        knots: Knots of the kind "trajectory" (`knots.pack`), None for others. [K, 20]
         covariance: Covariance of the fitted rates, or None. [P, P] in the order of `covariance_names`
         covariance_names: Names of its rows, such as "velocity.x" or "frequency".
     """
@@ -91,6 +93,7 @@ class MotionModel:
     second_angular_velocity: np.ndarray = _vector("w2", False, 1)
     second_angular_acceleration: np.ndarray = _vector("eps2", False, 2)
     inertia: np.ndarray | None = None
+    knots: np.ndarray | None = None
     covariance: np.ndarray | None = None
     covariance_names: tuple[str, ...] = ()
 
@@ -118,6 +121,7 @@ class MotionModel:
                 raise ValueError(f"{name}: expected a number {'from 0 to 1' if most == 1 else '>= 0'}, got {value}")
             object.__setattr__(self, name, value)
         self._check_inertia()
+        self._check_knots()
         self._check_covariance()
 
     def _check_inertia(self) -> None:
@@ -131,6 +135,13 @@ class MotionModel:
                 raise ValueError(f"inertia: expected a symmetric (3, 3) with positive moments, got {self.inertia!r}")
             inertia.flags.writeable = False
             object.__setattr__(self, "inertia", inertia)
+
+    def _check_knots(self) -> None:
+        if (self.knots is not None) != KINDS[self.kind].needs_knots:
+            expected = "those of a trajectory" if KINDS[self.kind].needs_knots else "None"
+            raise ValueError(f"knots: expected {expected} for the kind {self.kind!r}")
+        if self.knots is not None:
+            object.__setattr__(self, "knots", trajectories.checked(self.knots))
 
     def _check_covariance(self) -> None:
         object.__setattr__(self, "covariance_names", tuple(self.covariance_names))
@@ -160,6 +171,8 @@ class MotionModel:
         result.update({name: value for name in SCALARS if (value := getattr(self, name)) > 0})
         if self.inertia is not None:
             result["inertia"] = self.inertia.tolist()
+        if self.knots is not None:
+            result["knots"] = self.knots.tolist()
         if self.covariance is not None:
             result.update(covariance=self.covariance.tolist(), covariance_names=list(self.covariance_names))
         return result
@@ -207,6 +220,8 @@ class MotionModel:
         if self.inertia is not None:
             inertia = turn @ self.inertia @ turn.T
             values["inertia"] = 0.5 * (inertia + inertia.T)
+        if self.knots is not None:
+            values["knots"] = trajectories.transformed(self.knots, turn, scale)
         if self.covariance is not None:
             change = _change(self.covariance_names, maps)
             values["covariance"] = change @ self.covariance @ change.T

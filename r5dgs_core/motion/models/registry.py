@@ -22,6 +22,7 @@ MENU_NUMBERS = {
     "precession": 8,
     "bounce": 9,
     "two_oscillations": 10,
+    "trajectory": 11,
 }
 """Kinds in the order of Blender's menu, each the module of this room that defines `KIND`.
 

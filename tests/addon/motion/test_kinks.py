@@ -7,7 +7,7 @@ import pytest
 
 from r5dgs_core.motion import models
 from r5dgs_core.scene import scene_file
-from tests.support import motions, scenes
+from tests.support import motions, problems, scenes
 
 BOUNCE = models.MotionModel(
     "bounce",
@@ -23,10 +23,11 @@ BOUNCE = models.MotionModel(
 
 
 @pytest.fixture
-def scene_path(tmp_path):
-    """A scene whose first body, which a shadow follows, bounces."""
+def scene_path(tmp_path, request):
+    """A scene whose first body, which a shadow follows, bounces, or moves as the parameter says."""
     made = scenes.make_scene(n=300, objects=3, seed=1)
-    groups = (made.groups[0], dataclasses.replace(made.groups[1], model=BOUNCE), *made.groups[2:])
+    model = getattr(request, "param", BOUNCE)
+    groups = (made.groups[0], dataclasses.replace(made.groups[1], model=model), *made.groups[2:])
     return scene_file.write(dataclasses.replace(made, groups=groups), tmp_path / "scene.r5dgs")
 
 
@@ -55,6 +56,23 @@ def test_a_bounce_plays_like_the_core_about_its_impacts(blender, scene_path):
         rises = (key.handle_right[1] - key.co[1]) / (key.handle_right[0] - key.co[0])
         assert rises > 0.5 * speed * 0.3 / 60 and falls < -speed * 0.3 / 60
     assert not mug.r5dgs_motion.too_fast
+
+
+@pytest.mark.parametrize("scene_path", [problems.TOSSED], indirect=True)
+def test_a_trajectory_has_keys_at_its_knots_with_handles_of_both_sides(blender, scene_path):
+    scene = scene_file.read(scene_path)
+    loaded = motions.load(blender, scene_path, t_end=1.5)
+    motions.assert_plays_like_the_core(blender, loaded, scene, np.linspace(scenes.T_MAX, 1.5, 28))
+    mug = blender.data.objects["mug anchor"]
+    (key,) = (key for key in vertical_keys(mug) if 0.5 < key.co[0] - 1 - 60 * scenes.T_MAX < 0.75 * 60 - 0.5)
+    assert key.co[0] == pytest.approx(1 + 60 * (scenes.T_MAX + problems.TOSSED.knots[1, 0]), abs=1e-3)
+    falls = (key.co[1] - key.handle_left[1]) / (key.co[0] - key.handle_left[0])
+    rises = (key.handle_right[1] - key.co[1]) / (key.handle_right[0] - key.co[0])
+    assert (60 * falls, 60 * rises) == pytest.approx((-2.5, 0.9), rel=1e-3)
+    motions.choose(blender, blender.data.objects["red apple anchor"])
+    blender.context.object.r5dgs_motion.kind = "trajectory"
+    with pytest.raises(RuntimeError, match="red apple anchor: knots: expected those of a trajectory"):
+        blender.ops.r5dgs.re_extrapolate()
 
 
 def test_the_tube_of_a_bounce_touches_the_floor_at_its_impacts(blender, scene_path):

@@ -29,6 +29,7 @@ CASES = {name: model for name, (model, _) in problems.MOTIONS.items()} | {
     "world twist": WORLD_TWIST,
     "tumbling": problems.TUMBLING,
     "bounces": problems.BOUNCING,
+    "contacts": problems.TOSSED,
 }
 
 
@@ -134,7 +135,7 @@ def test_a_model_transforms_with_its_world(name, scale):
     np.testing.assert_allclose(moved.covariance, np.outer(values, values), atol=1e-12)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [name for name in CASES if CASES[name].knots is None])
 def test_a_fitted_motion_may_start_from_any_pose(name):
     model, tau = CASES[name], np.array([0.0, 0.3, 0.9])
     rotvec, displacement = np.array([[0.5, -0.2, 0.9]]), np.array([[0.3, 0.1, -0.2]])
@@ -171,6 +172,7 @@ def test_single_precision_keeps_distances_relative_to_the_pivot(name):
 @pytest.mark.parametrize("kind", [kind for kind in models.KINDS if kind != "static"])
 def test_overflow_is_finite_or_logged(kind, caplog):
     inertia = np.diag([1.0, 2.0, 2.5]) if models.KINDS[kind].needs_inertia else None
+    knots = problems.TOSSED.knots if models.KINDS[kind].needs_knots else None
     sane = CASES["hinge"]
     expected = models.evaluate_all([sane, models.STATIC], 0.8)
     rates = ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "precession", "second_velocity")
@@ -178,7 +180,7 @@ def test_overflow_is_finite_or_logged(kind, caplog):
         evaluation._warn_of_wild_motion.cache_clear()
         caplog.clear()
         given = {"velocity": [0.1, 0, 0], "angular_velocity": [0, 0.1, 0], rate: [0.3 * size, 0.0, 0.8 * size]}
-        wild = MotionModel(kind, inertia=inertia, **given)
+        wild = MotionModel(kind, inertia=inertia, knots=knots, **given)
         quats, displacements = models.evaluate_all([sane, wild], 0.8)
         np.testing.assert_array_equal(quats[0], expected[0][0])
         np.testing.assert_array_equal(displacements[0], expected[1][0])
@@ -310,6 +312,22 @@ def test_a_ball_bounces_off_its_floor_with_a_share_of_its_speed_until_it_rests()
     assert (heights >= floor - 1e-9).all()
 
 
+def test_a_trajectory_passes_its_knots_with_the_rates_of_both_sides_and_keeps_the_last_ones():
+    knots, h = problems.TOSSED.knots, 1e-9
+    for row in knots[1:]:
+        before, at, after = (models.curve(problems.TOSSED, row[0] + shift) for shift in (-h, 0.0, h))
+        np.testing.assert_allclose(at[1], row[1:4], atol=1e-12)
+        assert rotations.angle_between(at[0], row[4:8]) < 1e-7
+        np.testing.assert_allclose(np.concatenate([before[3], after[3]]), row[8:14], atol=1e-6)
+        np.testing.assert_allclose(np.concatenate([before[2], after[2]]), row[14:20], atol=1e-6)
+    last = knots[-1]
+    quat, d, _, _ = models.curve(problems.TOSSED, last[0] + 2.0)
+    np.testing.assert_allclose(d, last[1:4] + 2 * last[11:14])
+    turned = rotations.multiply(rotations.rotvecs_to_quats(2 * last[17:20]), last[4:8])
+    assert rotations.angle_between(quat, turned) < 1e-7
+    assert models.kinks(problems.TOSSED, 0.7).tolist() == [0.5]
+
+
 def test_a_ball_that_does_not_bounce_stays_on_the_floor_and_one_that_loses_nothing_bounces_on():
     clay, steel = (dataclasses.replace(CASES["bounces"], restitution=rho) for rho in (0.0, 1.0))
     later = models.evaluate(clay, np.array([0.11, 0.5, 9.0]))[1][:, 2]
@@ -386,6 +404,7 @@ def test_json_restores_a_model_to_the_bit(vector, number, kind):
         offset_rotvec=vector,
         fade_time=number,
         inertia=np.diag([number, number / 3, 1e-3]) if models.KINDS[kind].needs_inertia else None,
+        knots=problems.TOSSED.knots if models.KINDS[kind].needs_knots else None,
         covariance=np.eye(2) / 3,
         covariance_names=names,
     )
@@ -411,6 +430,13 @@ def test_json_restores_a_model_to_the_bit(vector, number, kind):
         ({"kind": "free_top", "inertia": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "inertia"),
         ({"kind": "free_top", "inertia": [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, "inertia"),
         ({"covariance": [[1.0]]}, "covariance"),
+        ({"kind": "trajectory"}, "knots: expected those of a trajectory"),
+        ({"knots": problems.TOSSED.knots.tolist()}, "knots: expected None"),
+        ({"kind": "trajectory", "knots": [[1.0, 2.0]]}, "knots: expected finite numbers of shape"),
+        ({"kind": "trajectory", "knots": "far"}, "knots: expected finite numbers of shape"),
+        ({"kind": "trajectory", "knots": problems.TOSSED.knots[::-1].tolist()}, "increasing"),
+        ({"kind": "trajectory", "knots": problems.TOSSED.knots[1:].tolist()}, "time 0"),
+        ({"kind": "trajectory", "knots": (2 * problems.TOSSED.knots).tolist()}, "unit quaternions"),
     ],
 )
 def test_malformed_models_are_refused_by_the_name_of_the_key(change, message):

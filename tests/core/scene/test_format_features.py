@@ -10,8 +10,10 @@ import pytest
 from r5dgs_core import errors
 from r5dgs_core.scene import format_features, scene_file, scene_json
 from tests.data.make_scenes import SCENES
+from tests.support import problems
 from tests.support.scenes import make_scene
 
+FAST = np.append(np.ones(17), [1e7] * 3)  # a knot with a spin after it that is too large
 FAR = np.array([5e6, -1.25e8, 3.0])
 
 
@@ -105,7 +107,7 @@ def test_a_missing_required_feature_is_named_with_its_release(path, tmp_path):
     listed = [
         {"name": "origin", "required": True, "since": "0.2.0"},
         {"name": "quantised", "required": True, "since": "0.9.1"},
-        {"name": "trajectory", "required": True, "since": "0.10.0"},
+        {"name": "colliders", "required": True, "since": "0.10.0"},
     ]
     newer = with_features(path, tmp_path / "newer.r5dgs", listed, origin=[0, 0, 1e7])
     for reader in (scene_file.read, scene_file.read_embeddings, scene_file.is_exact):
@@ -115,11 +117,27 @@ def test_a_missing_required_feature_is_named_with_its_release(path, tmp_path):
 
 
 def test_optional_features_are_skipped_with_one_line(path, tmp_path, caplog):
-    listed = [{"name": name, "required": False, "since": "0.5.0"} for name in ("colliders", "trajectory")]
+    listed = [{"name": name, "required": False, "since": "0.5.0"} for name in ("colliders", "ropes")]
     newer = with_features(path, tmp_path / "newer.r5dgs", listed, colliders=[1, 2, 3])
     scene = scene_file.read(newer)
-    assert [record.getMessage().count("colliders, trajectory") for record in caplog.records] == [1]
+    assert [record.getMessage().count("colliders, ropes") for record in caplog.records] == [1]
     assert members(scene_file.write(scene, tmp_path / "again.r5dgs")) == members(path)
+
+
+def test_a_trajectory_comes_back_and_a_reader_without_it_finds_the_smooth_motion(path, tmp_path):
+    scene = scene_file.read(path)
+    smooth, toss = scene.groups[1].model, problems.TOSSED
+    groups = list(scene.groups)
+    groups[1] = dataclasses.replace(groups[1], model=toss, smooth=smooth)
+    tossed = scene_file.write(dataclasses.replace(scene, groups=tuple(groups)), tmp_path / "tossed.r5dgs")
+    tree = scene_tree(tossed)
+    assert {"name": "trajectory", "required": False, "since": "0.2.0"} in tree["features"]
+    assert tree["groups"][1]["model"] == smooth.to_dict()
+    back = scene_file.read(tossed).groups[1]
+    assert back.model == toss and back.smooth == smooth
+    groups[1] = dataclasses.replace(groups[1], model=dataclasses.replace(toss, knots=toss.knots * FAST))
+    with pytest.raises(errors.SceneFileError, match=r"motion group 1: model: spins after knots.*up to 1e\+06"):
+        scene_file.write(dataclasses.replace(scene, groups=tuple(groups)), tossed)
 
 
 def test_version_1_has_no_features(path, tmp_path):
