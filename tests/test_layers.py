@@ -168,8 +168,8 @@ LATE_IMPORTS = {
 }
 # The same of the add-on: OpenImageIO is optional there.
 LATE_ADDON_IMPORTS = {"capture.files": {"data.images"}}
-# Packages that rooms of the light tier may import inside functions, for files of other programs.
-LATE_PACKAGES = {"formats": {"fourdgs", "gsply", "pxr"}}
+# Packages that rooms of the light tier may import inside functions, for files of other programs and for baking.
+LATE_PACKAGES = {"formats": {"fourdgs", "gsply", "pxr"}, "shapes": {"scipy"}}
 # Which rooms of the add-on a room may import, itself aside, lower rooms first.
 ADDON_ALLOWED = {
     "compat": set(),

@@ -1,4 +1,4 @@
-"""Stage of baking: convex hulls of the objects, for shadows in Blender."""
+"""Stage of baking: convex hulls of the objects, for collisions, and for shadows in Blender."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Convex hull of an object, which Blender uses as proxy for shadows."""
+"""Convex hull of an object, for collisions, and as proxy for shadows in Blender."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ class Hull:
         object_id: The object.
         motion_id: The motion group.
         vertices: Points whose convex hull it is, 4 to 64, world. [V, 3] float64
+        error: Mean distance of its outlines from the silhouettes of the Gaussians, world units; None if unknown.
     """
 
     object_id: int
     motion_id: int
     vertices: np.ndarray
+    error: float | None = None

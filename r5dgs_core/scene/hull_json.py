@@ -23,6 +23,7 @@ def to_json(scene: Scene) -> list[dict[str, Any]]:
             "object_id": hull.object_id,
             "motion_id": hull.motion_id,
             "vertices": np.asarray(hull.vertices, np.float32).astype(np.float64).tolist(),
+            **({} if hull.error is None else {"error": float(np.float32(hull.error))}),
         }
         for hull in scene.hulls
     ]
@@ -36,7 +37,8 @@ def read(row: Row) -> Hull:
             wanted = f"4 to {MAX_VERTICES} points"
             raise errors.SceneFileError(f"{row.place}: vertices: expected {wanted}, found {len(vertices)}")
         vertices = row.numbers("vertices", (len(vertices), 3))
-    return Hull(row.get("object_id", int), row.get("motion_id", int), vertices)
+    error = row.optional("error", float)
+    return Hull(row.get("object_id", int), row.get("motion_id", int), vertices, error)
 
 
 def check(scene: Scene, place: str, guard: findings.Guard) -> None:
@@ -55,6 +57,8 @@ def check(scene: Scene, place: str, guard: findings.Guard) -> None:
                 fail(place, where, f"vertices of shape (4 to {MAX_VERTICES}, 3)", shape)
             if not (np.abs(hull.vertices) <= cameras.FARTHEST).all():
                 fail(place, where, f"vertices up to {cameras.FARTHEST:g}", hull.vertices)
+            if isinstance(hull.error, float) and not 0 <= hull.error <= cameras.FARTHEST:
+                fail(place, where, f"an error from 0 to {cameras.FARTHEST:g}", hull.error)
             if hull.object_id not in {item.id for item in scene.objects if item.id > 0}:
                 fail(place, where, "the id of an object", hull.object_id)
             if not 0 <= hull.motion_id < len(scene.groups) or scene.groups[hull.motion_id].role == "shadow":

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..motion import rotations
 from ..scene.hull_json import MAX_VERTICES
+from . import directions
 
 LEVEL = 0.15  # opacity at which the surface of a Gaussian is placed; between 0.1 and 0.25 hulls of objects fit best
 _DIRECTIONS = 1024  # directions in which the hull is tight
@@ -39,16 +40,16 @@ def vertices(
     solid = np.flatnonzero(opacities > LEVEL)
     if not len(solid):
         return np.zeros((0, 3))
-    solid = solid[_largest_part(means[solid].astype(np.float64))]
+    solid = solid[largest_part(means[solid].astype(np.float64))]
     centers = means[solid].astype(np.float64)
     sigmas = np.sqrt(2 * np.log(opacities[solid].astype(np.float64) / LEVEL))
     frames = rotations.quats_to_rotmats(rotations.normalize(quats[solid].astype(np.float64)))
     axes = frames * (sigmas[:, None] * scales[solid].astype(np.float64))[:, None, :]
-    candidates = _support_points(centers, axes, _sphere(_DIRECTIONS))
-    return candidates[_spread(candidates, _sphere(_DIRECTIONS), most)]
+    candidates = _support_points(centers, axes, directions.sphere(_DIRECTIONS))
+    return candidates[spread(candidates, directions.sphere(_DIRECTIONS), most)]
 
 
-def _largest_part(points: np.ndarray) -> np.ndarray:
+def largest_part(points: np.ndarray) -> np.ndarray:
     """Mask of the points in the largest set of adjacent occupied cells of a grid. [N, 3] -> [N]
 
     The size of the cells follows the number of points, so that neighbours of an evenly filled object are adjacent.
@@ -85,14 +86,6 @@ def _fill(seed: np.ndarray, allowed: np.ndarray) -> np.ndarray:
         seed = grown
 
 
-def _sphere(count: int) -> np.ndarray:
-    """Evenly distributed unit vectors, on a Fibonacci spiral. [count, 3]"""
-    number = np.arange(count) + 0.5
-    z, angle = 1 - 2 * number / count, np.pi * (1 + 5**0.5) * number
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-
-
 def _support_points(centers: np.ndarray, axes: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Return the farthest point of all ellipsoids in each direction.
 
@@ -117,7 +110,7 @@ def _support_points(centers: np.ndarray, axes: np.ndarray, directions: np.ndarra
     return found
 
 
-def _spread(points: np.ndarray, directions: np.ndarray, most: int) -> np.ndarray:
+def spread(points: np.ndarray, directions: np.ndarray, most: int) -> np.ndarray:
     """Return rows of points that approximate the support function of all of them. Greedy. [V]"""
     heights = points @ directions.T
     support = heights.max(axis=0)

@@ -7,20 +7,20 @@ import numpy as np
 from ..scene.hull import Hull
 from ..scene.scene import Scene
 from ..scene.splats import to_opacities
-from . import convex_hull
+from . import silhouette_hull
 
 
 def of(scene: Scene) -> tuple[Hull, ...]:
-    """Return the hulls of a scene, in the bind state. Objects without visible Gaussians have none."""
+    """Return the hulls of a scene, in the bind state. Objects that are nowhere solid have none."""
     found = []
     for object_id, motion_id in sorted(bodies(scene)):
         rows = np.flatnonzero(_members(scene, object_id, motion_id))
         gaussians = scene.gaussians
         scales = np.exp(gaussians.log_scales[rows].astype(np.float64))
         opacities = to_opacities(gaussians.opacity_logits[rows])
-        corners = convex_hull.vertices(gaussians.means[rows], gaussians.quats[rows], scales, opacities)
-        if len(corners) >= 4:
-            found.append(Hull(object_id, motion_id, corners))
+        hull = silhouette_hull.of(gaussians.means[rows], gaussians.quats[rows], scales, opacities)
+        if hull is not None:
+            found.append(Hull(object_id, motion_id, hull.vertices, hull.error))
     return tuple(found)
 
 

@@ -193,8 +193,9 @@ def test_each_body_has_one_hull_and_shadows_and_fringes_have_none(blender, tmp_p
     assert {"mug still", "mug with red apple", "mug with mug shadow"} < {cloud.object.name for cloud in clouds}
     proxies = shadows.add(blender.context.scene, clouds, (), ())
     assert {proxy.parent.name for proxy in proxies.objects} == {"mug", "red apple", "toy car"}
+    near = 1e-3 if stored else 0.1  # Blender encloses ellipsoids, baking has silhouettes
     for proxy in proxies.objects:
         hull = {h.object_id: h.vertices for h in object_hulls.of(mixed)}[proxy.parent.r5dgs.object_id]
         found = np.array([vertex.co for vertex in proxy.data.vertices])
-        np.testing.assert_allclose(found.min(0), hull.min(0), atol=1e-3)
-        np.testing.assert_allclose(found.max(0), hull.max(0), atol=1e-3)
+        np.testing.assert_allclose(found.min(0), hull.min(0), atol=near)
+        np.testing.assert_allclose(found.max(0), hull.max(0), atol=near)
