@@ -11,6 +11,8 @@ from ..train.refinement import trial
 from ..train.refinement.refinement import PARTS
 from .draft import Need
 
+UNITS = dict(zip(PARTS, ("px", "px at the border", "intervals between times", "of white"), strict=True))
+
 
 def rows(record: Mapping[str, Any], config: Config) -> tuple[Need, ...]:
     """Return a row per part of the corrections.
@@ -22,11 +24,11 @@ def rows(record: Mapping[str, Any], config: Config) -> tuple[Need, ...]:
     table = []
     sizes = camera_correction.sizes(record)
     for part in PARTS:
-        gain = record.get("gains_db", {}).get(part)
+        size = record.get("sizes", {}).get(part)
         on = part in record.get("refined", ())
-        reason = "gain on pixels that were not fitted, dB" if gain is not None else "not examined"
+        reason = f"size on which the pictures agree, {UNITS[part]}" if size is not None else "not examined"
         reason += f"; {sizes[part]}" if part in sizes else ""
         wanted = getattr(config.needs, part)
         reason = reason if wanted == "auto" else f"set {wanted} by the user; {reason}"
-        table.append(Need(part, gain or 0.0, trial.threshold(part, config), on, reason, on))
+        table.append(Need(part, size or 0.0, trial.least_size(part, config), on, reason, on))
     return tuple(table)

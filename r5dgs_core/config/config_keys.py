@@ -46,8 +46,10 @@ _KEYS_BY_UNIT = {
     "normalised length": "field.still discovery.still densify.prune_near",
     "scene time": "field.horizon field.step",
     "1 / half image width": "densify.gradient densify_default.gradient",
-    "px": "densify.split_pixels densify_default.prune_radius",
-    "dB": "refine.threshold refine.threshold_time residual.threshold",
+    "px": "densify.split_pixels densify_default.prune_radius refine.pixels",
+    "intervals": "refine.intervals",
+    "share of white": "refine.colors",
+    "dB": "residual.threshold",
     "Gaussians": """
         init.object_points init.background_points init.shadow_points field.chunk densify.max_gaussians
         discovery.fewest identity.neighbours identity.samples

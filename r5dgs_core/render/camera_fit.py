@@ -18,7 +18,7 @@ from ..scene.cameras import Camera
 Draw = Callable[[Camera, float], np.ndarray]  # picture of a camera at a scene time, [H, W, 3]
 
 STEP = 0.25  # change of the picture for differences, px
-BLOCK = 16  # side of the squares that form the two halves of an image, px
+TILES = 8  # number of parts along each axis of an image
 ROWS = 1 << 16  # pixels per pass of the sums, which bounds memory
 DAMPING, EASIER, HARDER = 1e-3, 0.3, 8.0  # of Levenberg and Marquardt
 ITERATIONS, CONVERGED = 12, 1e-4  # maximum number of iterations; relative decrease of the error that ends them
@@ -103,6 +103,11 @@ class Normal:
         return float(self.error - 2 * self.vector @ change + change @ self.matrix @ change)
 
 
+def added(parts: Sequence[Normal]) -> Normal:
+    """Return the normal equations of all pixels of some parts, at least one."""
+    return sum(parts[1:], parts[0])
+
+
 def columns(pose: bool = False, focal: bool = False, time: bool = False, color: bool = False) -> np.ndarray:
     """Return the indices of the parameters of some parts of a correction.
 
@@ -113,10 +118,10 @@ def columns(pose: bool = False, focal: bool = False, time: bool = False, color: 
     return np.concatenate([*indices, np.array([8, 12, 16, 17, 18, 19] if color else [], int)])
 
 
-def normal_halves(
-    draw: Draw, shot: Shot, correction: Correction, units: Units, which: np.ndarray, odd: int = 0
-) -> tuple[Normal, Normal]:
-    """Return the normal equations of the two halves of an image, squares of `BLOCK` pixels in a chessboard.
+def normal_tiles(
+    draw: Draw, shot: Shot, correction: Correction, units: Units, which: np.ndarray, tiles: int = TILES
+) -> list[Normal]:
+    """Return the normal equations of parts of an image, row by row. [tiles * tiles]
 
     Args:
         draw: Draws the scene.
@@ -124,7 +129,7 @@ def normal_halves(
         correction: Correction at which the picture is linearised.
         units: Sizes of changes of a pixel.
         which: Indices of the parameters whose slopes are needed; those of the geometry cost a picture each.
-        odd: 1 exchanges the halves.
+        tiles: Number of parts along each axis of the image.
     """
     plain = draw(correction.camera(shot.camera), shot.t + correction.time)
     picture = correction.seen(plain)
@@ -137,21 +142,21 @@ def normal_halves(
         other = moved.seen(draw(moved.camera(shot.camera), shot.t + moved.time))
         geometry.append((index, ((other - picture) / steps[index]).reshape(-1, 3)))
     height, width = plain.shape[:2]
-    rows, cols = np.indices((height, width)) // BLOCK
-    half = ((rows + cols + odd) % 2).ravel()
+    rows, cols = np.arange(height) * tiles // height, np.arange(width) * tiles // width
+    tile = (tiles * rows[:, None] + cols).ravel()
     if shot.valid is not None:
-        half = np.where(shot.valid.ravel(), half, 2)
+        tile[~shot.valid.ravel()] = -1
     colors, residual = plain.reshape(-1, 3), (shot.image - picture).reshape(-1, 3)
-    half = np.where(((shot.image >= 1) & (picture > 1)).any(-1).ravel(), 2, half)  # saturated
-    return _sums(half, 0, geometry, colors, residual), _sums(half, 1, geometry, colors, residual)
+    tile[((shot.image >= 1) & (picture > 1)).any(-1).ravel()] = -1  # saturated
+    return [_sums(tile == k, geometry, colors, residual) for k in range(tiles * tiles)]
 
 
 def _sums(
-    half: np.ndarray, wanted: int, geometry: list[tuple[int, np.ndarray]], colors: np.ndarray, residual: np.ndarray
+    chosen: np.ndarray, geometry: list[tuple[int, np.ndarray]], colors: np.ndarray, residual: np.ndarray
 ) -> Normal:
-    """Return the normal equations of one half of the pixels."""
+    """Return the normal equations of chosen pixels."""
     total = Normal(np.zeros((COUNT, COUNT)), np.zeros(COUNT), 0.0, 0)
-    pixels = np.flatnonzero(half == wanted)
+    pixels = np.flatnonzero(chosen)
     for first in range(0, len(pixels), ROWS):
         some = pixels[first : first + ROWS]
         slopes = np.zeros((len(some), 3, COUNT))
@@ -177,8 +182,7 @@ def fit(draw: Draw, shots: Sequence[Shot], units: Units, which: np.ndarray, star
     """
     best, error, damping = start, _error(draw, shots, start), DAMPING
     for _ in range(ITERATIONS):
-        parts = [half for shot in shots for half in normal_halves(draw, shot, best, units, which)]
-        normal = sum(parts[1:], parts[0])
+        normal = added([normal_tiles(draw, shot, best, units, which, tiles=1)[0] for shot in shots])
         before = error
         while damping < 1e6:
             tried = best.plus(normal.solve(which, damping))

@@ -170,12 +170,15 @@ class RefineSection:
     """Refinement of the cameras (`train/refinement`).
 
     Attributes:
-        threshold: Minimum gain of a part of the corrections on pixels to which it was not fitted, dB.
-        threshold_time: The same for time offsets, which change only what moves.
+        pixels: Minimum size of the corrections of poses, and of focal lengths at the border of the image, rms over the
+            cameras.
+        intervals: Minimum size of the offsets of clocks, intervals between the observed times.
+        colors: Minimum size of the corrections of colours, as a share of white.
     """
 
-    threshold: float = 0.25
-    threshold_time: float = 0.06
+    pixels: float = 0.2
+    intervals: float = 0.05
+    colors: float = 0.01
 
 
 @dataclass(frozen=True)

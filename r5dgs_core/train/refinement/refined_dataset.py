@@ -62,19 +62,23 @@ def record(
         points: Points of the scene, world. [N, 3]
 
     Returns:
-        ``seconds_per_unit`` of scene time, or None; ``refined``, the parts; ``gains_db`` of each part;
-        ``corrections`` by camera; and ``pixels``, the shift of the picture of each camera by its corrections of pose
-        and focal length (rms).
+        ``seconds_per_unit`` of scene time, or None; ``refined``, the parts; ``sizes`` and ``gains_db`` of each part
+        (`agreement.Evidence`); ``corrections`` by camera; and ``pixels``, the shift of the picture of each camera by
+        its corrections of pose and focal length (rms).
     """
     trained = _restored(dataset, tensors)
     if trained.gains is None:
         return {}
     given = {view.camera.name: view.camera for view in reversed(dataset.train)}
-    gains = {part: None if np.isnan(gain) else float(gain) for part, gain in zip(PARTS, trained.gains, strict=True)}
+
+    def by_part(values: np.ndarray) -> dict[str, float | None]:
+        return {part: None if np.isnan(one) else float(one) for part, one in zip(PARTS, values, strict=True)}
+
     return {
         "seconds_per_unit": dataset.units.seconds_per_unit,
         "refined": [part for part in PARTS if part in trained.parts],
-        "gains_db": gains,
+        "sizes": by_part(trained.sizes),
+        "gains_db": by_part(trained.gains),
         "corrections": {name: correction.to_dict() for name, correction in found.items()},
         "pixels": {name: pixel_shift(given[name], correction, points) for name, correction in found.items()},
     }

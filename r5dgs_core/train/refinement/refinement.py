@@ -21,10 +21,11 @@ from ...scene.camera_correction import POSE, Correction
 from ..initialization.color_balance import ColorBalance
 from ..representations.fused_posing import PosedSplats
 from ..train_views import TrainView
-from . import gauge
+from . import gauge, gradients
 from .rig import Rig
 
-PARTS = ("camera_poses", "focal_lengths", "time_offsets", "camera_colours")  # rows of the needs table
+POSES = "camera_poses"
+PARTS = (POSES, "focal_lengths", "time_offsets", "camera_colours")  # rows of the needs table
 BETAS, EPS = (0.9, 0.99), 1e-12
 REACH = 8.0  # maximum total change of a parameter over the run, in its units
 LOWEST, HIGHEST = 0.02, 0.15  # limits of a parameter's first step, units
@@ -77,13 +78,16 @@ class Refinement:
 
     Attributes:
         parts: Parts that are trained, from `PARTS`; empty before the decision or if no camera needs a correction.
-        gains: Gain of each part on held-out pixels, dB, in the order of `PARTS`; None before the decision. [4]
+        gains: Largest gain of each part on pixels to which it was not fitted, dB, in the order of `PARTS`; nan if it
+            was not examined; None before the decision. [4]
+        sizes: Largest size of each part on which the pictures agree (`agreement.Evidence`), likewise. [4]
     """
 
     def __init__(self, rig: Rig, spacing: float, steps: int):
         self.rig = rig
         self.parts: frozenset[str] = frozenset()
         self.gains: np.ndarray | None = None
+        self.sizes = np.full(len(PARTS), math.nan)
         self._spacing, self._steps, self._begin = spacing, steps, 0
         self._poses = _Rows.zeros(rig.poses, 6)
         self._focal = _Rows.zeros(rig.lenses, 1)
@@ -100,6 +104,12 @@ class Refinement:
     def active(self) -> bool:
         """True if any part is trained."""
         return bool(self.parts)
+
+    def learn(self, evidence: Mapping[str, tuple[float, float]]) -> None:
+        """Keep size and gain of the parts that were examined."""
+        found = np.array([evidence.get(part, (math.nan, math.nan)) for part in PARTS])
+        self.sizes = np.fmax(self.sizes, found[:, 0])
+        self.gains = found[:, 1] if self.gains is None else np.fmax(self.gains, found[:, 1])
 
     def begin(
         self, parts: Sequence[str], points: np.ndarray, iteration: int, changes: Mapping[int, np.ndarray]
@@ -133,7 +143,8 @@ class Refinement:
         """Begin to train the colours of all lenses, from those of the background images."""
         rows = [balance.names.index(name) for name in self.rig.lens_names]
         self.parts |= {"camera_colours"}
-        self.gains = np.array([balance.gain_db if part == "camera_colours" else math.nan for part in PARTS])
+        change = 0.5 * (balance.gains - 1) + balance.offsets  # of middle grey
+        self.learn({"camera_colours": (float(np.sqrt(np.mean(change**2))), balance.gain_db)})
         self._color.values[:] = np.stack([balance.gains[rows] - 1, balance.offsets[rows]], axis=-1)
         self._fix()
 
@@ -197,7 +208,7 @@ class Refinement:
         if not self.active or splats.means.grad is None:
             return
         row, lens = int(self.rig.pose_of[index]), int(self.rig.lens_of[index])
-        by_pose, by_focal = camera_gradient(view, splats, self._poses.values[row, 3:])
+        by_pose, by_focal = gradients.camera_gradient(view, splats, self._poses.values[row, 3:])
         if "camera_poses" in self.parts:
             step = self._poses.change(row, self._units[row].T @ by_pose, self._rate(self._poses, iteration))
             self._poses.values[row] += self._units[row] @ step
@@ -208,7 +219,7 @@ class Refinement:
             self._focal.values[lens] += unit * step
         if "time_offsets" in self.parts:
             unit, h = TIME_UNIT * self._spacing, TIME_STEP * self._spacing
-            by_time = _time_gradient(splats, pose(view.t - h), pose(view.t + h)) / (2 * h)
+            by_time = gradients.time_gradient(splats, pose(view.t - h), pose(view.t + h)) / (2 * h)
             step = self._time.change(lens, np.array([by_time * unit]), self._rate(self._time, iteration))
             self._time.values[lens] += unit * step
         if self._color_leaf is not None and self._color_leaf.grad is not None:
@@ -244,6 +255,7 @@ class Refinement:
             return {}
         named = {
             "gains": self.gains,
+            "sizes": self.sizes,
             "on": np.array([part in self.parts for part in PARTS]),
             "begin": np.array(self._begin),
         }
@@ -258,6 +270,7 @@ class Refinement:
         """Restore the state from `tensors`."""
         named = {n.removeprefix(PREFIX): t.numpy().copy() for n, t in tensors.items() if n.startswith(PREFIX)}
         self.parts, self.gains, self._gauge = frozenset(), named.get("gains"), None
+        self.sizes = named.get("sizes", np.full(len(PARTS), math.nan))
         if self.gains is not None:
             self._begin = int(named["begin"])
             self.parts = frozenset(part for part, on in zip(PARTS, named["on"], strict=True) if on)
@@ -270,48 +283,6 @@ class Refinement:
 
     def _kinds(self) -> dict[str, _Rows]:
         return {"poses": self._poses, "focal": self._focal, "time": self._time, "color": self._color}
-
-
-def camera_gradient(view: TrainView, splats: PosedSplats, shift: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the gradient of a loss with respect to pose correction and log focal length of the camera.
-
-    Sizes of the Gaussians in the image change with the focal length as with their own sizes.
-
-    Args:
-        view: The view as drawn.
-        splats: Its splats, with gradients of means, quats and scales.
-        shift: Shift of the camera's present correction, the fixed point of its rotation. [3]
-
-    Returns:
-        Gradient of rotation and shift in the camera's axes [6], and that of the log focal length.
-    """
-    like = splats.means
-    assert like.grad is not None
-    camera = torch.from_numpy(view.camera.T_cam_world).to(like)
-    rotation = camera[:3, :3]
-    p, by_p = like @ rotation.T + camera[:3, 3], like.grad @ rotation.T
-    by_shift = by_p.sum(0, dtype=torch.float64)
-    lever = p - torch.from_numpy(np.asarray(shift)).to(like)
-    by_turn = torch.linalg.cross(lever, by_p).sum(0, dtype=torch.float64)
-    focal = (p[:, :2] * by_p[:, :2]).sum(dtype=torch.float64)
-    if splats.quats.grad is not None:
-        w, v, gw, gv = splats.quats[:, :1], splats.quats[:, 1:], splats.quats.grad[:, :1], splats.quats.grad[:, 1:]
-        spun = 0.5 * (w * gv - gw * v + torch.linalg.cross(v, gv)).sum(0, dtype=torch.float64)
-        by_turn = by_turn + rotation.to(torch.float64) @ spun
-    if splats.scales.grad is not None:
-        focal = focal + (splats.scales * splats.scales.grad).sum(dtype=torch.float64)
-    numbers = torch.cat([by_turn, by_shift, focal[None]]).cpu().numpy()
-    return numbers[:6], float(numbers[6])
-
-
-def _time_gradient(splats: PosedSplats, before: PosedSplats, after: PosedSplats) -> float:
-    """Return the change of the loss from the splats of an earlier to those of a later time, to first order."""
-    total = 0.0
-    for name in ("means", "quats"):
-        gradient = getattr(splats, name).grad
-        if gradient is not None:
-            total += float((gradient * (getattr(after, name) - getattr(before, name))).sum(dtype=torch.float64))
-    return total if math.isfinite(total) else 0.0
 
 
 class RefinedViews(Sequence[TrainView]):

@@ -1,15 +1,14 @@
 """Decision on the refinement of the cameras, from the images that the training has so far explained.
 
-Pictures of some views are linearised in the corrections of their cameras (`render.camera_fit`). Corrections are fitted
-to one half of the pixels and measured on the other half, both ways. A part of the corrections (poses, focal lengths,
-time offsets, colours) is trained if the error on the pixels that were not fitted grows clearly without it.
+Pictures of some views are linearised in the corrections of their cameras (`render.camera_fit`). A part of the
+corrections (poses, focal lengths, time offsets, colours) is trained if opposite sides of the pictures agree that it is
+needed (`agreement`).
 """
 
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -23,6 +22,8 @@ from ...scene.sampling import spacing, spread
 from .. import train_views
 from ..normalization import TARGET_DISTANCE
 from ..trainer import Trainer
+from . import agreement, gauge
+from .agreement import Evidence, Examined
 from .refinement import PARTS
 
 log = logging.getLogger(__name__)
@@ -30,10 +31,8 @@ log = logging.getLogger(__name__)
 SHORTEST = 100  # minimum steps of a run for an examination; shorter runs explain too little of the images
 FOLLOW_UPS = 8  # number of examinations of refined parts while times enter
 ROUNDS = 3  # number of examinations once all times have entered
-POSES, VIEWS = 12, 3  # maximum number of poses that are examined, and of views of each
+MOST_POSES, VIEWS = 12, 3  # maximum number of poses that are examined, and of views of each
 TIME_PIXEL = 0.1  # time in which moving things go about a pixel, spacings of the observed times
-RIDGE = 1e-3  # relative increase of the diagonal of the normal equations
-_COLUMNS: dict[str, str] = dict(zip(PARTS, ("pose", "focal", "time", "color"), strict=True))
 
 
 def steps(config: Config) -> tuple[int, ...]:
@@ -62,28 +61,33 @@ def after_step(trainer: Trainer) -> None:
             decide(trainer, [part for part in _possible(trainer) if part in trainer.refinement.parts])
 
 
-def threshold(part: str, config: Config) -> float:
-    """Return the minimum gain of a part, dB."""
-    return config.refine.threshold_time if part == "time_offsets" else config.refine.threshold
+def least_size(part: str, config: Config) -> float:
+    """Return the minimum size of a part, in the units of `agreement.Evidence`."""
+    section = config.refine
+    return {"time_offsets": section.intervals, "camera_colours": section.colors}.get(part, section.pixels)
 
 
 def decide(trainer: Trainer, possible: Sequence[str]) -> None:
     """Examine some parts, begin the refinement of those that help, and improve the corrections of the others."""
     refinement, config = trainer.refinement, trainer.config
-    examined = spread(range(refinement.rig.poses), POSES)
-    halves = {row: found for row in examined if possible and (found := _halves(trainer, row, possible)) is not None}
-    gains = _gains(list(halves.values()), possible)
-    found = np.array([gains.get(part, math.nan) for part in PARTS])
-    refinement.gains = found if refinement.gains is None else np.fmax(refinement.gains, found)
+    examined = spread(range(refinement.rig.poses), MOST_POSES)
+    tiles = {row: found for row in examined if possible and (found := _tiles(trainer, row, possible)) is not None}
+    if not tiles:
+        return
+    points = to_host(trainer.gaussians.means)
+    some = points[:: max(1, len(points) // gauge.POINTS)]
+    poses = [Examined(refinement.rig.cameras[row], found) for row, found in tiles.items()]
+    evidence = agreement.examine(poses, possible, _units(trainer), some, spacing(trainer.times))
+    refinement.learn({part: (one.size, one.gain) for part, one in evidence.items()})
     forced = {part for part in possible if getattr(config.needs, part) == "on"}
-    helpful = {part for part in possible if gains[part] > threshold(part, config)}
+    helpful = {part for part, one in evidence.items() if one.size > least_size(part, config)}
     taken = [part for part in PARTS if part in forced | helpful | refinement.parts]
-    log.info("cameras: gains %s; refined: %s", _text(found), ", ".join(taken) or "nothing")
+    log.info("cameras, step %d: %s; refined: %s", trainer.iteration, _text(evidence), ", ".join(taken) or "nothing")
     if not taken:
         return
-    which = _indices([part for part in taken if part in possible])
-    changes = {row: (a + b).solve(which, RIDGE) for row, (a, b) in halves.items()}
-    refinement.begin(taken, to_host(trainer.gaussians.means), trainer.iteration, changes)
+    which = agreement.indices([part for part in taken if part in possible])
+    changes = {row: camera_fit.added(found).solve(which, agreement.RIDGE) for row, found in tiles.items()}
+    refinement.begin(taken, points, trainer.iteration, changes)
 
 
 def _possible(trainer: Trainer) -> list[str]:
@@ -98,13 +102,13 @@ def _possible(trainer: Trainer) -> list[str]:
     return [part for part in PARTS if enough[part] and getattr(trainer.config.needs, part) != "off"]
 
 
-def _indices(parts: Sequence[str]) -> np.ndarray:
-    return camera_fit.columns(**{_COLUMNS[part]: True for part in parts})
+def _units(trainer: Trainer) -> Units:
+    return Units(TARGET_DISTANCE, TIME_PIXEL * spacing(trainer.times))
 
 
 @torch.no_grad()
-def _halves(trainer: Trainer, row: int, parts: Sequence[str]) -> tuple[Normal, Normal] | None:
-    """Return the normal equations of the two halves of a pose's pixels; None if no view of it is in training yet."""
+def _tiles(trainer: Trainer, row: int, parts: Sequence[str]) -> list[Normal] | None:
+    """Return the normal equations of the tiles of a pose's pictures; None if no view of it is in training yet."""
     refinement, (first, last) = trainer.refinement, trainer.curriculum.entered
     mine = [
         int(index)
@@ -114,35 +118,17 @@ def _halves(trainer: Trainer, row: int, parts: Sequence[str]) -> tuple[Normal, N
     if not mine:
         return None
     mine.sort(key=lambda index: trainer.given_views[index].t)
-    units, which = Units(TARGET_DISTANCE, TIME_PIXEL * spacing(trainer.times)), _indices(parts)
-    a, b = [], []
-    for number, index in enumerate(spread(mine, VIEWS)):
+    views, which = [], agreement.indices(parts)
+    for index in spread(mine, VIEWS):
         view = trainer.given_views[index]
 
         def draw(camera: Camera, t: float, given: Camera = view.camera) -> np.ndarray:
             return to_host(trainer.render(camera, t, behind=given))
 
         shot = Shot(view.camera, view.t, view.image.astype(np.float32) / 255)
-        halves = camera_fit.normal_halves(draw, shot, refinement.correction(row), units, which, odd=number % 2)
-        a.append(halves[0])
-        b.append(halves[1])
-    return sum(a[1:], a[0]), sum(b[1:], b[0])
+        views.append(camera_fit.normal_tiles(draw, shot, refinement.correction(row), _units(trainer), which))
+    return [camera_fit.added(tile) for tile in zip(*views, strict=True)]
 
 
-def _gains(halves: Sequence[tuple[Normal, Normal]], parts: Sequence[str]) -> dict[str, float]:
-    """Return the increase of the error on pixels that were not fitted if one part is left out, dB."""
-    if not halves:
-        return {}
-    whole = _error(halves, parts)
-    return {part: 10 * math.log10(_error(halves, [p for p in parts if p != part]) / whole) for part in parts}
-
-
-def _error(halves: Sequence[tuple[Normal, Normal]], parts: Sequence[str]) -> float:
-    which, total = _indices(parts), 1e-12
-    for a, b in halves:
-        total += max(b.after(a.solve(which, RIDGE)), 0.0) + max(a.after(b.solve(which, RIDGE)), 0.0)
-    return total
-
-
-def _text(gains: np.ndarray) -> str:
-    return ", ".join(f"{part} {gain:+.2f} dB" for part, gain in zip(PARTS, gains, strict=True) if not math.isnan(gain))
+def _text(evidence: Mapping[str, Evidence]) -> str:
+    return ", ".join(f"{part} {one.size:.3g} ({one.gain:+.2f} dB)" for part, one in evidence.items())

@@ -228,14 +228,14 @@ def test_the_table_lists_regrouped_gaussians():
     assert table()["regrouping"]["decision"] == "off"
 
 
-def test_refined_cameras_have_rows_with_gain_and_size():
-    gains = {"camera_poses": 1.5, "focal_lengths": 0.0, "time_offsets": None, "camera_colours": 0.1}
+def test_refined_cameras_have_rows_with_sizes():
+    sizes = {"camera_poses": 1.5, "focal_lengths": 0.0, "time_offsets": None, "camera_colours": 0.001}
     corrections = {"left": Correction(rotvec=np.full(3, 0.01)).to_dict()}
-    record = {"refined": ["camera_poses"], "gains_db": gains, "corrections": corrections, "pixels": {"left": 0.7}}
+    record = {"refined": ["camera_poses"], "sizes": sizes, "corrections": corrections, "pixels": {"left": 0.7}}
     rows = {need.name: need.row() for need in camera_needs.rows(record, config.Config())}
     assert list(rows) == list(PARTS)
     assert rows["camera_poses"]["decision"] == "on" and rows["camera_poses"]["value"] == 1.5
     assert "moved by 0.7 (at most 0.7) px" in rows["camera_poses"]["reason"]
-    assert rows["camera_colours"]["decision"] == "off" and rows["camera_colours"]["threshold"] == 0.25
+    assert rows["camera_colours"]["decision"] == "off" and rows["camera_colours"]["threshold"] == 0.01
     assert rows["time_offsets"]["reason"] == "not examined"
     assert {need.reason for need in camera_needs.rows({}, config.Config())} == {"not examined"}

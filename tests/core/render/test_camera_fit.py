@@ -56,26 +56,27 @@ def test_only_the_wanted_parameters_change(draw, shots):
     assert found.changes_colors
 
 
-def test_the_halves_share_the_pixels_and_can_be_exchanged(draw, shots):
+def test_tiles_share_the_pixels(draw, shots):
     which = camera_fit.columns(pose=True)
-    a, b = camera_fit.normal_halves(draw, shots[0], Correction(), UNITS, which)
-    other_a, other_b = camera_fit.normal_halves(draw, shots[0], Correction(), UNITS, which, odd=1)
-    assert a.pixels + b.pixels == 96 * 72
-    np.testing.assert_array_equal(a.matrix, other_b.matrix)
-    np.testing.assert_array_equal(b.vector, other_a.vector)
+    tiles = camera_fit.normal_tiles(draw, shots[0], Correction(), UNITS, which, tiles=5)
+    assert len(tiles) == 25 and all(tile.pixels > 200 for tile in tiles)
+    whole = camera_fit.normal_tiles(draw, shots[0], Correction(), UNITS, which, tiles=1)[0]
+    together = camera_fit.added(tiles)
+    assert together.pixels == whole.pixels == 96 * 72
+    np.testing.assert_allclose(together.matrix, whole.matrix, rtol=1e-9, atol=1e-9)
 
 
 def test_invalid_pixels_do_not_count(draw, shots):
     valid = np.zeros((72, 96), bool)
     valid[:10] = True
     shot = camera_fit.Shot(shots[0].camera, shots[0].t, shots[0].image, valid)
-    a, b = camera_fit.normal_halves(draw, shot, Correction(), UNITS, camera_fit.columns(color=True))
-    assert a.pixels + b.pixels == 960
+    tiles = camera_fit.normal_tiles(draw, shot, Correction(), UNITS, camera_fit.columns(color=True))
+    assert sum(tile.pixels for tile in tiles) == 960
 
 
 def test_the_linearised_error_falls_to_that_of_the_solution(draw, shots):
     which = camera_fit.columns(pose=True, color=True)
-    a, b = camera_fit.normal_halves(draw, shots[0], Correction(), UNITS, which)
-    change = (a + b).solve(which)
-    assert (a + b).after(change) < 0.5 * (a + b).error
-    assert (a + b).after(np.zeros(len(change))) == pytest.approx((a + b).error)
+    whole = camera_fit.normal_tiles(draw, shots[0], Correction(), UNITS, which, tiles=1)[0]
+    change = whole.solve(which)
+    assert whole.after(change) < 0.5 * whole.error
+    assert whole.after(np.zeros(len(change))) == pytest.approx(whole.error)

@@ -11,7 +11,7 @@ from r5dgs_core.raster import rasterize_splats
 from r5dgs_core.scene import cameras
 from r5dgs_core.scene.camera_correction import Correction
 from r5dgs_core.train import run, train_views
-from r5dgs_core.train.refinement import refined_dataset, refinement, trial
+from r5dgs_core.train.refinement import gradients, refined_dataset, trial
 from r5dgs_core.train.refinement.refinement import PARTS
 from r5dgs_core.train.representations.fused_posing import PosedSplats
 from r5dgs_core.train.trainer import Trainer
@@ -86,7 +86,7 @@ def test_gradients_of_the_camera_are_those_of_the_picture():
     loss(Correction()).backward()
     view = dataclasses.make_dataclass("View", ["camera"])(camera)
     with torch.no_grad():
-        by_pose, by_focal = refinement.camera_gradient(view, splats, np.zeros(3))
+        by_pose, by_focal = gradients.camera_gradient(view, splats, np.zeros(3))
         step = 1e-5
         numeric = [
             float(loss(Correction().plus(step * unit)) - loss(Correction().plus(-step * unit))) / (2 * step)
@@ -155,7 +155,7 @@ def test_colours_are_corrected_before_gaussians_are_placed(tiny, monkeypatch):
         run.take_step(resumed, None, lambda event: None)
     found = resumed.state().tensors
     for name, tensor in trainer.state().tensors.items():
-        assert torch.equal(tensor, found[name]) or name == "refine.gains", name
+        assert torch.equal(tensor, found[name]) or name in ("refine.gains", "refine.sizes"), name
     off = Trainer(dataset, tiny_datasets.settings(*STEPS, "needs.camera_colours=off"))
     assert not off.refinement.active
 
