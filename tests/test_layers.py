@@ -55,6 +55,7 @@ ALLOWED = {
     "scene": {"motion"},
     "color": {"scene"},
     "shapes": {"motion", "scene"},
+    "contact": {"motion", "shapes"},
     "data": {"motion", "scene", "color"},
     "raster": {"motion", "scene"},
     "search": {"scene"},

@@ -28,7 +28,7 @@ class Trajectory(MotionKind):
         knots = _knots(model)
         number = np.searchsorted(knots[:, TIME], tau, side="right") - 1
         last = len(knots) - 1
-        inside = _between(knots[np.clip(number, 0, last)], knots[np.clip(number + 1, 0, last)], tau)
+        inside = between(knots[np.clip(number, 0, last)], knots[np.clip(number + 1, 0, last)], tau)
         outside = _beyond(knots[np.clip(number, 0, last)], tau, (number >= 0)[..., None])
         within = ((number >= 0) & (number < last))[..., None]
         quats, places, spins, velocities = (np.where(within, x, y) for x, y in zip(inside, outside, strict=True))
@@ -43,7 +43,7 @@ class Trajectory(MotionKind):
             rows: np.ndarray = starts[:-1] + [int(np.searchsorted(own, tau, side="right")) - 1 for own in times]
             within = rows + 1 < starts[1:]
             at = np.full(len(rows), tau)
-            inside = _between(every[rows], every[np.where(within, rows + 1, rows)], at)
+            inside = between(every[rows], every[np.where(within, rows + 1, rows)], at)
             outside = _beyond(every[rows], at, np.ones((len(rows), 1), bool))
             quats, places = (np.where(within[:, None], x, y) for x, y in zip(inside[:2], outside[:2], strict=True))
             return quats, places
@@ -69,7 +69,7 @@ def _knots(model: MotionModel) -> np.ndarray:
     return model.knots
 
 
-def _between(start: np.ndarray, stop: np.ndarray, tau: np.ndarray) -> Curve:
+def between(start: np.ndarray, stop: np.ndarray, tau: np.ndarray) -> Curve:
     """Poses and rates between two knots [..., 20]; of no use for two equal ones."""
     h = (stop[..., TIME] - start[..., TIME])[..., None]
     h = np.where(h > 0, h, 1.0)

@@ -1,0 +1,1 @@
+"""Motion of rigid bodies in contact, simulated by MuJoCo: materials, roll-outs, identification, many futures."""

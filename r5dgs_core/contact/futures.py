@@ -1,0 +1,69 @@
+"""Many futures of a body: samples of its state and material, simulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..motion import rotations
+from .identify import PARAMETERS, Estimate, Fitter
+
+WIDENED = 2.0  # factor on the standard deviations of a fit, read off tosses of a cube
+_FACE = np.pi / 4  # angle to the most central future beyond which a body lies on another face
+
+
+@dataclass(frozen=True)
+class Futures:
+    """Sampled poses of one body.
+
+    Attributes:
+        times: [T]
+        quats: [T, N, 4]
+        places: Centres of mass. [T, N, 3]
+    """
+
+    times: np.ndarray
+    quats: np.ndarray
+    places: np.ndarray
+
+    def radii(self, center: np.ndarray, level: float) -> np.ndarray:
+        """Distance from given places [T, 3] within which a share ``level`` of the samples lies. [T]"""
+        return np.quantile(np.linalg.norm(self.places - center[:, None], axis=-1), level, axis=1)
+
+    def angles(self, quats: np.ndarray, level: float) -> np.ndarray:
+        """The same of rotations [T, 4], rad. [T]"""
+        return np.quantile(rotations.angle_between(self.quats, quats[:, None]), level, axis=1)
+
+    def other_faces(self) -> float:
+        """Share of the samples whose last rotation is far from that of the most central one."""
+        last = self.quats[-1]
+        apart = rotations.angle_between(last[:, None], last[None])
+        return float((apart[np.argmin(np.median(apart, axis=1))] > _FACE).mean())
+
+
+def sample(
+    fitter: Fitter,
+    estimate: Estimate,
+    times: np.ndarray,
+    count: int,
+    rng: np.random.Generator,
+    widened: float = WIDENED,
+) -> Futures:
+    """Simulate samples of an estimate.
+
+    Args:
+        fitter: The fitter of the body.
+        estimate: Its result.
+        times: Times, increasing and not before that of the estimate. [T]
+        count: Number of samples N.
+        rng: Source of the samples.
+        widened: Factor on the standard deviations.
+    """
+    deviations = rng.normal(size=(count, PARAMETERS)) @ np.linalg.cholesky(estimate.covariance).T * widened
+    quats, places = np.empty((len(times), count, 4)), np.empty((len(times), count, 3))
+    for n, x in enumerate(deviations):
+        state, material = fitter.moved(estimate.state, estimate.material, x)
+        quats[:, n], places[:, n] = fitter.poses(state, material, times - estimate.time)
+    good = np.isfinite(places).all(axis=(0, 2))
+    return Futures(times, quats[:, good], places[:, good])

@@ -1,0 +1,241 @@
+"""State, friction and restitution of a body from its observed poses, by least squares over simulations.
+
+Notation: the parameters are deviations from a reference: place, rotation, velocity and spin, with lengths in sizes of
+the body and times in sqrt(size / g), then the logarithm of the friction and the logit of the restitution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..motion import levenberg_marquardt, rotations, se3
+from . import world as worlds
+from .simulation import Simulation
+from .world import Material, State
+
+PARAMETERS = 14
+LAST = 4  # poses that determine the state at t_max
+_STEPS = np.repeat([0.002, 0.003, 0.002, 0.003, 0.03, 0.1], [3, 3, 3, 3, 1, 1])  # of differences
+_OUTLIER = 9.0  # squared residual of a pose whose weight is one half
+_FRICTIONS, _RESTITUTIONS = (0.1, 0.18, 0.3, 0.5), (0.1, 0.3, 0.6)  # first guesses
+_CLOSE = 0.04  # gap, as a share of the size, below which a pose may be in contact
+_EARLY, _FULL = 5, 8  # iterations
+
+
+@dataclass(frozen=True)
+class Track:
+    """Observed poses of a body.
+
+    Attributes:
+        times: Increasing. [S]
+        quats: Relative to the bind state. [S, 4]
+        places: Centres of mass. [S, 3]
+        place_noise: Standard deviation of a place per axis. [S]
+        turn_noise: The same of a rotation, rad. [S]
+    """
+
+    times: np.ndarray
+    quats: np.ndarray
+    places: np.ndarray
+    place_noise: np.ndarray
+    turn_noise: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def rows(self, rows: slice) -> Track:
+        """Select poses."""
+        return Track(
+            *(column[rows] for column in (self.times, self.quats, self.places, self.place_noise, self.turn_noise))
+        )
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Normal distributions of the logarithm of the friction and the logit of the restitution.
+
+    Attributes:
+        material: Their means.
+        friction, restitution: Their standard deviations.
+    """
+
+    material: Material
+    friction: float
+    restitution: float
+
+
+WIDE = Prior(Material(0.3, 0.3), 0.6, 1.0)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Result of a fit.
+
+    Attributes:
+        state: State of the body at ``time``.
+        time: Time of the first pose that was fitted.
+        material: Friction and restitution.
+        covariance: Of the parameters of the module's notation. [14, 14]
+        cost: Weighted sum of squared residuals, with the prior.
+        misfit: Mean squared residual in units of the noise.
+    """
+
+    state: State
+    time: float
+    material: Material
+    covariance: np.ndarray
+    cost: float
+    misfit: float
+
+
+class Fitter:
+    """Fits of one body, the only one of a simulation that moves or the one with a given number.
+
+    Args:
+        simulation: A draft simulation.
+        track: Observed poses.
+    """
+
+    def __init__(self, simulation: Simulation, track: Track, body: int = 0):
+        self.simulation, self.track, self.body = simulation, track, body
+        world = simulation.world
+        self.size = world.bodies[body].solid.size
+        g = float(np.linalg.norm(world.gravity))
+        self.unit_time = float(np.sqrt(self.size / g)) if g > 0 else float(np.ptp(track.times)) or 1.0
+        self.scales = np.repeat([self.size, 1.0, self.size / self.unit_time, 1 / self.unit_time, 1.0], [3, 3, 3, 3, 2])
+
+    def run(self, prior: Prior = WIDE) -> Estimate:
+        """Fit material and state by the whole track, then the state by its last poses."""
+        first = self._whole(prior)
+        rows = slice(max(len(self.track) - LAST, 0), None)
+        start = self.at(first, float(self.track.times[rows][0]))
+        narrow = Prior(first.material, min(0.1, prior.friction), min(0.5, prior.restitution))
+        if not self._touched():  # nothing was learned about the material
+            return first
+        return self.fit(start, first.material, self.track.rows(rows), narrow, _FULL)
+
+    def _touched(self) -> bool:
+        return self._flight() < len(self.track)
+
+    def _whole(self, prior: Prior) -> Estimate:
+        track, flight = self.track, max(self._flight(), min(3, len(self.track)))
+        start = self.ballistic(track.rows(slice(0, flight)))
+        if not self._touched():
+            return self.fit(start, prior.material, track, prior, _FULL)
+        guess = min(
+            (Material(mu, e) for mu in _FRICTIONS for e in _RESTITUTIONS),
+            key=lambda material: self._truncated(start, material),
+        )
+        found, count = None, len(track)
+        for rows in sorted({min(count, flight + 2), min(count, (flight + 2 + count) // 2), count}):
+            near = (start, guess) if found is None else (found.state, found.material)
+            steps = _FULL if rows == count else _EARLY
+            found = self.fit(*near, track.rows(slice(0, rows)), prior, steps)
+        assert found is not None
+        again = self.fit(start, guess, track, prior, _FULL)
+        return min(found, again, key=lambda estimate: estimate.cost)
+
+    def fit(self, state: State, material: Material, track: Track, prior: Prior, steps: int) -> Estimate:
+        """Fit from a state at the time of the first pose of a track."""
+        theta = _logs(material) - _logs(prior.material)
+        precision = np.append(np.zeros(12), [1 / prior.friction, 1 / prior.restitution])
+        start = np.append(np.zeros(12), theta)
+
+        def linearized(x: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            values, slopes = zip(*(self._linearized(state, prior, track, row) for row in x), strict=True)
+            return np.array(values), np.array(slopes)
+
+        found = levenberg_marquardt.solve_linearized(
+            linearized, start[None], precision=precision, softness=_OUTLIER, steps=steps
+        ).row(0)
+        moved, learned = self.moved(state, prior.material, found.x)
+        ridge = np.diag(1e-9 * np.maximum(np.diag(found.normal), 1e-9))
+        covariance = np.linalg.inv(found.normal + ridge)
+        misfit = float((found.residuals**2).mean())
+        return Estimate(moved, float(track.times[0]), learned, covariance, float(found.cost), misfit)
+
+    def moved(self, state: State, material: Material, x: np.ndarray) -> tuple[State, Material]:
+        """State and material with deviations [14] in the module's notation."""
+        d = x[:12].reshape(4, 3) * self.scales[:12].reshape(4, 3)
+        quats = rotations.normalize(rotations.multiply(rotations.rotvecs_to_quats(d[1]), state.quats))
+        changed = State(state.places + d[0], quats, state.velocities + d[2], state.spins + d[3])
+        log_friction, logit = _logs(material) + x[12:]
+        return changed, Material(float(np.exp(np.clip(log_friction, -12, 5))), float(1 / (1 + np.exp(-logit))))
+
+    def at(self, estimate: Estimate, time: float) -> State:
+        """State of an estimate at a later time."""
+        self.simulation.touch(self._materials(estimate.material))
+        self.simulation.load(self._all(estimate.state))
+        self.simulation.advance(time - estimate.time)
+        return self.simulation.state().one(self.body)
+
+    def poses(self, state: State, material: Material, times: np.ndarray) -> se3.Pose:
+        """Poses of the body at times since a state. [T, 4], [T, 3]"""
+        self.simulation.touch(self._materials(material))
+        quats, places = self.simulation.poses(self._all(state), times)
+        return quats[:, self.body], places[:, self.body]
+
+    def ballistic(self, track: Track) -> State:
+        """State at the first of at least two poses in free flight, by a parabola and a constant spin."""
+        gravity = self.simulation.world.gravity
+        t = track.times - track.times[0]
+        columns = np.stack([np.ones_like(t), t], axis=1)
+        place, velocity = np.linalg.lstsq(columns, track.places - 0.5 * gravity * t[:, None] ** 2, rcond=None)[0]
+        steps = rotations.quats_to_rotvecs(rotations.multiply(track.quats[1:], rotations.conjugate(track.quats[:-1])))
+        quat, spin = track.quats[0], np.median(steps / np.diff(t)[:, None], axis=0) if len(t) > 1 else np.zeros(3)
+        for _ in range(5 if len(t) > 1 else 0):
+            shown = rotations.multiply(rotations.rotvecs_to_quats(spin * t[:, None]), quat)
+            missed = rotations.quats_to_rotvecs(rotations.multiply(track.quats, rotations.conjugate(shown)))
+            turn, more = np.linalg.lstsq(columns, missed, rcond=None)[0]
+            quat, spin = rotations.multiply(rotations.rotvecs_to_quats(turn), quat), spin + more
+        return State(place[None], rotations.normalize(quat)[None], velocity[None], spin[None])
+
+    def _flight(self) -> int:
+        """Number of poses before the first that is close to the plane."""
+        plane = self.simulation.world.plane
+        if plane is None:
+            return len(self.track)
+        body = self.simulation.world.bodies[self.body]
+        close = worlds.gaps(body, plane, self.track.places, self.track.quats) < _CLOSE * self.size
+        return int(np.argmax(close)) if close.any() else len(self.track)
+
+    def _linearized(self, state: State, prior: Prior, track: Track, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        here = self._residuals(*self.moved(state, prior.material, x), track)
+        nudged = (x + step * nudge for step, nudge in zip(_STEPS, np.eye(PARAMETERS), strict=True))
+        ahead = np.array([self._residuals(*self.moved(state, prior.material, near), track) for near in nudged])
+        return here, (ahead - here) / _STEPS[:, None, None]
+
+    def _residuals(self, state: State, material: Material, track: Track) -> np.ndarray:
+        """Differences from observed places and rotations in units of the noise. [2 S, 3]"""
+        found = self.poses(state, material, track.times - track.times[0])
+        missed = se3.differences(found, (track.quats, track.places), 1.0, 1.0)
+        return np.concatenate([missed[:, :3] / track.place_noise[:, None], missed[:, 3:] / track.turn_noise[:, None]])
+
+    def _truncated(self, state: State, material: Material) -> float:
+        missed = self._residuals(state, material, self.track)
+        return float(np.minimum(np.linalg.norm(np.nan_to_num(missed, nan=1e9), axis=1), 10).sum())
+
+    def _materials(self, material: Material) -> Sequence[Material]:
+        bodies = self.simulation.world.bodies
+        return [material if i == self.body else body.material for i, body in enumerate(bodies)]
+
+    def _all(self, state: State) -> State:
+        """State of all bodies: the others at rest in the bind state."""
+        everything = worlds.at_rest(self.simulation.world)
+        for name in ("places", "quats", "velocities", "spins"):
+            getattr(everything, name)[self.body] = getattr(state, name)[0]
+        return everything
+
+
+def _logs(material: Material) -> np.ndarray:
+    """Logarithm of the friction and logit of the restitution. [2]"""
+    e = min(max(material.restitution, 1e-3), 1 - 1e-3)
+    return np.array([np.log(max(material.friction, 1e-4)), np.log(e / (1 - e))])
+
+
+def scaled(estimate: Estimate, factor: float) -> Estimate:
+    """Estimate with standard deviations multiplied by a factor."""
+    return replace(estimate, covariance=factor**2 * estimate.covariance)

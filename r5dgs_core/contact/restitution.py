@@ -1,0 +1,41 @@
+"""Coefficient of restitution of MuJoCo's contacts.
+
+A contact of MuJoCo is a damped spring that cannot pull: it ends when its force reaches zero. Notation: z the damping
+ratio, w the angular frequency of the undamped spring, e the speed after an impact over the speed before it.
+"""
+
+from __future__ import annotations
+
+import math
+
+LEAST, MOST = 0.05, 0.98  # range of e in which simulated impacts keep it to 0.01
+_HEAVY = 50.0  # damping ratio above which nothing bounces
+
+
+def of_damping(z: float) -> float:
+    """Restitution of a damping ratio >= 0; falls from 1.
+
+    Source: motion of the damped oscillator up to the time at which its force is zero.
+    """
+    if z < 1e-9:
+        return 1.0
+    if abs(z - 1) < 1e-6:
+        return math.exp(-2)
+    s = math.sqrt(abs(z * z - 1))
+    phase = math.atan2(2 * z * s, 2 * z * z - 1) if z < 1 else math.log((z + s) / (z - s))
+    return math.exp(-z / s * phase)
+
+
+def damping_of(e: float) -> float:
+    """Damping ratio of a restitution, clipped to [`LEAST`, `MOST`]; inverse of `of_damping`."""
+    e = min(max(e, LEAST), MOST)
+    low, high = 0.0, _HEAVY
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if of_damping(middle) > e else (low, middle)
+    return 0.5 * (low + high)
+
+
+def reference(e: float, frequency: float) -> tuple[float, float]:
+    """MuJoCo's ``solref`` of a contact with a restitution and a frequency w: minus stiffness and minus damping."""
+    return -(frequency**2), -2 * damping_of(e) * frequency

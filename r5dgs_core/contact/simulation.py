@@ -1,0 +1,199 @@
+"""Simulation of a world by MuJoCo, from any state and with any materials.
+
+MuJoCo's friction cone is elliptic, as the pyramidal one is wrong by 41 % in diagonal directions; its matrices are
+dense, as these are faster for few bodies; speculative contacts keep thin bodies from passing through each other.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .. import errors, extras
+from ..motion import rotations
+from . import restitution
+from .stepping import Stepping
+from .world import Body, Material, State, World
+
+log = logging.getLogger(__name__)
+_IMPEDANCE = [0.99, 0.99, 0.001, 0.5, 2]  # constant, so that solref alone determines the restitution
+_LEAST_FRICTION, _MOST_FRICTION = 1e-5, 1e3
+_TOUCHING = 1e-3  # penetration that stays in the initial state, as a share of a body's size
+
+
+class Simulation:
+    """A compiled world. Calls are independent of each other.
+
+    Raises:
+        BackendError: MuJoCo is not installed.
+        ConfigError: MuJoCo refuses a body.
+    """
+
+    def __init__(self, world: World, stepping: Stepping):
+        with extras.required("contacts", "contact"):
+            import mujoco as engine
+        mujoco: Any = engine
+        mujoco.set_mju_user_warning(log.debug)  # it would write MUJOCO_LOG.TXT into the working directory
+        self.mujoco = mujoco
+        self.world, self.stepping = world, stepping
+        spec = _specification(mujoco, world, stepping)
+        try:
+            self.model = spec.compile()
+        except ValueError as error:
+            raise errors.ConfigError(f"contacts: MuJoCo refuses the bodies: {error}") from error
+        self.data = mujoco.MjData(self.model)
+        self._moving = [i for i, body in enumerate(world.bodies) if not body.fixed]
+        self._geoms = np.array([self.model.geom(f"body{i}").id for i in range(len(world.bodies))], int)
+        self.touch([body.material for body in world.bodies])
+
+    def touch(self, materials: Sequence[Material]) -> None:
+        """Set the materials of the B bodies."""
+        model, frequency = self.model, self.stepping.frequency
+        for i, material in enumerate(materials):
+            friction = min(max(material.friction, _LEAST_FRICTION), _MOST_FRICTION)
+            reference = restitution.reference(max(material.restitution, self.stepping.least_restitution), frequency)
+            model.geom_friction[self._geoms[i], 0] = friction
+            model.geom_solref[self._geoms[i]] = reference
+            if self.world.plane is not None and not self.world.bodies[i].fixed:
+                pair = self._moving.index(i)
+                model.pair_friction[pair, :2] = friction
+                model.pair_solref[pair] = reference
+
+    def load(self, state: State) -> None:
+        """Set the state at time 0."""
+        self.mujoco.mj_resetData(self.model, self.data)
+        for k, i in enumerate(self._moving):
+            self.data.qpos[7 * k : 7 * k + 3] = state.places[i]
+            self.data.qpos[7 * k + 3 : 7 * k + 7] = state.quats[i]
+            self.data.qvel[6 * k : 6 * k + 3] = state.velocities[i]
+            self.data.qvel[6 * k + 3 : 6 * k + 6] = rotations.rotate(
+                rotations.conjugate(state.quats[i]), state.spins[i]
+            )
+
+    def state(self) -> State:
+        """Present state; fixed bodies are at rest."""
+        count = len(self.world.bodies)
+        places = np.array([body.solid.center for body in self.world.bodies]).reshape(count, 3)
+        quats, velocities, spins = rotations.identity(count), np.zeros((count, 3)), np.zeros((count, 3))
+        poses, rates = self.data.qpos.reshape(-1, 7), self.data.qvel.reshape(-1, 6)
+        places[self._moving], quats[self._moving] = poses[:, :3], poses[:, 3:]
+        velocities[self._moving] = rates[:, :3]
+        spins[self._moving] = rotations.rotate(poses[:, 3:], rates[:, 3:])
+        return State(places, quats, velocities, spins)
+
+    def advance(self, time: float) -> None:
+        """Simulate up to the last step before a time."""
+        steps = int(np.floor((time - self.data.time) / self.stepping.step + 1e-9))
+        if steps > 0:
+            self.mujoco.mj_step(self.model, self.data, steps)
+
+    @property
+    def failed(self) -> bool:
+        """True if MuJoCo has reset the state because of a number that is not finite or huge."""
+        kinds = self.mujoco.mjtWarning
+        bad = (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)
+        return any(self.data.warning[kind].number for kind in bad)
+
+    def poses(self, state: State, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Simulate from a state at time 0.
+
+        Args:
+            state: The initial state.
+            times: Times >= 0, increasing. [T]
+
+        Returns:
+            Quaternions relative to the bind state [T, B, 4] and centres of mass [T, B, 3]; not a number after a
+            simulation has failed.
+        """
+        self.load(state)
+        quats, places = np.empty((len(times), len(state.places), 4)), np.empty((len(times), len(state.places), 3))
+        for row, time in enumerate(times):
+            self.advance(float(time))
+            now, rest = self.state(), float(time) - self.data.time
+            places[row] = now.places + rest * now.velocities
+            quats[row] = rotations.multiply(rotations.rotvecs_to_quats(rest * now.spins), now.quats)
+        if self.failed:
+            places[:], quats[:] = np.nan, np.nan
+        return quats, places
+
+    def contacts(self) -> dict[tuple[int, int], float]:
+        """Normal forces that push now, by the two bodies, -1 for the plane."""
+        found: dict[tuple[int, int], float] = {}
+        force = np.zeros(6)
+        for k in range(self.data.ncon):
+            self.mujoco.mj_contactForce(self.model, self.data, k, force)
+            if force[0] > 0:
+                pair = self._pair(self.data.contact[k])
+                found[pair] = found.get(pair, 0.0) + float(force[0])
+        return found
+
+    def deepest(self, state: State) -> dict[tuple[int, int], float]:
+        """Penetrations of a state that are more than a thousandth of the smaller body, by the two bodies."""
+        self.load(state)
+        self.mujoco.mj_forward(self.model, self.data)
+        found: dict[tuple[int, int], float] = {}
+        for contact in self.data.contact[: self.data.ncon]:
+            pair = self._pair(contact)
+            size = min(self.world.bodies[i].solid.size for i in pair if i >= 0)
+            if contact.dist < -_TOUCHING * size:
+                found[pair] = max(found.get(pair, 0.0), -float(contact.dist))
+        return found
+
+    def _pair(self, contact: Any) -> tuple[int, int]:
+        first, second = sorted(
+            int(np.flatnonzero(self._geoms == g)[0]) if g in self._geoms else -1 for g in contact.geom
+        )
+        return first, second
+
+
+def _specification(mujoco: Any, world: World, stepping: Stepping) -> Any:
+    """Model of a world before it is compiled: an `MjSpec`."""
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep, option.gravity = stepping.step, world.gravity
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    option.enableflags = int(mujoco.mjtEnableBit.mjENBL_SPECULATIVE)
+    geom = spec.default.geom
+    geom.condim, geom.solimp = 3, _IMPEDANCE
+    for i, body in enumerate(world.bodies):
+        _add_body(mujoco, spec, i, body)
+        if world.plane is not None and not body.fixed:
+            _add_floor(mujoco, spec, i, body, world)
+    return spec
+
+
+def _add_body(mujoco: Any, spec: Any, number: int, body: Body) -> None:
+    solid, name, radius = body.solid, f"body{number}", body.ball_radius
+    # Bodies of mass 1e-6 and of mass 1 behave alike, but MuJoCo has least values of mass and inertia.
+    added = spec.worldbody.add_body(name=name, pos=solid.center)
+    if not body.fixed:
+        added.add_freejoint()
+    density = body.density / solid.volume
+    if radius is not None:
+        added.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], density=density)
+        return
+    mesh = spec.add_mesh(name=name)
+    mesh.uservert, mesh.userface = (solid.vertices - solid.center).ravel(), solid.triangles.ravel()
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    added.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, density=density)
+
+
+def _add_floor(mujoco: Any, spec: Any, number: int, body: Body, world: World) -> None:
+    """Add the plane on which a body rests; it touches that body alone."""
+    assert world.plane is not None
+    normal, height = world.plane.normal, world.plane.height if body.floor is None else body.floor
+    quat = rotations.between_vectors(np.array([0.0, 0.0, 1.0]), normal)
+    spec.worldbody.add_geom(
+        name=f"floor{number}",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.05],
+        pos=height * normal,
+        quat=quat,
+        contype=0,
+        conaffinity=0,
+    )
+    spec.add_pair(geomname1=f"floor{number}", geomname2=f"body{number}", condim=3, solimp=_IMPEDANCE)

@@ -1,0 +1,64 @@
+"""Material and state of simulated tosses are found from noisy poses."""
+
+import numpy as np
+import pytest
+
+from r5dgs_core.contact import futures, identify
+from r5dgs_core.motion import rotations
+from tests.support import contacts
+from tests.support.contacts import SIZE
+
+pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
+FRICTION = 0.25
+
+
+def observed(until, seed=0, noise=0.005, height=0.09):
+    """Fitter of a box that is thrown onto a plane, poses up to a time, and the true places of later times."""
+    rng, times = np.random.default_rng(seed), np.arange(0, 0.6, 1 / 30)
+    runs, state = contacts.simulate(contacts.on_plane(contacts.box([0, 0, height], friction=FRICTION)), draft=True)
+    state.velocities[0], state.spins[0] = [1.5, 0.3, 0.2], [0.5, 1.0, 2.0]
+    quats, places = runs.poses(state, times)
+    seen = int((times <= until).sum())
+    turns = rotations.rotvecs_to_quats(rng.normal(0, noise, (seen, 3)))
+    track = identify.Track(
+        times[:seen],
+        rotations.multiply(turns, quats[:seen, 0]),
+        places[:seen, 0] + rng.normal(0, noise * SIZE, (seen, 3)),
+        np.full(seen, noise * SIZE),
+        np.full(seen, noise),
+    )
+    return identify.Fitter(runs, track), times, places[:, 0]
+
+
+@pytest.fixture(scope="module")
+def slid():
+    fitter, times, places = observed(0.4)
+    return fitter, fitter.run(), times, places
+
+
+def test_the_friction_of_a_slide_and_its_end_are_found(slid):
+    fitter, estimate, times, places = slid
+    assert estimate.material.friction == pytest.approx(FRICTION, rel=0.15)
+    end = fitter.poses(estimate.state, estimate.material, times[-1:] - estimate.time)[1][0]
+    still = np.linalg.norm(fitter.track.places[-1] - places[-1])
+    assert np.linalg.norm(end - places[-1]) < 0.15 * SIZE < still
+
+
+def test_the_samples_of_a_fit_hold_the_true_end(slid):
+    fitter, estimate, times, places = slid
+    found = futures.sample(fitter, estimate, times[-1:], 24, np.random.default_rng(1))
+    center = np.median(found.places, axis=1)
+    assert np.linalg.norm(center[0] - places[-1]) < 2 * found.radii(center, 0.95)[0] < SIZE
+    assert found.other_faces() < 0.5 and found.angles(found.quats[:, 0], 0.9)[0] < 1.0
+
+
+def test_a_flight_tells_nothing_about_the_material():
+    fitter, times, places = observed(0.11, height=0.22)
+    estimate = fitter.run()
+    assert len(fitter.track) >= 3
+    np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance))[12:], [0.6, 1.0], rtol=0.2)
+    narrow, wide = (
+        futures.sample(fitter, estimate, times[[3, -1]], 24, np.random.default_rng(1)).radii(places[[3, -1]], 0.9)
+        for _ in range(2)
+    )
+    assert narrow.tolist() == wide.tolist() and wide[1] > 2 * wide[0]
