@@ -62,7 +62,7 @@ ALLOWED = {
     "capture": {"motion", "scene", "data"},
     "config": {"data"},
     "playback": {"motion", "scene", "color"},
-    "formats": {"motion", "scene", "color", "search", "playback"},
+    "formats": {"motion", "scene", "color", "search", "playback", "shapes"},
     "editing": {"motion", "scene", "color", "playback"},
     "protocol": {"scene", "search"},
     "model": {"motion", "scene"},

@@ -17,7 +17,8 @@ SUFFIX = ".glb"
 _MAGIC, _VERSION, _JSON, _BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _HEADER, _CHUNK = 12, 8  # bytes
 _VERTICES = 34962  # target of buffer views of vertex attributes
-_COMPONENTS = {"f4": 5126, "u1": 5121}
+_INDICES = 34963  # of buffer views of indices
+_COMPONENTS = {"f4": 5126, "u1": 5121, "u4": 5125}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _ALIGNMENT = 4
 MAX_SIZE = (1 << 32) - 1  # sizes in the header have 32 bits
@@ -43,15 +44,16 @@ class Arrays:
         """Add an array and return the number of its accessor.
 
         Args:
-            values: Numbers or vectors, float or uint8 (normalised). [N] or [N, 2..4]
+            values: Numbers or vectors, float or uint8 (normalised), or indices, uint32. [N] or [N, 2..4]
             vertices: True for a vertex attribute.
             bounds: True to state minimum and maximum.
         """
-        kind = "u1" if values.dtype == np.uint8 else "f4"
+        kind = {np.dtype(np.uint8): "u1", np.dtype(np.uint32): "u4"}.get(values.dtype, "f4")
         stored = np.ascontiguousarray(values, f"<{kind}")
         blob = stored.tobytes()
         view = {"buffer": 0, "byteOffset": self.size, "byteLength": len(blob)}
-        self.views.append(view | {"target": _VERTICES} if vertices else view)
+        target = _VERTICES if vertices else _INDICES if kind == "u4" else None
+        self.views.append(view if target is None else view | {"target": target})
         self.blobs.append(blob + bytes(-len(blob) % _ALIGNMENT))
         self.size += len(self.blobs[-1])
         width = 1 if stored.ndim == 1 else stored.shape[1]

@@ -1,0 +1,173 @@
+"""Hulls of a scene as rigid bodies with their state at a time, for simulators; shared by `hulls`, `mjcf` and `urdf`."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import errors
+from ..motion import rotations
+from ..playback import object_poses
+from ..scene import cameras
+from ..scene.hull import Hull
+from ..scene.scene import MotionGroup, Scene
+from ..shapes import object_hulls, solid
+from ..shapes.solid import Solid
+from . import registry, scene_nodes
+
+DENSITY = 1000.0  # unknown; masses of bodies are proportional to their volumes
+FRICTION = 0.3
+_EARTH = 9.80665  # m / s^2
+_FLIGHTS = ("translation", "ballistic_spin", "free_top", "bounce")  # kinds whose acceleration may be gravity
+_DOWNWARD = 0.9  # least cosine between gravity and the downward axis of the world
+_NEAR = 0.2  # of the size: distance up to which the centre of rotation in flight replaces the centre of the hull
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """A hull in the units of a file, z up. Its frame has its origin at the centre of mass.
+
+    Attributes:
+        name: Unique name.
+        solid: The hull in the body's frame.
+        position: Centre of mass. [3]
+        quat: Rotation from the body's frame to the world, unit wxyz. [4]
+        velocity: Of the centre of mass. [3]
+        spin: Angular velocity, world axes. [3]
+        moves: False for an object without motion of its own.
+    """
+
+    name: str
+    solid: Solid
+    position: np.ndarray
+    quat: np.ndarray
+    velocity: np.ndarray
+    spin: np.ndarray
+    moves: bool
+
+    @property
+    def mass(self) -> float:
+        """Mass at the assumed density."""
+        return DENSITY * self.solid.volume
+
+    @property
+    def inertia(self) -> np.ndarray:
+        """Inertia about the centre of mass, in the body's frame. [3, 3]"""
+        return DENSITY * self.solid.inertia
+
+
+def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
+    """Return the bodies of the selected objects at a scene time, in metres and seconds if the scene stores these units.
+
+    Raises:
+        ConfigError: No selected object has a hull.
+    """
+    hulls = [hull for hull in _hulls(scene) if options.object_ids is None or hull.object_id in options.object_ids]
+    if not hulls:
+        wanted = "expected objects with enough Gaussians for a hull"
+        raise errors.ConfigError(f"{scene.name}: {wanted}, found none in the selection")
+    names = _names(scene, hulls)
+    steady = dataclasses.replace(scene, groups=tuple(_without_offset(group) for group in scene.groups))
+    poses = {(one.object_id, one.group): one for one in object_poses.at(steady, (t,))}
+    start = {(one.object_id, one.group): one for one in object_poses.at(scene, (t,))}
+    turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
+    axes, length, time = rotations.rotmats_to_quats(turn), scene.units.meters_per_unit or 1.0, _time_unit(scene)
+    found = []
+    for hull, name in zip(hulls, names, strict=True):
+        group, body = scene.groups[hull.motion_id], solid.of(hull.vertices)
+        center = _center_of_mass(group, body)
+        pose, rates = (one.get((hull.object_id, hull.motion_id)) for one in (start, poses))
+        position, quat, velocity, spin = center, rotations.identity(), np.zeros(3), np.zeros(3)
+        if pose is not None and rates is not None and hull.motion_id > 0:
+            quat = pose.quats[0]
+            arm = rotations.rotate(quat, center - group.home)
+            spin = rates.angular_velocities[0]
+            position, velocity = pose.positions[0] + arm, rates.velocities[0] + np.cross(spin, arm)
+        local = solid.of(length * (body.vertices - center) @ turn.T)
+        found.append(
+            RigidBody(
+                name,
+                dataclasses.replace(local, center=np.zeros(3)),
+                length * turn @ position,
+                rotations.multiply(rotations.multiply(axes, quat), rotations.conjugate(axes)),
+                length / time * turn @ velocity,
+                turn @ spin / time,
+                hull.motion_id > 0,
+            )
+        )
+    return found
+
+
+def gravity(scene: Scene) -> np.ndarray:
+    """Acceleration of falling bodies in the units of a file, z up: that of thrown bodies, else the earth's, else 0. [3]
+
+    The earth's needs units of length and time in the scene.
+    """
+    turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
+    models = [group.model for group in scene.groups if group.role == "body"]
+    found = np.array([turn @ model.acceleration for model in models if model.kind in _FLIGHTS]).reshape(-1, 3)
+    found = found[-found[:, 2] > _DOWNWARD * np.maximum(np.linalg.norm(found, axis=1), 1e-300)]
+    if len(found):
+        return np.median(found, axis=0) * (scene.units.meters_per_unit or 1.0) / _time_unit(scene) ** 2
+    known = scene.units.meters_per_unit is not None and scene.units.seconds_per_unit is not None
+    return np.array([0.0, 0.0, -_EARTH if known else 0.0])
+
+
+def time_step(scene: Scene) -> float:
+    """Step of a simulation: a thousandth of the observed span, in the unit of time of a file."""
+    return _time_unit(scene) * (float(np.ptp(scene.tracks.times)) or 1.0) / 1000
+
+
+def losses(scene: Scene) -> list[str]:
+    """Parts of this scene that rigid bodies do not hold, as sentences."""
+    found = []
+    present = {(hull.object_id, hull.motion_id) for hull in _hulls(scene)}
+    missing = sorted({pair[0] for pair in object_hulls.bodies(scene) - present})
+    if missing:
+        found.append(f"objects without a hull: {', '.join(scene.object(number).name for number in missing)}")
+    if any(group.joint is not None for group in scene.groups):
+        found.append("joints: parts are bodies of their own")
+    return found + scene_nodes.lost_bending(scene)
+
+
+def simulator_losses(scene: Scene) -> list[str]:
+    """As `losses`, for formats of simulators."""
+    unknown = [] if gravity(scene).any() else ["gravity is unknown and set to 0; set it in the simulator"]
+    return [*losses(scene), *unknown, "the support of resting bodies: add a plane in the simulator"]
+
+
+def _hulls(scene: Scene) -> tuple[Hull, ...]:
+    return scene.hulls or object_hulls.of(scene)
+
+
+def _time_unit(scene: Scene) -> float:
+    return scene.units.seconds_per_unit or 1.0
+
+
+def _without_offset(group: MotionGroup) -> MotionGroup:
+    """Group whose motion past t_max starts on its fitted curve: offsets fade, and are no motion of a free body."""
+    model = dataclasses.replace(group.model, offset_rotvec=np.zeros(3), offset_displacement=np.zeros(3))
+    return dataclasses.replace(group, model=model)
+
+
+def _center_of_mass(group: MotionGroup, body: Solid) -> np.ndarray:
+    """Centre of the hull; of a body in flight, the point about which it spins, which the motion tells better. [3]"""
+    point = group.pivot + group.model.center_offset
+    flies = group.model.kind in _FLIGHTS and group.model.acceleration.any()
+    return point if flies and np.linalg.norm(point - body.center) < _NEAR * body.size else body.center
+
+
+def _names(scene: Scene, hulls: list[Hull]) -> list[str]:
+    groups, used = scene_nodes.group_names(scene), set()
+    found = []
+    for hull in hulls:
+        first = name = groups[hull.motion_id] if hull.motion_id else scene.object(hull.object_id).name
+        count = 1
+        while name in used:
+            count += 1
+            name = f"{first} {count}"
+        used.add(name)
+        found.append(name)
+    return found

@@ -1,0 +1,102 @@
+"""Scenes as URDF: hulls as links with floating joints, with an OBJ mesh beside the file for each.
+
+URDF has no velocities. An element ``r5dgs_state`` of each body holds them; other readers skip it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from .. import atomic_files
+from ..motion import rotations
+from ..scene.scene import Scene
+from . import registry, rigid_bodies
+from .mjcf import numbers
+from .rigid_bodies import RigidBody
+
+_WORLD = "world"
+
+
+def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
+    """Write the bodies at the first time. Implements `registry.Format.write`."""
+    bodies = rigid_bodies.of(scene, options.times[0], options)
+    meshes = [path.with_name(f"{path.stem}_{name}") for name in _mesh_names(bodies)]
+    for body, target in zip(bodies, meshes, strict=True):
+        with registry.writing(target):
+            atomic_files.write(target, _obj(body).encode())
+        yield target
+    tree = _robot(scene, bodies, [target.name for target in meshes])
+    ElementTree.indent(tree)
+    with registry.writing(path):
+        atomic_files.write(path, ElementTree.tostring(tree, "utf-8", xml_declaration=True) + b"\n")
+    yield path
+
+
+def companions(scene: Scene, options: registry.Options) -> list[str]:
+    """Names of the meshes beside the file."""
+    return _mesh_names(rigid_bodies.of(scene, options.times[0], options))
+
+
+def _mesh_names(bodies: list[RigidBody]) -> list[str]:
+    return [f"{number}_{re.sub(r'[^A-Za-z0-9]+', '_', body.name)}.obj" for number, body in enumerate(bodies)]
+
+
+def _robot(scene: Scene, bodies: list[RigidBody], meshes: list[str]) -> ElementTree.Element:
+    root = ElementTree.Element("robot", name=scene.name)
+    add = ElementTree.SubElement
+    extension = add(root, "mujoco")
+    add(extension, "compiler", discardvisual="true", fusestatic="false")
+    add(extension, "option", gravity=numbers(rigid_bodies.gravity(scene)), cone="elliptic", integrator="RK4")
+    extension[1].set("timestep", numbers([rigid_bodies.time_step(scene)]))
+    add(root, "link", name=_WORLD)
+    for body, mesh in zip(bodies, meshes, strict=True):
+        link = add(root, "link", name=body.name)
+        inertial = add(link, "inertial")
+        add(inertial, "mass", value=numbers([body.mass]))
+        entries = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
+        add(inertial, "inertia", {name: numbers([body.inertia[at]]) for name, at in entries.items()})
+        for part in ("visual", "collision"):
+            add(add(add(link, part), "geometry"), "mesh", filename=mesh)
+        friction = add(add(link, "contact"), "lateral_friction")
+        friction.set("value", numbers([rigid_bodies.FRICTION]))
+        joint = add(root, "joint", name=f"{body.name} joint", type="floating" if body.moves else "fixed")
+        add(joint, "origin", xyz=numbers(body.position), rpy=numbers(_roll_pitch_yaw(body.quat)))
+        add(joint, "parent", link=_WORLD)
+        add(joint, "child", link=body.name)
+        if body.moves:
+            add(root, "r5dgs_state", link=body.name, linear=numbers(body.velocity), angular=numbers(body.spin))
+    return root
+
+
+def _roll_pitch_yaw(quat: np.ndarray) -> np.ndarray:
+    """Angles of R = Rz(yaw) Ry(pitch) Rx(roll), rad. [4] -> [3]"""
+    R = rotations.quats_to_rotmats(quat)
+    pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
+    if np.hypot(R[0, 0], R[1, 0]) < 1e-9:  # only roll - yaw or roll + yaw is determined
+        return np.array([np.arctan2(-R[1, 2], R[1, 1]), pitch, 0.0])
+    return np.array([np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
+
+
+def _obj(body: RigidBody) -> str:
+    corners = [f"v {numbers(corner)}\n" for corner in body.solid.vertices]
+    faces = [f"f {a} {b} {c}\n" for a, b, c in (body.solid.triangles + 1).tolist()]
+    return "".join([f"o {body.name}\n", *corners, *faces])
+
+
+FORMAT = registry.Format(
+    name="urdf",
+    label="URDF",
+    suffix=".urdf",
+    keeps="convex hulls as links with mass, inertia and friction; poses, velocities; one OBJ file per hull beside it",
+    loses="Gaussians, colours, learned motion, joints, concave shapes, support, cameras",
+    write=export,
+    companions=companions,
+    losses=rigid_bodies.simulator_losses,
+    extra="contact",
+    packages=("scipy",),
+)
