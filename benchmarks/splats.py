@@ -1,19 +1,22 @@
 """Time of splats in Blender's window: load, orbit, play and render scenes of several sizes.
 
     xvfb-run -a -s "-screen 0 1280x800x24 +extension GLX" \\
-        blender --factory-startup --window-geometry 0 0 1280 800 --python benchmarks/splats.py -- [GAUSSIANS ...]
+        blender --factory-startup --window-geometry 0 0 1280 800 --python benchmarks/splats.py -- \\
+            [--undrawn] [--views N] [GAUSSIANS ...]
 
 Loads a synthetic scene of twelve moving bodies per size, by default 12,000, 40,000, 300,000 and 1,000,000 Gaussians,
 each in a Blender of its own. ``load`` is the time of the operator in seconds. ``orbit``, ``play`` and ``bend`` are
 processor milliseconds of the main thread per drawn view: everything that the draw handler does but the commands to the
 graphics card, which a software driver executes itself. They contain the search for visible clouds, reading changed
-points, sorting and uploading; medians of twelve, in a scene whose two bending bodies have a sixth of the Gaussians for
-``bend``. ``exact`` is the time of the handler that moves those points, ``depth`` that of reading the depth buffer
-beside a mesh. ``first`` and ``f12`` are the times of the first and second render at 512 x 512 in seconds;
-`R5DGS_PYTHON` sets the worker's Python. ``mb`` and ``worker`` are the largest memory of Blender and of the worker.
-Results: docs/results/blender.md.
+points, sorting and uploading; medians of ``--views`` (twelve by default), in a scene whose two bending bodies have a
+sixth of the Gaussians for ``bend``. ``exact`` is the time of the handler that moves those points, ``depth`` that of
+reading the depth buffer beside a mesh. ``first`` and ``f12`` are the times of the first and second render at 512 x 512
+in seconds; `R5DGS_PYTHON` sets the worker's Python. ``mb`` and ``worker`` are the largest memory of Blender and of the
+worker. ``--undrawn`` leaves out the command that draws the instances, which takes a software driver many seconds per
+view of 300,000 Gaussians and is in no column. Results: docs/results/blender.md.
 """
 
+import argparse
 import resource
 import statistics
 import subprocess
@@ -33,7 +36,6 @@ import window as w  # noqa: E402  (the line before finds it)
 
 SIZES = (12_000, 40_000, 300_000, 1_000_000)
 COLUMNS = ("gaussians", "load", "orbit", "play", "bend", "exact", "depth", "first", "f12", "mb", "worker")
-VIEWS = 12
 
 
 class Stopwatch:
@@ -63,9 +65,9 @@ class Stopwatch:
         return {name: 1e3 * seconds for name, seconds in self.seconds.items()}
 
 
-def medians(stopwatch: Stopwatch, action) -> dict[str, float]:
-    """Medians of the milliseconds of an action with the numbers of `VIEWS` steps."""
-    found = [stopwatch.milliseconds(lambda step=step: action(step)) for step in range(VIEWS)]
+def medians(stopwatch: Stopwatch, views: int, action) -> dict[str, float]:
+    """Medians of the milliseconds of an action with the numbers of some steps."""
+    found = [stopwatch.milliseconds(lambda step=step: action(step)) for step in range(views)]
     return {name: statistics.median(one.get(name, 0.0) for one in found) for name in {n for one in found for n in one}}
 
 
@@ -75,7 +77,7 @@ def redraw() -> None:
         bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
 
 
-def measure(path: Path, stopwatch: Stopwatch) -> dict[str, float]:
+def measure(path: Path, stopwatch: Stopwatch, views: int) -> dict[str, float]:
     """Measure one scene, which is removed at the end."""
     scene, view = w.main_window().scene, w.area_of("VIEW_3D").spaces.active.region_3d
     started = time.perf_counter()
@@ -88,15 +90,15 @@ def measure(path: Path, stopwatch: Stopwatch) -> dict[str, float]:
         view.view_rotation = Euler((1.1, 0, 0.5 * step)).to_quaternion()
         redraw()
 
-    row["orbit"] = medians(stopwatch, orbit)["draw"]
+    row["orbit"] = medians(stopwatch, views, orbit)["draw"]
 
     def play(step):
         scene.frame_set(scene.frame_start + 3 * step)
         redraw()
 
-    row["play"] = medians(stopwatch, play)["draw"]
+    row["play"] = medians(stopwatch, views, play)["draw"]
     bpy.ops.mesh.primitive_cube_add(location=(0, 0, 100))
-    row["depth"] = medians(stopwatch, orbit)["depth"]
+    row["depth"] = medians(stopwatch, views, orbit)["depth"]
     bpy.data.objects.remove(bpy.context.object)
     scene.render.engine = "R5DGS"
     scene.render.resolution_x = scene.render.resolution_y = 512
@@ -113,7 +115,7 @@ def measure(path: Path, stopwatch: Stopwatch) -> dict[str, float]:
     return row
 
 
-def measure_bending(path: Path, stopwatch: Stopwatch) -> dict[str, float]:
+def measure_bending(path: Path, stopwatch: Stopwatch, views: int) -> dict[str, float]:
     """Measure playing a scene with two bodies that bend."""
     scene = w.main_window().scene
     with w.inside():
@@ -124,7 +126,7 @@ def measure_bending(path: Path, stopwatch: Stopwatch) -> dict[str, float]:
         scene.frame_set(scene.frame_start + step)
         redraw()
 
-    found = medians(stopwatch, play)
+    found = medians(stopwatch, views, play)
     return {"bend": found["draw"], "exact": found["exact"]}
 
 
@@ -146,7 +148,22 @@ def bending(path: Path) -> Path:
     return scene_file.write(bent, path.with_name("bending.r5dgs"))
 
 
-def checks(count: int):
+def uploading_first(draw, undrawn: bool):
+    """Replace `SplatBuffer._draw` by a function that makes the texture of changed points before it draws.
+
+    Args:
+        draw: The method.
+        undrawn: True to draw no Gaussian.
+    """
+
+    def drawn(buffer, picture, poses, table, view, meshes, count):
+        assert table.geometry is not None
+        draw(buffer, picture, poses, table, view, meshes, 0 if undrawn else count)
+
+    return drawn
+
+
+def checks(count: int, views: int, undrawn: bool):
     """Measure a size and print its row. Yields the seconds to wait after each step."""
     from tests.blender import run
 
@@ -156,27 +173,33 @@ def checks(count: int):
     stopwatch.wrap(viewport, "_draw_viewport", "draw")
     stopwatch.wrap(viewport, "depth", "depth")
     stopwatch.wrap(renderer.SplatBuffer, "_draw", "card")
+    renderer.SplatBuffer._draw = uploading_first(renderer.SplatBuffer._draw, undrawn)
     stopwatch.wrap(paste, "paste", "card")
     exact = w.service("motion.exact_mode")
     stopwatch.wrap(exact, "_try", "exact")
     yield 1.0
     with tempfile.TemporaryDirectory() as folder:
         path = run.synthetic(count, Path(folder))
-        row = {"gaussians": count, **measure(path, stopwatch)}
+        row = {"gaussians": count, **measure(path, stopwatch, views)}
         yield 0.5
-        row |= measure_bending(bending(path), stopwatch)
+        row |= measure_bending(bending(path), stopwatch, views)
     print(f"{count:>12}" + "".join(f"{row[name]:>10.2f}" for name in COLUMNS[1:]), flush=True)
 
 
 def main(arguments: list[str]) -> None:
     """Measure one size in this Blender, or several in others."""
-    sizes = [int(text) for text in arguments] or SIZES
-    if len(sizes) == 1:
-        w.run(checks, *sizes)
+    p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    p.add_argument("sizes", nargs="*", type=int, default=SIZES, metavar="GAUSSIANS")
+    p.add_argument("--views", type=int, default=12, help="number of views behind each median (default: 12)")
+    p.add_argument("--undrawn", action="store_true", help="do not draw the instances")
+    args = p.parse_args(arguments)
+    if len(args.sizes) == 1:
+        w.run(checks, args.sizes[0], args.views, args.undrawn)
         return
     print(f"{COLUMNS[0]:>12}" + "".join(f"{name:>10}" for name in COLUMNS[1:]), flush=True)
-    options = ["--factory-startup", "--window-geometry", "0", "0", "1280", "800", "--python", __file__]
-    codes = [subprocess.run([bpy.app.binary_path, *options, "--", str(size)]).returncode for size in sizes]
+    options = ["--factory-startup", "--window-geometry", "0", "0", "1280", "800", "--python", __file__, "--"]
+    given = ["--views", str(args.views), *(["--undrawn"] if args.undrawn else [])]
+    codes = [subprocess.run([bpy.app.binary_path, *options, *given, str(size)]).returncode for size in args.sizes]
     raise SystemExit(any(codes))
 
 

@@ -6,9 +6,19 @@ import pytest
 from r5dgs_core.data import images
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
-from tests.addon.engine.test_engine import NOTHING, assert_almost_all_close, go_to, loaded, psnr, render_passes, scene
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
+pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
+
+from tests.addon.engine.test_engine import (  # noqa: E402  (needs torch)
+    NOTHING,
+    assert_almost_all_close,
+    go_to,
+    loaded,
+    psnr,
+    render_passes,
+    scene,
+)
 
 __all__ = ("loaded", "scene")  # fixtures
 
