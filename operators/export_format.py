@@ -6,6 +6,7 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 from ..r5dgs_addon.export import formats, frame_range, gaussians
 from ..r5dgs_addon.scene import loaded_scenes, polls
 from ..r5dgs_addon.ui import stepwise_operator
+from ..r5dgs_addon.worker import export_formats
 from ..r5dgs_core.formats import registry
 
 _items = []  # referenced here, because Blender keeps no reference to the strings
@@ -13,7 +14,9 @@ _items = []  # referenced here, because Blender keeps no reference to the string
 
 def _formats(operator, context):
     found = [registry.get(name) for name in registry.MODULES]
-    _items[:] = [(format.name, format.label, format.why_unavailable() or format.summary) for format in found]
+    _items[:] = [
+        (format.name, format.label, export_formats.why_unavailable(format) or format.summary) for format in found
+    ]
     return _items
 
 
@@ -37,7 +40,7 @@ class R5DGS_OT_export_format(polls.NeedsScene, stepwise_operator.Stepwise, bpy.t
     @classmethod
     def description(cls, context, properties):
         format = registry.get(properties.format)
-        return format.why_unavailable() or f"{cls.__doc__}. {format.summary}"
+        return export_formats.why_unavailable(format) or f"{cls.__doc__}. {format.summary}"
 
     def suggest(self, context):
         suffix = registry.get(self.format).suffix
@@ -46,7 +49,7 @@ class R5DGS_OT_export_format(polls.NeedsScene, stepwise_operator.Stepwise, bpy.t
         return False
 
     def steps(self, context):
-        format = registry.usable(self.format)
+        format = export_formats.usable(self.format)
         return formats.steps(
             context,
             loaded_scenes.active_collection(context),

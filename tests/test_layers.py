@@ -73,7 +73,7 @@ ALLOWED = {
     "language": {"scene", "data", "search", "playback", "render"},
     "train": {"motion", "motion_fit", "scene", "data", "raster", "config", "model", "render"},
     "masks": {"data", "language"},
-    "worker": {"scene", "raster", "playback", "editing", "protocol", "render", "language"},
+    "worker": {"scene", "raster", "playback", "formats", "editing", "protocol", "render", "language"},
     "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train", "shapes"},
     "prepare": {"color", "motion", "scene", "data", "capture", "masks"},
     "check": {"motion", "terminal", "scene", "color", "data", "formats", "config", "train", "prepare"},

@@ -1,15 +1,23 @@
 """Export of a loaded scene with its edits in any format of the core's registry."""
 
+import os
+import tempfile
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.formats import registry
+from ...r5dgs_core.scene import scene_file
 from ..scene import timeline
 from ..ui import plural
 from ..ui.stepwise_operator import Outcome, Step, Steps
+from ..worker import jobs
 from . import frame_range, gaussians, scene
+
+_POLL_S = 0.05
 
 
 def steps(
@@ -51,9 +59,31 @@ def steps(
     targets = format.paths(path, options, edited.scene)
     yield Step(edited.done, edited.done + len(targets), f"writing {targets[0].name}", slow=True)
     try:
-        for number, target in enumerate(format.write(edited.scene, path, options), edited.done + 1):
-            yield Step(number, edited.done + len(targets), target.name)
+        if format.why_unavailable() is None:
+            for number, target in enumerate(format.write(edited.scene, path, options), edited.done + 1):
+                yield Step(number, edited.done + len(targets), target.name)
+        else:
+            yield from _by_worker(edited, path, format, options, len(targets))
     except OSError as error:
         raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
     files = path.name if targets == [path] else plural.of(len(targets), "file")
     return Outcome(f"{files}: {format.label} of {plural.of(len(clouds), 'cloud')}", edited.notes)
+
+
+def _by_worker(
+    edited: scene.EditedScene, path: Path, format: registry.Format, options: registry.Options, count: int
+) -> Iterator[Step]:
+    """Write a scene in the worker, whose Python may have the format's package. Stopping it stops the worker."""
+    with tempfile.TemporaryDirectory() as folder:
+        source = scene_file.write(edited.scene, Path(folder) / "scene.r5dgs", exact=True)
+        arguments = {"format": format.name, "times": list(options.times), "frames": options.frames}
+        where = {"scene": str(source), "path": os.path.abspath(path)}
+        job = jobs.start([(f"writing {path.name}", "export", arguments | where)])
+        try:
+            while not job.done:
+                yield Step(edited.done, edited.done + count, job.doing, slow=True)
+                time.sleep(_POLL_S)
+            job.answer()
+        finally:
+            if not job.done:
+                job.cancel()

@@ -3,6 +3,7 @@
 import bpy
 
 from ...r5dgs_core.formats import registry
+from ..worker import export_formats
 from . import sidebar
 
 FORMATS = {  # operator and icon of the formats that have their own, by name
@@ -12,7 +13,7 @@ FORMATS = {  # operator and icon of the formats that have their own, by name
 
 
 def draw_formats(layout: bpy.types.UILayout, in_menu: bool = False) -> None:
-    """Draw a button for each format of the registry, disabled if a package is missing.
+    """Draw a button for each format of the registry, disabled if neither Blender nor the worker can write it.
 
     Args:
         layout: Layout of a panel or menu.
@@ -21,7 +22,7 @@ def draw_formats(layout: bpy.types.UILayout, in_menu: bool = False) -> None:
     for name in registry.MODULES:
         found = registry.get(name)
         row = layout.row()
-        row.enabled = found.why_unavailable() is None
+        row.enabled = export_formats.why_unavailable(found) is None
         operator, icon = FORMATS.get(name, ("r5dgs.export_format", "EXPORT"))
         label = f"{found.label} ({found.suffix})"
         button = row.operator(operator, text=f"R5DGS {label}" if in_menu else label, icon="NONE" if in_menu else icon)

@@ -188,6 +188,13 @@ def notice() -> str:
     return running.notice if running is not None and running.alive else ""
 
 
+def formats() -> frozenset[str] | None:
+    """Names of the export formats that the running worker can write, or None if none has answered yet."""
+    running = _worker
+    known = running.hello.get("formats") if running is not None and running.alive else None
+    return None if known is None else frozenset(known)
+
+
 def busy(key: str | None = None) -> bool:
     """True if any job with this key, or any job at all if None, has not ended."""
     return any(not job.done and (key is None or job.key == key) for job in list(_jobs))

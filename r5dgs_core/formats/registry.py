@@ -111,7 +111,7 @@ class Format:
             return None
         return (
             f"{self.label} ({self.suffix}): {', '.join(missing)} is not installed; remedy: "
-            f"{extras.command(str(self.extra))}, then use the command r5dgs export"
+            f"{extras.command(str(self.extra))}"
         )
 
     def paths(self, path: Path, options: Options, scene: Scene) -> list[Path]:
@@ -136,6 +136,11 @@ def usable(name: str) -> Format:
     if (reason := found.why_unavailable()) is not None:
         raise errors.BackendError(reason)
     return found
+
+
+def usable_names() -> list[str]:
+    """Names of the formats that this Python can write."""
+    return [name for name in MODULES if get(name).why_unavailable() is None]
 
 
 def numbered(path: Path, frame: int) -> Path:

@@ -31,6 +31,7 @@ _FIELDS = {
     "render": ("camera", "instances", "t", "scene", "sky", "near", "distance", "want", "coverage", "meshes"),
     "query": ("text", "scene", "encoder"),
     "embed": ("texts", "encoder"),
+    "export": ("scene", "format", "path", "times", "frames"),
     "warm_up": (),
     "check": (),
     "shutdown": (),
@@ -91,6 +92,18 @@ def need(request: dict[str, Any], key: str, kind: type) -> Any:
 def time_of(request: dict[str, Any]) -> float:
     """Return the scene time of a picture."""
     return _number(request.get("t"), "worker: 'render' needs 't'")
+
+
+def times_of(request: dict[str, Any]) -> tuple[tuple[float, ...], tuple[int, ...] | None]:
+    """Return scene times, at least one, and the number of the frame of each, or None."""
+    times = need(request, "times", list)
+    numbers = None if request.get("frames") is None else need(request, "frames", list)
+    if not times or (numbers is not None and len(numbers) != len(times)):
+        raise errors.ConfigError("worker: 'export' needs times and as many frames, or null for the frames")
+    if numbers is not None and not all(_is_whole(number) for number in numbers):
+        raise errors.ConfigError(f"worker: 'frames' have to be whole numbers, found {_short(numbers)}")
+    found = tuple(_number(time, "worker: 'times' have to be numbers") for time in times)
+    return found, None if numbers is None else tuple(numbers)
 
 
 def texts_of(request: dict[str, Any]) -> list[str]:

@@ -36,6 +36,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from .. import __version__, errors, timing
+from ..formats import registry as formats
 from ..language import query
 from ..language.encoders import encoder_base, registry
 from ..playback import scene_player
@@ -44,7 +45,7 @@ from ..protocol import fields, messages
 from ..render import posed_scene
 from ..scene import quality, scene_file
 from ..scene.scene import Scene
-from . import edited_points, further_layers
+from . import edited_points, further_layers, scene_export
 from .warming import WarmUpThread
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ class Server:
             "render": self._render,
             "query": self._query,
             "embed": self._embed,
+            "export": self._export,
             "warm_up": self._warm_up,
             "check": self._check,
         }
@@ -101,7 +103,8 @@ class Server:
     def _hello(self, _: dict[str, Any]) -> Answer:
         missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
         python, pid = platform.python_version(), os.getpid()
-        return {"protocol": messages.VERSION, "python": python, "missing": missing, "pid": pid}, {}
+        written = formats.usable_names()
+        return {"protocol": messages.VERSION, "python": python, "missing": missing, "pid": pid, "formats": written}, {}
 
     def _load(self, request: dict[str, Any]) -> Answer:
         """Load the scene files ``paths`` in this order; keeps those already loaded and drops all others."""
@@ -245,6 +248,10 @@ class Server:
         card = encoder.card
         known = {"kind": card.kind, "name": card.name, "digest": card.digest, "dimension": card.dimension}
         return {"encoder": known}, {"embeddings": encoder_base.embed_phrases(encoder, texts)}
+
+    def _export(self, request: dict[str, Any]) -> Answer:
+        """Return the ``files`` that an export writes; see `scene_export.write`. The loaded scenes stay."""
+        return {"files": scene_export.write(request)}, {}
 
     def _opened(self, request: dict[str, Any]) -> encoder_base.Encoder:
         """Return the requested encoder; the last one stays open."""

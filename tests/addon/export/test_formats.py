@@ -148,10 +148,28 @@ def test_a_format_whose_package_is_missing_is_disabled_with_the_reason(blender, 
     enabled = []
     collected = property(fset=lambda row, value: enabled.append(value))
     monkeypatch.setattr(layouts.Layout, "enabled", collected, raising=False)
+    jobs = importlib.import_module("r5dgs.r5dgs_addon.worker.jobs")
+    monkeypatch.setattr(jobs, "formats", lambda: frozenset({"ply"}))  # a worker with no further package
     usable = [registry.get(name).why_unavailable() is None for name in registry.MODULES]
     assert "Centers (.csv)" in drawn(blender) and enabled == usable and not usable[-1] and any(usable)
-    reason = "no_such_package is not installed; remedy: pip install 'r5dgs[tables]'"
+    reason = "no_such_package is not installed; remedy: pip install 'r5dgs[tables]', in the Python of the worker"
     assert reason in tooltip(blender, csv)
     with pytest.raises(RuntimeError) as refused:
         blender.ops.r5dgs.export_format(format=csv, filepath=str(tmp_path / "a.csv"))
     assert reason in str(refused.value) and not (tmp_path / "a.csv").exists()
+
+
+def test_a_format_whose_package_only_the_worker_has_is_written_there(blender, loaded, tmp_path, monkeypatch):
+    options = {"format": "poses", "frames": "RANGE"}
+    assert blender.ops.r5dgs.export_format(filepath=str(tmp_path / "own.json"), **options) == {"FINISHED"}
+    module = importlib.import_module("r5dgs_core.formats.poses")
+    lacking = dataclasses.replace(module.FORMAT, extra="tables", packages=("no_such_package",))
+    monkeypatch.setattr(module, "FORMAT", lacking)  # the worker is another process
+    jobs = importlib.import_module("r5dgs.r5dgs_addon.worker.jobs")
+    jobs.stop()
+    assert jobs.formats() is None and "Keeps: " in tooltip(blender, "poses")
+    assert blender.ops.r5dgs.export_format(filepath=str(tmp_path / "a.json"), **options) == {"FINISHED"}
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "own.json").read_bytes()
+    assert "poses" in jobs.formats() and "Keeps: " in tooltip(blender, "poses")
+    with pytest.raises(RuntimeError, match="cannot be written"):
+        blender.ops.r5dgs.export_format(filepath=str(tmp_path / "missing" / "a.json"), **options)
