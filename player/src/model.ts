@@ -94,7 +94,7 @@ export class Model {
     this.pieces = glb.tree.nodes.flatMap((node) => {
       const extras = node.extras?.r5dgs;
       if (node.mesh === undefined || extras?.object === undefined) return [];
-      return [piece(glb, node.mesh, extras.object, this.groups[extras.group!])];
+      return [piece(glb, node.mesh, extras.object, this.groups[extras.group!], node.translation ?? [0, 0, 0])];
     });
     const present = new Set(this.pieces.map((one) => one.object));
     this.labels = own.objects;
@@ -150,14 +150,15 @@ export class Model {
   get skyColor(): Vec { return this.sky[0].map((dc) => Math.min(1, Math.max(0, 0.5 + C0 * dc))) as Vec; }
 }
 
-function piece(glb: Glb, mesh: number, object: number, group: Group): Piece {
+// Positions become those in the frame of the group's node.
+function piece(glb: Glb, mesh: number, object: number, group: Group, place: number[]): Piece {
   const names = glb.tree.meshes[mesh].primitives[0].attributes;
   const column = (name: string) => glb.array(names[name]);
   const pairs = [0, 1, 2, 3].flatMap((degree) => Array.from({ length: 2 * degree + 1 }, (_, k) => [degree, k]));
   const standard = pairs.map(([degree, k]) => `${EXTENSION}:SH_DEGREE_${degree}_COEF_${k}`);
   const unshaded = pairs.map((_, k) => `${OWN}${k}`);
   const listed = names[unshaded[0]] === undefined ? standard : unshaded;
-  const positions = column("POSITION");
+  const positions = column("POSITION").map((value, k) => value + place[k % 3]);
   return {
     node: group.node,
     group,

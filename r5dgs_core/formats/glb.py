@@ -1,9 +1,10 @@
 """Scenes as animated binary glTF (`.glb`) with KHR_gaussian_splatting (docs/reference/glb.md).
 
-A root node turns the data set's world to glTF's y up. Below it, each motion group has one node at its anchor, with keys
-of translation and rotation; parts hang on the node of their parent. The Gaussians of an object in a group are a mesh of
-a child of the group's node. ``extras.r5dgs`` of the file's scene holds all other data for our own programs. The extras
-of a node hold the number of its group, object or camera.
+A root node turns the data set's world to glTF's y up. Below it, each motion group has one node at its anchor, with
+keys of translation and rotation; parts hang on the node of their parent. The Gaussians of an object in a group are a
+mesh of a child of the group's node, whose place decides when other programs draw it (`draw_order`). ``extras.r5dgs``
+of the file's scene holds all other data for our own programs. The extras of a node hold the number of its group,
+object or camera.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ..playback import modes
 from ..playback.scene_player import Player, available
 from ..scene import cameras
 from ..scene.scene import MotionGroup, Scene
-from . import glb_motion, glb_splats, gltf, registry, scene_nodes, scene_notes
+from . import draw_order, glb_motion, glb_splats, gltf, registry, scene_nodes, scene_notes
 
 KIND = scene_notes.Kind("r5dgs glb", 1, "r5dgs export --to glb")
 ELSEWHERE = ", in other programs"  # end of sentences about losses that our own programs do not have
@@ -129,12 +130,13 @@ def _add_groups(scene: Scene, options: registry.Options, tree: _Nodes, arrays: g
         return numbers[group.id]
 
     factors = Player(scene).frame(scene.t_max).shading_factor
-    for rows, object_id, motion_id in pieces:
+    for (rows, object_id, motion_id), origin in zip(pieces, draw_order.origins(scene, pieces), strict=True):
         group = scene.groups[motion_id]
         name = f"{names[object_id]} Gaussians" + ("" if motion_id == 0 else f" in group {motion_id}")
-        tree.meshes.append(glb_splats.mesh(scene, rows, group.home, factors, arrays, name))
+        tree.meshes.append(glb_splats.mesh(scene, rows, group.home + origin, factors, arrays, name))
         extras = {"r5dgs": {"group": motion_id, "object": object_id}}
-        tree.add(name, node_of(group), mesh=len(tree.meshes) - 1, extras=extras)
+        moved = {"translation": origin.tolist()} if origin.any() else {}
+        tree.add(name, node_of(group), mesh=len(tree.meshes) - 1, extras=extras, **moved)
     return numbers
 
 

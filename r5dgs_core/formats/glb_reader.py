@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,7 @@ def _gaussians(content: gltf.Content, groups: Sequence[MotionGroup]) -> tuple[Ga
         if not isinstance(group, int) or not 0 <= group < len(groups):
             raise content.error(f"{user}: group: expected a number below {len(groups)}, found {group!r:.60}")
         splats, shading = glb_splats.read(content, content.item("meshes", node.get("mesh"), user), user)
+        splats = dataclasses.replace(splats, means=splats.means + _place(content, node, user))
         pieces.append(((own["object"], group), splats, shading))
     if not pieces:
         raise content.error("expected nodes with Gaussians, found none")
@@ -75,6 +77,14 @@ def _gaussians(content: gltf.Content, groups: Sequence[MotionGroup]) -> tuple[Ga
         vectors = np.concatenate([np.tile(plain, (len(s.means), 1)) if v is None else v for _, s, v in pieces])
     arrays = {"means": np.concatenate(means).astype(np.float32), "object_ids": ids[:, 0], "motion_ids": ids[:, 1]}
     return Gaussians(**joined | arrays), vectors
+
+
+def _place(content: gltf.Content, node: dict[str, Any], user: str) -> np.ndarray:
+    """Translation of a node. [3]"""
+    found = node.get("translation", [0.0] * 3)
+    if not isinstance(found, list) or len(found) != 3 or not all(type(value) in (int, float) for value in found):
+        raise content.error(f"{user}: translation: expected three numbers, found {found!r:.60}")
+    return np.array(found, np.float64)
 
 
 def _tracks(content: gltf.Content, groups: Sequence[MotionGroup], times: np.ndarray, units: Units) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Gaussians as vertex attributes of glTF meshes: KHR_gaussian_splatting, and our own attributes for shading.
 
-Positions are relative to the anchor of the motion group, and harmonics are those of the bind frame, so that both move
-with the node of the group. Colours are those of t_max: `SHADING` and, if a factor at t_max is not 1, `HARMONICS` hold
+Positions are relative to the mesh's node, and harmonics are those of the bind frame, so that both move with the node of
+the group. Colours are those of t_max: `SHADING` and, if a factor at t_max is not 1, `HARMONICS` hold
 the rest. Names of attributes of an application start with "_"; other programs skip them.
 """
 
@@ -38,13 +38,13 @@ def harmonic_names(count: int) -> list[str]:
     return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k}" for degree, k in pairs[:count]]
 
 
-def mesh(scene: Scene, rows: slice, home: np.ndarray, factors: np.ndarray | None, arrays: Arrays, name: str) -> Any:
+def mesh(scene: Scene, rows: slice, origin: np.ndarray, factors: np.ndarray | None, arrays: Arrays, name: str) -> Any:
     """Add a mesh of Gaussians and return its JSON.
 
     Args:
         scene: The scene.
         rows: The Gaussians, of one motion group.
-        home: Position of the group's anchor at t_max. [3]
+        origin: Position of the mesh's node at t_max. [3]
         factors: Factor on the colour of each Gaussian of the scene at t_max, or None. [N]
         arrays: Arrays of the file.
         name: Name of the mesh.
@@ -53,7 +53,7 @@ def mesh(scene: Scene, rows: slice, home: np.ndarray, factors: np.ndarray | None
     frozen = sh if factors is None else tints.tint_sh(sh, factors[rows, None])
     quats = rotations.normalize(gaussians.quats[rows].astype(np.float64))
     columns = {
-        "POSITION": gaussians.means[rows] - home,
+        "POSITION": gaussians.means[rows] - origin,
         f"{EXTENSION}:ROTATION": quats[:, [1, 2, 3, 0]],
         f"{EXTENSION}:SCALE": np.exp(gaussians.log_scales[rows].astype(np.float64)).clip(_SMALLEST),
         f"{EXTENSION}:OPACITY": to_opacities(gaussians.opacity_logits[rows]),
