@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from r5dgs_core.motion.history import Event, History
 from r5dgs_core.playback.group_dynamics import knot_poses
 from r5dgs_core.scene.scene import Scene
 
@@ -47,7 +48,9 @@ def impact(scene: Scene) -> Scene:
     poses = scene.tracks.poses.copy()
     way = moves[group, 0] - moves[group, -1]
     poses[group, :, 4:] = np.abs(times - middle)[:, None] / (times[-1] - middle) * way - way
-    return scene.with_arrays(track_poses=poses)
+    hit = History((Event(float(middle), "impact", 1e-3),))
+    groups = [dataclasses.replace(one, history=hit) if one.id == group else one for one in scene.groups]
+    return dataclasses.replace(scene.with_arrays(track_poses=poses), groups=tuple(groups))
 
 
 def large(scene: Scene) -> Scene:

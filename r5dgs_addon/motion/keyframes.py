@@ -117,9 +117,10 @@ def reduced_keys(
 
 
 def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Curves:
-    """One key per knot, which is exact, or fewer keys if they stay within the tolerance."""
+    """One key per knot and jump, which is exact, or fewer keys if they stay within the tolerance."""
     exact = group_curves.observed(scene, motion_id)
-    times = exact.location.times
+    times = np.asarray(scene.tracks.times, np.float64)
+    jumps = [keys.times[(keys.left_slopes != keys.right_slopes).any(-1)] for keys in (exact.location, exact.rotation)]
     if len(times) < 2 or not _worth_reducing(exact, allowed, radius):
         return exact
 
@@ -131,12 +132,12 @@ def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Cu
         return unit, moved, (raw_slopes - unit * (unit * raw_slopes).sum(-1, keepdims=True)) / norm, moved_slopes
 
     most = min(max(_PER_KNOT * len(times), reduction.MIN_INTERVALS), reduction.MAX_INTERVALS)
-    fewer = reduction.reduce(sample, float(times[0]), float(times[-1]), allowed, radius, most=most)
+    fewer = reduction.reduce(sample, float(times[0]), float(times[-1]), allowed, radius, np.union1d(*jumps), most=most)
     if not fewer.followed:
         return exact
     return Curves(
         *(
-            some if len(some.times) < len(times) else all_knots
+            some if len(some.times) < len(all_knots.times) else all_knots
             for some, all_knots in ((fewer.location, exact.location), (fewer.rotation, exact.rotation))
         )
     )

@@ -12,20 +12,18 @@ import numpy as np
 
 from ..motion import cubic_curves, models, rotations
 from ..motion import key_reduction as reduction
-from ..motion.cubic_curves import Curves, Keys
+from ..motion.cubic_curves import Curves
 from ..scene import row_runs
 from ..scene.scene import Scene
-from . import group_dynamics
+from . import group_dynamics, observed_motion
 
 TOLERANCE = 3e-6  # error of reduced keys at the members, as a fraction of the scene's extent
 
 
 def observed(scene: Scene, motion_id: int) -> Curves:
-    """Return one key per knot, which is exactly the playback up to t_max."""
-    times = np.asarray(scene.tracks.times, np.float64)
-    quats, displacements = group_dynamics.local_knots(scene, scene.groups[motion_id])
-    quat_slopes, slopes = (cubic_curves.slopes(times, values) for values in (quats, displacements))
-    return Curves(Keys(times, displacements, slopes, slopes), Keys(times, quats, quat_slopes, quat_slopes))
+    """Return one key per knot and per jump between knots, which is exactly the playback up to t_max."""
+    group = scene.groups[motion_id]
+    return observed_motion.curves(scene, group, *group_dynamics.local_knots(scene, group))
 
 
 def future(

@@ -28,6 +28,7 @@ from ..motion.models import STATIC, MotionModel
 from ..scene import visibility
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
+from . import observed_motion
 from .modes import SOURCES
 
 FARTHEST = 1e30  # maximum predicted displacement per axis, within the range of float32
@@ -86,6 +87,11 @@ class GroupMotion:
             cubic_curves.slopes(self._times, self._quats),
             cubic_curves.slopes(self._times, self._displacements),
         )
+        self._jumping = {
+            g: observed_motion.curves(scene, group, self._quats[g], self._displacements[g])
+            for g, group in enumerate(scene.groups)
+            if observed_motion.jumps(scene, group)
+        }
         self._followers = [
             (g, group.follows, group.follow_matrix)
             for g, group in enumerate(scene.groups)
@@ -128,6 +134,9 @@ class GroupMotion:
             cubic_curves.hermite(values[:, k], values[:, k + 1], slopes[:, k], slopes[:, k + 1], h, u)
             for values, slopes in zip((self._quats, self._displacements), self._slopes, strict=True)
         )
+        for g, curves in self._jumping.items():
+            q[g] = cubic_curves.evaluate(curves.rotation, np.array(t))
+            d[g] = cubic_curves.evaluate(curves.location, np.array(t))
         q = rotations.normalize(q)
         self._compose_parts(q, d)
         return q, d

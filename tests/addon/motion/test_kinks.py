@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import models
+from r5dgs_core.motion.history import Event, History
 from r5dgs_core.scene import scene_file
 from tests.support import motions, problems, scenes
 
@@ -114,3 +115,21 @@ def test_a_body_that_friction_stops_rests_from_that_time_on(blender, scene_path)
     scene = dataclasses.replace(scene, groups=(scene.groups[0], edited, *scene.groups[2:]))
     motions.assert_plays_like_the_core(blender, loaded, scene, np.linspace(scenes.T_MAX, 1.2, 40))
     assert vertical_keys(mug)[-1].co[0] < 1 + 60 * (scenes.T_MAX + 0.41)
+
+
+@pytest.mark.parametrize("share", [0.6, 1.0], ids=["between", "knot"])
+def test_an_observed_impact_plays_like_the_core_and_has_a_key(blender, tmp_path, share):
+    made = scenes.make_scene(n=300, objects=2, seed=1)
+    times, poses = made.tracks.times, made.tracks.poses.copy()
+    hit = float(times[5] + share * (times[6] - times[5]))
+    poses[1, :, 4:] = (np.abs(times - hit) - np.abs(times[-1] - hit))[:, None] * [1.0, 0.2, -2.0]
+    struck = dataclasses.replace(made.groups[1], history=History((Event(hit, "impact", 0.001),)))
+    scene = dataclasses.replace(made.with_arrays(track_poses=poses), groups=(made.groups[0], struck, *made.groups[2:]))
+    loaded = motions.load(blender, scene_file.write(scene, tmp_path / "scene.r5dgs"), t_end=1.0)
+    beside = hit + np.array([-0.4, -0.02, 0.0, 0.02, 0.4]) / 60
+    motions.assert_plays_like_the_core(blender, loaded, scene, sorted({*np.linspace(0, 0.74, 23), *beside}))
+    key = min(vertical_keys(blender.data.objects["mug anchor"]), key=lambda key: abs(key.co[0] - (1 + 60 * hit)))
+    assert abs(key.co[0] - (1 + 60 * hit)) < 1e-4
+    arrives = (key.co[1] - key.handle_left[1]) / (key.co[0] - key.handle_left[0])
+    leaves = (key.handle_right[1] - key.co[1]) / (key.handle_right[0] - key.co[0])
+    assert arrives == pytest.approx(2 / 60, rel=1e-3) and leaves == pytest.approx(-2 / 60, rel=1e-3)
