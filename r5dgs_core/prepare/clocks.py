@@ -1,21 +1,24 @@
 """Common clock of the cameras: known offsets, sound, or motion.
 
-A measured offset is used only if it is significant. Cameras that record in step have offset 0, and a measurement would
-only add its error.
+Measured offsets are used only if one of them is significant. Cameras that record in step have offset 0, and a
+measurement would only add its error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .. import errors
 from ..capture.calibration.calibration import CalibratedCamera, Calibration
-from . import audio_offsets, motion_offsets, motion_tracks
+from ..data import mask_notes, masks
+from . import audio_offsets, frame_masks, motion_offsets, motion_tracks
 from .camera_source import TABLE, CameraSource
 from .clock import Offset
+from .motion_tracks import MotionTrack
 
 METHODS = ("auto", "audio", "motion", "none")
 SIGNIFICANT = 3.0  # least offset, in standard deviations
@@ -30,6 +33,7 @@ def offsets(
     method: str,
     given: Mapping[str, float],
     progress: Callable[[dict[str, Any]], None],
+    mask_folder: Path | None = None,
 ) -> tuple[list[Offset], list[str]]:
     """Return the offset of each camera's clock, and remarks for the user.
 
@@ -40,6 +44,7 @@ def offsets(
         method: One of `METHODS`.
         given: Known offsets in seconds by name; other cameras then have offset 0.
         progress: Called with progress events.
+        mask_folder: Masks of the frames, whose objects are compared instead of the largest moving region.
 
     Raises:
         ConfigError: A given name does not exist, or the method cannot be used.
@@ -68,12 +73,55 @@ def offsets(
             raise errors.ConfigError("--sync audio: the cameras' sounds do not match; use --sync motion")
     if any(camera.changes for camera in cameras):
         return none, ["clocks are not compared, because a camera moves or zooms; give offsets with --offset NAME=MS"]
-    return _by_motion(sources, cameras, progress)
+    return _by_motion(sources, cameras, progress, mask_folder)
 
 
 def _by_motion(
-    sources: Sequence[CameraSource], cameras: Sequence[CalibratedCamera], progress: Callable[[dict[str, Any]], None]
+    sources: Sequence[CameraSource],
+    cameras: Sequence[CalibratedCamera],
+    progress: Callable[[dict[str, Any]], None],
+    folder: Path | None,
 ) -> tuple[list[Offset], list[str]]:
+    poses = [camera.T_cam_world for camera in cameras]
+    intervals = [source.interval for source in sources]
+    tracks = [] if folder is None else _masked_tracks(sources, cameras, folder)
+    found = motion_offsets.measure(tracks, poses, intervals)
+    if found is None:
+        tracks = _moving_regions(sources, cameras, progress)
+        found = motion_offsets.measure(tracks, poses, intervals)
+    none = [Offset(0.0, None, "none") for _ in sources]
+    if found is None:
+        return none, ["clocks are not compared: too little moves in the cameras' common view; offsets of 0 are used"]
+    values = np.array([one.seconds for one in found])
+    before = motion_offsets.misfit(tracks, poses, max(intervals), 0 * values)
+    after = motion_offsets.misfit(tracks, poses, max(intervals), values)
+    if np.isfinite(before) and after > (1 - GAIN) * before:
+        return [Offset(0.0, one.sigma, one.method) for one in found], []
+    return _significant(sources, found)
+
+
+def _masked_tracks(
+    sources: Sequence[CameraSource], cameras: Sequence[CalibratedCamera], folder: Path
+) -> list[dict[int, MotionTrack]]:
+    """Return the paths of the objects of masks; none if their ids are not those of the scene."""
+    notes, files = mask_notes.read(folder), frame_masks.find(folder, sources)
+    if notes.numbering != mask_notes.SCENE:
+        return []
+    colors = masks.color_table([path for found in files for path in found.values()])
+
+    def read(path: Path) -> np.ndarray:
+        return masks.read(path, colors, notes.unknown)
+
+    return [
+        motion_tracks.of_masks(source, camera.lens, found, read)
+        for source, camera, found in zip(sources, cameras, files, strict=True)
+    ]
+
+
+def _moving_regions(
+    sources: Sequence[CameraSource], cameras: Sequence[CalibratedCamera], progress: Callable[[dict[str, Any]], None]
+) -> list[dict[int, MotionTrack]]:
+    """Return the path of the largest moving region of each camera."""
     total = sum(min(len(source.times), motion_tracks.MOST_FRAMES) for source in sources)
     done, tracks = 0, []
     for source, camera in zip(sources, cameras, strict=True):
@@ -82,35 +130,23 @@ def _by_motion(
             event = {"event": "sync", "done": before + count, "total": total, "unit": "frames"}
             progress({**event, "text": f"motion in {name}"})
 
-        tracks.append(motion_tracks.track(source, camera.lens, report))
+        tracks.append({0: motion_tracks.track(source, camera.lens, report)})
         done += min(len(source.times), motion_tracks.MOST_FRAMES)
-    poses = [camera.T_cam_world for camera in cameras]
-    intervals = [source.interval for source in sources]
-    found = motion_offsets.measure(tracks, poses, intervals)
-    none = [Offset(0.0, None, "none") for _ in sources]
-    if found is None:
-        return none, ["clocks are not compared: too little moves in the cameras' common view; offsets of 0 are used"]
-    values = np.array([one.seconds for one in found])
-    before = motion_offsets.misfit(tracks, poses, max(intervals), 0 * values)
-    after = motion_offsets.misfit(tracks, poses, max(intervals), values)
-    if np.isfinite(before) and after > (1 - GAIN) * before:
-        sigmas = [one.sigma for one in found]
-        return [Offset(0.0, sigma, "motion") for sigma in sigmas], []
-    return _significant(sources, found)
+    return tracks
 
 
 def _significant(sources: Sequence[CameraSource], found: Sequence[Offset]) -> tuple[list[Offset], list[str]]:
-    """Replace offsets that are not significant by 0; returns them, and a remark for each that was not measured."""
+    """Replace all offsets by 0 if none is significant; returns them, and a remark for each that was not measured."""
     result, notes = [], []
     for source, one in zip(sources, found, strict=True):
         if one.sigma is None or one.sigma > UNSURE * source.interval:
             notes.append(f"{source.name}: its clock could not be compared with the others; offset 0 is used")
             result.append(Offset(0.0, None, "none"))
-        elif one.sigma and abs(one.seconds) < SIGNIFICANT * one.sigma:
-            result.append(Offset(0.0, one.sigma, one.method))
         else:
             result.append(one)
-    return result, notes
+    if any(one.sigma and abs(one.seconds) >= SIGNIFICANT * one.sigma for one in result):
+        return result, notes
+    return [Offset(0.0, one.sigma, one.method) for one in result], notes
 
 
 def _distances(cameras: Sequence[CalibratedCamera], meters_per_unit: float | None) -> np.ndarray | None:

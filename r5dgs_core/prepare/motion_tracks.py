@@ -1,19 +1,23 @@
-"""Path of the largest moving region in the frames of a static camera."""
+"""Paths of what moves in the frames of a static camera: of its objects, or of the largest moving region."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
 from ..capture.calibration.lens import Lens
+from ..data import masks as id_images
 from .camera_source import CameraSource
 
 WIDTH = 240  # of the reduced frames, pixels
 MOST_FRAMES = 600  # per camera, consecutive; bounds memory
 BACKGROUND_FRAMES = 41
+LEAST_PATH = 2.0  # least extent of the path of an object, px
+LEAST_PIXELS = 20  # of an object's mask
 _NOISE = 12  # least difference from the background, of 255
 _AREA = 0.0008  # least share of the frame
 _SHARE = 0.5  # largest share of the frame
@@ -62,6 +66,53 @@ def track(source: CameraSource, lens: Lens, report: Callable[[int], None]) -> Mo
     rows = pixels[:, 1] / source.height - 0.5
     good = np.isfinite(rays).all(1) & (rays[:, 2] > 1e-3)
     return MotionTrack(source.times[found][seen][good], rays[good, :2] / rays[good, 2:], 1.0 / lens.fx, rows[good])
+
+
+def of_masks(
+    source: CameraSource, lens: Lens, masks: Mapping[int, Path], read: Callable[[Path], np.ndarray]
+) -> dict[int, MotionTrack]:
+    """Follow each object of a camera by its masks, while all of it is visible.
+
+    Args:
+        source: The camera, static.
+        lens: Its lens for the size of the frames.
+        masks: File of each frame's mask.
+        read: Returns the ids of a file. [H, W]
+    """
+    indices = sorted(masks)
+    first = max(0, (len(indices) - MOST_FRAMES) // 2)
+    seen: dict[int, list[tuple[float, float, float]]] = {}
+    for index in indices[first : first + MOST_FRAMES]:
+        ids = read(masks[index])
+        scale = source.width / ids.shape[1]
+        for key, (x, y) in _whole(ids).items():
+            seen.setdefault(key, []).append((float(source.times[index]), x * scale, y * scale))
+    tracks = {}
+    for key, rows in seen.items():
+        times, pixels = np.array(rows)[:, 0], np.array(rows)[:, 1:]
+        if np.ptp(pixels, axis=0).max() >= LEAST_PATH:
+            rays = lens.unproject(pixels)
+            good = np.isfinite(rays).all(1) & (rays[:, 2] > 1e-3)
+            points, places = rays[good, :2] / rays[good, 2:], pixels[good, 1] / source.height - 0.5
+            tracks[key] = MotionTrack(times[good], points, 1.0 / lens.fx, places)
+    return tracks
+
+
+def _whole(ids: np.ndarray) -> dict[int, tuple[float, float]]:
+    """Return the centre (x, y) of each object that neither leaves the image nor touches another one, px."""
+    padded = np.pad(ids, 1, constant_values=id_images.UNKNOWN)
+    centers = {}
+    for key, place in enumerate(ndimage.find_objects(np.where(ids == id_images.UNKNOWN, 0, ids)), 1):
+        if place is None:
+            continue
+        top, left = place[0].start, place[1].start
+        around = padded[top : place[0].stop + 2, left : place[1].stop + 2]
+        region = around == key
+        border = np.asarray(ndimage.binary_dilation(region), bool) & ~region
+        if region.sum() >= LEAST_PIXELS and not around[border].any():
+            y, x = np.nonzero(region)
+            centers[key] = left + float(x.mean()) - 0.5, top + float(y.mean()) - 0.5
+    return centers
 
 
 def step_of(width: int) -> int:

@@ -35,6 +35,7 @@ class Request:
         unknown: Known facts about cameras without a calibration.
         up: Up of the world (`gauge.upright`), or None for that of the calibration.
         meters_per_unit: Length of a unit of the world, or None for that of the calibration.
+        masks: Folder of masks of the frames, whose objects are compared to measure clocks.
     """
 
     source: Path
@@ -51,6 +52,7 @@ class Request:
     unknown: UnknownCameras = field(default_factory=UnknownCameras)
     up: str | None = None
     meters_per_unit: float | None = None
+    masks: Path | None = None
 
 
 @dataclass(frozen=True)

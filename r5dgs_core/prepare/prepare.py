@@ -109,7 +109,9 @@ def _plan(
         offsets, notes = record.offsets_of(known), list(known["notes"])
     else:
         calibrated = [camera.calibrated for camera in opened]
-        offsets, notes = clocks.offsets(sources, calibration, calibrated, request.sync, request.offsets, progress)
+        offsets, notes = clocks.offsets(
+            sources, calibration, calibrated, request.sync, request.offsets, progress, request.masks
+        )
     names = [source.name for source in sources]
     times = [
         camera.source.times[camera.usable] + offset.seconds for camera, offset in zip(opened, offsets, strict=True)

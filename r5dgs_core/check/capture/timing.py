@@ -62,7 +62,7 @@ class Clocks:
             return
         reach = 5.0 if self._seconds is None else 5.0 / self._seconds
         poses = [camera.T_cam_world for camera in self._cameras]
-        found = motion_offsets.measure(self._tracks, poses, self._intervals, reach)
+        found = motion_offsets.measure([{0: track} for track in self._tracks], poses, self._intervals, reach)
         if found is None:
             return
         known = [k for k, one in enumerate(found) if one.sigma is not None and one.sigma < 0.5 * step]
@@ -74,7 +74,7 @@ class Clocks:
             self._check_shutter()
 
     def _misfit(self, offsets: np.ndarray, readout: float = 0.0) -> float:
-        tracks = [read_by_rows(one, readout) for one in self._tracks] if readout else self._tracks
+        tracks = [{0: read_by_rows(one, readout) if readout else one} for one in self._tracks]
         poses = [camera.T_cam_world for camera in self._cameras]
         return motion_offsets.misfit(tracks, poses, max(self._intervals), offsets)
 

@@ -24,6 +24,7 @@ LONG = (
 EXAMPLE = "VIDEOS --calibration calibration.toml --out DATA"
 PAGE = "user/your_data.md"
 SYNC = ("auto", "audio", "motion", "none")
+_NO_FOLDER = ("none", "sam2", "sam3")  # values of --masks that name no folder
 NOT_RECORDED = ("D53",)  # findings about the machine, not about the capture
 
 
@@ -164,6 +165,7 @@ def run_prepare(
         window=frame_choice.Window(**window),
         hold_out=data_splits.HoldOut(**(hold_out or {})),
         unknown=unknown_cameras.UnknownCameras(**(unknown or {})),
+        masks=None if masks in _NO_FOLDER else Path(masks),
         **fields,
     )
     with make(progress_kind) as progress:

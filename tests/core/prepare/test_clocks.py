@@ -1,15 +1,37 @@
 """Offsets between clocks are recovered from sound and from motion, and are not invented."""
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import signal
 
 from r5dgs_core import errors
+from r5dgs_core.capture.calibration.lens import Lens
+from r5dgs_core.data import masks
 from r5dgs_core.prepare import cameras, clock, clocks, motion_offsets, motion_tracks
 from tests.support import recordings
 
 CLOCKS = (0.0, 0.0071, -0.0133)  # seconds
 STARTS = (0.5, 0.503, 0.511)
+
+
+PATHS = {  # positions of objects at a time
+    1: recordings.ball,
+    2: lambda t: np.array([0.6 * np.cos(2.9 * t), 0.5 * np.sin(2.2 * t), 0.3 + 0.2 * np.cos(4 * t)]),
+}
+
+
+def tracks_of(camera, times, shift, paths):
+    """Exact tracks of objects in a camera whose clock is late."""
+    tracks = {}
+    for key, path in paths.items():
+        seen = np.stack([path(t + shift) for t in times])
+        local = seen @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
+        points = local[:, :2] / local[:, 2:]
+        tracks[key] = motion_tracks.MotionTrack(times, points, 1 / camera.intrinsics[0, 0], np.zeros(len(times)))
+    return tracks
 
 
 def draw_nothing(camera, lens, t):
@@ -119,16 +141,69 @@ def test_cameras_that_no_pair_connects_have_no_uncertainty():
 
 
 def test_the_misfit_is_least_at_the_true_offsets():
-    rig = recordings.make_rig(2, 320, 240)
-    times = np.arange(80) / 30
-    tracks = []
-    for camera, shift in zip(rig.cameras, (0.0, 0.02), strict=True):
-        seen = np.stack([recordings.ball(t + shift) for t in times])
-        local = seen @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
-        points = local[:, :2] / local[:, 2:]
-        tracks.append(motion_tracks.MotionTrack(times, points, 1 / camera.intrinsics[0, 0], np.zeros(len(times))))
+    rig, times = recordings.make_rig(2, 320, 240), np.arange(80) / 30
+    pairs = zip(rig.cameras, (0.0, 0.02), strict=True)
+    tracks = [tracks_of(camera, times, shift, {0: recordings.ball}) for camera, shift in pairs]
     poses = [camera.T_cam_world for camera in rig.cameras]
     found = motion_offsets.measure(tracks, poses, [1 / 30, 1 / 30])
     assert found[1].seconds == pytest.approx(0.02, abs=3e-4)
     at = [motion_offsets.misfit(tracks, poses, 1 / 30, np.array([0.0, value])) for value in (0.0, 0.02, 0.04)]
     assert at[1] < 0.1 * min(at[0], at[2])
+
+
+def test_objects_are_compared_with_themselves():
+    rig, times = recordings.make_rig(4, 320, 240), np.arange(30) / 30
+    shifts, shown = (0.0, 0.006, -0.009, 0.012), ((1, 2), (1,), (1, 2), (2,))
+    tracks = [
+        tracks_of(camera, times, shift, {key: PATHS[key] for key in keys})
+        for camera, shift, keys in zip(rig.cameras, shifts, shown, strict=True)
+    ]
+    found = motion_offsets.measure(tracks, [camera.T_cam_world for camera in rig.cameras], [1 / 30] * 4)
+    np.testing.assert_allclose([one.seconds for one in found], shifts, atol=5e-4)
+
+
+def test_steady_motion_gives_no_offset():
+    rig, times, rng = recordings.make_rig(3, 320, 240), np.arange(40) / 30, np.random.default_rng(0)
+    paths = {1: lambda t: np.array([0.5 * t, 0.3 * t, 0.2])}
+    tracks = [tracks_of(camera, times, 0.0, paths) for camera in rig.cameras]
+    for track in tracks:
+        track[1].points[:] += rng.normal(0, 0.3 * track[1].pixel, track[1].points.shape)
+    found = motion_offsets.measure(tracks, [camera.T_cam_world for camera in rig.cameras], [1 / 30] * 3)
+    assert [one.sigma for one in found[1:]] == [None, None]
+
+
+def test_objects_are_followed_while_all_of_them_is_visible():
+    source = SimpleNamespace(times=np.arange(20) / 30, width=120, height=80)
+    frames = np.zeros((20, 40, 60), np.int32)  # half of the size of the frames
+    for k in range(20):
+        frames[k, 10:20, 2 * k : 2 * k + 10] = 7  # begins at the left edge
+        frames[k, 5:25, 45:50] = 9  # at rest; the other one arrives at it
+    files = {k: Path(f"{k}.png") for k in range(20)}
+    lens = Lens("pinhole", 100.0, 100.0, 60.0, 40.0)
+    found = motion_tracks.of_masks(source, lens, files, lambda path: frames[int(path.stem)])
+    assert found.keys() == {7}
+    np.testing.assert_allclose(found[7].times * 30, np.arange(1, 18), atol=1e-9)
+    np.testing.assert_allclose(found[7].points[:, 0] * 100 + 60, 2 * (2 * np.arange(1, 18) + 5))
+    np.testing.assert_allclose(found[7].points[:, 1] * 100 + 40, 30)
+
+
+def test_masks_of_the_frames_replace_the_largest_moving_region(swinging, tmp_path):
+    opened, calibration = cameras.open_all(swinging, None, None)
+    for camera, start in zip(opened, STARTS, strict=True):
+        lens, pose = camera.calibrated.lens, camera.calibrated.T_cam_world
+        v, u = np.mgrid[: camera.source.height, : camera.source.width] + 0.5
+        for k in range(len(camera.source.times)):
+            center = pose[:3, :3] @ recordings.ball(start + k / 30) + pose[:3, 3]
+            (x, y), radius = lens.project(center[None])[0], 0.22 * lens.fx / center[2]
+            ids = ((u - x) ** 2 + (v - y) ** 2 < radius**2).astype(np.uint16)
+            masks.write(tmp_path / camera.name / f"{k:06d}.png", ids)
+    found, _ = clocks.offsets(
+        [camera.source for camera in opened],
+        calibration,
+        [camera.calibrated for camera in opened],
+        "motion",
+        {},
+        lambda event: pytest.fail("no frame is read"),
+        tmp_path,
+    )
+    np.testing.assert_allclose([one.seconds for one in found], CLOCKS, atol=1e-3)
