@@ -29,6 +29,7 @@ import numpy as np
 import torch
 
 from r5dgs_core.model import deformation, trd
+from r5dgs_core.motion import knots as trajectory_knots
 from r5dgs_core.motion import models, point_dynamics, rotations, se3
 from r5dgs_core.playback import group_dynamics, scene_player
 from r5dgs_core.scene.scene import Dynamics, Gaussians, MotionGroup, Scene, SceneObject, Shading, Tracks
@@ -52,8 +53,19 @@ def make_scene(count: int, bodies: int, kind: str = "ballistic_spin", seed: int 
         v, a, w, eps = rng.normal(size=(4, 3)) * [[0.5], [0.5], [1.5], [0.7]]
         inertia = np.diag([0.4, 0.8, 1.0]) if models.KINDS[kind].needs_inertia else None
         rates = {"velocity": v, "acceleration": a, "angular_velocity": w, "angular_acceleration": eps}
-        model = models.MotionModel(kind, **rates, inertia=inertia, radius=0.5, offset_rotvec=rng.normal(size=3) * 0.01)
-        quats, displacements, _, _ = models.curve(models.MotionModel("ballistic_spin", **rates), times - T_MAX)
+        free = models.MotionModel("ballistic_spin", **rates)
+        path = np.linspace(0.0, T_MAX, KNOTS)
+        turns, places, spins, velocities = models.curve(free, path)
+        knots = trajectory_knots.pack(path, (turns, places), (velocities, velocities), (spins, spins))
+        model = models.MotionModel(
+            kind,
+            **rates,
+            inertia=inertia,
+            knots=knots if models.KINDS[kind].needs_knots else None,
+            radius=0.5,
+            offset_rotvec=rng.normal(size=3) * 0.01,
+        )
+        quats, displacements, _, _ = models.curve(free, times - T_MAX)
         poses.append(np.concatenate([rotations.normalize(quats), displacements], -1))
         rows = np.flatnonzero(ids == g)
         anchor = int(rows[np.argmin(((means[rows] - centers[g]) ** 2).sum(-1))]) if len(rows) else -1

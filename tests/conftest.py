@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import itertools
 import os
 import sys
 from pathlib import Path
@@ -32,10 +33,17 @@ hypothesis.settings.register_profile("r5dgs", deadline=None, max_examples=50)
 hypothesis.settings.load_profile("r5dgs")
 
 
+@pytest.fixture(scope="session")
+def settings_folders(tmp_path_factory):
+    """Iterator over new folders of user settings, which do not exist yet."""
+    base = tmp_path_factory.mktemp("settings")
+    return (base / str(number) for number in itertools.count())
+
+
 @pytest.fixture(autouse=True)
-def no_user_settings(monkeypatch, tmp_path_factory):
+def no_user_settings(monkeypatch, settings_folders):
     """Give every test an empty folder of user settings, so that those of the tester are neither read nor changed."""
-    folder = tmp_path_factory.mktemp("settings")
+    folder = next(settings_folders)
     for variable in ("XDG_CONFIG_HOME", "APPDATA"):
         monkeypatch.setenv(variable, str(folder))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import json
 import re
@@ -64,12 +65,20 @@ def test_the_extra_all_has_every_extra_that_runs_on_a_cpu():
     assert own.name == "r5dgs" and own.extras == set(EXTRAS) - UNTESTED_EXTRAS - NOT_RUN
 
 
-def named_extras(tree: ast.AST) -> set[str]:
+@functools.cache
+def source(path: Path) -> tuple[str, ast.Module, list[ast.AST]]:
+    """Text, syntax tree, and all nodes of a module."""
+    text = path.read_text(encoding="utf-8")
+    tree = ast.parse(text)
+    return text, tree, list(ast.walk(tree))
+
+
+def named_extras(nodes: list[ast.AST]) -> set[str]:
     """Extras that calls of `r5dgs_core.extras` in a module name literally."""
     position = {"required": 1, "command": 0}
     calls = [
         node
-        for node in ast.walk(tree)
+        for node in nodes
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
         if isinstance(node.func.value, ast.Name) and node.func.value.id == "extras"
     ]
@@ -80,8 +89,8 @@ def named_extras(tree: ast.AST) -> set[str]:
 def test_every_extra_in_a_message_exists_and_only_one_module_writes_the_command():
     named, by_hand = set(), []
     for path in (ROOT / "r5dgs_core").rglob("*.py"):
-        text = path.read_text()
-        named |= named_extras(ast.parse(text))
+        text, _, nodes = source(path)
+        named |= named_extras(nodes)
         if "'r5dgs[" in text and path.name != "extras.py":
             by_hand.append(path)
     named |= {export_formats.get(name).extra for name in export_formats.MODULES} - {None}
@@ -104,8 +113,8 @@ def imported_packages(*, late: bool) -> set[str]:
     """Packages that modules of the core import at their top and, if ``late``, inside functions too."""
     found = set()
     for path in (ROOT / "r5dgs_core").rglob("*.py"):
-        tree = ast.parse(path.read_text())
-        for node in ast.walk(tree) if late else tree.body:
+        _, tree, nodes = source(path)
+        for node in nodes if late else tree.body:
             if isinstance(node, ast.Import):
                 found |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
@@ -252,10 +261,10 @@ def test_files_and_functions_of_the_product_stay_short():
     files = [p for room in ("r5dgs_core", "r5dgs_addon", "operators") for p in (ROOT / room).rglob("*.py")]
     long = []
     for path in (p for p in files if kernels not in p.parents):
-        text = path.read_text(encoding="utf-8")
+        text, _, nodes = source(path)
         if text.count("\n") > 350:
             long.append(f"{path.relative_to(ROOT)}: {text.count(chr(10))} lines")
-        for node in ast.walk(ast.parse(text)):
+        for node in nodes:
             if isinstance(node, ast.FunctionDef):
                 first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
                 if node.end_lineno - first + 1 > 60:

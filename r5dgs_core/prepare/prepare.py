@@ -13,6 +13,7 @@ from typing import Any
 
 from .. import errors, folder_lock
 from ..capture.calibration.calibration import Calibration
+from ..capture.reconstruction import gauge
 from ..data import images
 from ..data.layouts.camera_files import POINTS
 from . import cameras, capture_file, clocks, data_splits, frame_choice, image_size, record, unknown_cameras
@@ -41,6 +42,8 @@ def prepare(request: Request, progress: Progress) -> Plan:
         raise errors.ConfigError(
             f"--out {request.out}: is among the recordings; name a folder outside {request.source}"
         )
+    if request.up is not None:
+        gauge.check_up(request.up)
     file = request.calibration
     if unknown_cameras.missing(request.source, file):
         with folder_lock.hold(out):

@@ -36,7 +36,12 @@ MOTIONS = {
 }
 SKY = np.array([0.55, 0.7, 0.9])
 # Few Gaussians and early rounds, so that a run of some hundred steps shows what a long one does.
+CAMERA_PARTS = ("camera_poses", "focal_lengths", "time_offsets", "camera_colours")
+EXAMINED = tuple(f"needs.{part}=auto" for part in CAMERA_PARTS)
+# Repair of poses and examination of cameras take a third of a tiny run and are off; their own tests switch them on.
 SETTINGS = (
+    "train.repair=false",
+    *(f"needs.{part}=off" for part in CAMERA_PARTS),
     "init.object_points=150",
     "init.background_points=700",
     "init.shadow_points=10",

@@ -33,6 +33,12 @@ def with_distance(calibration: Calibration, first: str, second: str, meters: flo
     return dataclasses.replace(calibration, meters_per_unit=meters / units)
 
 
+def check_up(up: str) -> None:
+    """Raise ConfigError if `upright` does not know an up direction."""
+    if up not in (CAMERAS, PLANE, BOARD):
+        _vector(up)
+
+
 def upright(calibration: Calibration, up: str, boards: list[np.ndarray] | None = None) -> Calibration:
     """Turn the world so that z is up.
 

@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 
 from r5dgs_core import check
+from r5dgs_core.check import codes
 from r5dgs_core.check.capture import agreement, arrangement
 from r5dgs_core.data import images
-from tests.core.check.test_check import CASES
+from tests.core.check.test_check import CASES, assert_found
 from tests.support import captures, recordings
-
-
-def found_in(root, tmp_path):
-    return {finding.code: finding for finding in check.check(root, tmp_path / "pictures")}
 
 
 def test_a_sound_capture_with_masks_has_no_findings(tmp_path):
@@ -40,12 +37,18 @@ TEXTS = {
 }
 
 
-@pytest.mark.default_cases("D62", "D67", "D68")
+def test_every_fault_of_captures_has_a_text():
+    assert list(TEXTS) == [code for code in codes.CODES if "D60" <= code < "E"]
+
+
+@pytest.mark.default_cases("D60", "D62", "D64", "D67", "D68", "D71")  # one of each module
 @pytest.mark.parametrize("code", TEXTS)
 def test_each_fault_is_the_only_one_of_its_capture_and_has_a_picture(tmp_path, code):
     (tmp_path / "data").mkdir()
     root = CASES[code](tmp_path / "data")
-    found = found_in(root, tmp_path)
+    every = check.check(root, tmp_path / "pictures")
+    assert_found(every, code)
+    found = {finding.code: finding for finding in every}
     assert set(found) & set(TEXTS) == {code}
     assert re.search(TEXTS[code], found[code].problem), found[code].problem
     picture = found[code].picture

@@ -90,7 +90,7 @@ def test_lenses_of_other_cameras_are_refused(recordings, tmp_path):
         (["--board", "paper"], "--board paper: expected charuco:COLUMNSxROWS"),
         (["--moving", "drone"], "cameras drone: unknown"),
         (["--distance", "cam0", "cam1", "far"], "--distance: expected metres"),
-        (["--board", CHARUCO, "--up", "north"], "--up north: expected cameras, plane, board, or a vector"),
+        (["--up", "north"], "--up north: expected cameras, plane, board, or a vector"),
         (["--words", "mug"], "--words mug: applies to --masks sam3, found --masks none"),
         (
             ["--masks", "folder", "--model", "sam"],

@@ -125,6 +125,6 @@ def test_a_fast_body_is_not_lost_as_times_enter(tmp_path, monkeypatch):
 def test_poses_of_tracks_are_repaired_unless_switched_off(tiny):
     plan = {}
     for override in ("train.repair=false", "train.seed=0", "train.representation='field'"):
-        settings = tiny_datasets.settings(override)
+        settings = tiny_datasets.settings("train.repair=true", override)
         plan[override] = pose_repair.applies(Trainer(datasets.read(tiny.root), settings))
     assert list(plan.values()) == [False, True, False]

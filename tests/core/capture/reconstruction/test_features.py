@@ -35,12 +35,12 @@ def fixed(count: int = 4) -> tuple[list[Film], list[np.ndarray]]:
 def solved(tmp_path_factory):
     films, poses = fixed()
     request = Request(shared_lens=True, distance=("cam0", "cam2", 1.5))
-    runs = [reconstruct.reconstruct(films, request, tmp_path_factory.mktemp("work")) for _ in range(2)]
-    return runs, poses
+    found = reconstruct.reconstruct(films, request, tmp_path_factory.mktemp("work"))
+    return films, request, poses, found
 
 
 def test_fixed_cameras_are_found_behind_moving_things(solved):
-    (found, _), poses = solved
+    _, _, poses, found = solved
     shifts, angles = pose_errors([camera.camera_to_world for camera in found.cameras], poses)
     assert shifts.max() < 0.05 and angles.max() < 0.5
     assert found.cameras[0].lens.fx == pytest.approx(LENS.fx, rel=0.03)
@@ -49,8 +49,10 @@ def test_fixed_cameras_are_found_behind_moving_things(solved):
     assert found.world_convention == "blender" and len(found.points) > 100
 
 
-def test_the_same_images_give_the_same_cameras(solved):
-    (first, second), _ = solved
+@pytest.mark.slow
+def test_the_same_images_give_the_same_cameras(solved, tmp_path):
+    films, request, _, first = solved
+    second = reconstruct.reconstruct(films, request, tmp_path / "work")
     points = first.points[:50]
     for a, b in zip(first.cameras, second.cameras, strict=True):
         pixels = [c.lens.project((points - c.camera_to_world[:3, 3]) @ c.camera_to_world[:3, :3]) for c in (a, b)]
@@ -66,12 +68,12 @@ def test_known_lenses_are_kept(tmp_path):
 
 
 def test_a_moving_camera_has_a_pose_for_each_frame(tmp_path):
-    angles = np.linspace(-0.4, 0.4, 8)
+    angles = np.linspace(-0.3, 0.3, 6)
     poses = [look_at((np.sin(a), -0.3, -np.cos(a)), (0.5 * np.sin(a), 0.1, 1.5)) for a in angles]
-    film = Film("phone", [picture(LENS, SIZE, pose, WALLS) for pose in poses], np.arange(8) / 5)
+    film = Film("phone", [picture(LENS, SIZE, pose, WALLS) for pose in poses], np.arange(6) / 5)
     found = reconstruct.reconstruct([film], Request(moving=frozenset({"phone"})), tmp_path / "work")
     (camera,) = found.cameras
-    assert camera.moves and [frame.path.stem for frame in camera.frames] == [f"{k:06d}" for k in range(8)]
+    assert camera.moves and [frame.path.stem for frame in camera.frames] == [f"{k:06d}" for k in range(6)]
     assert [frame.time for frame in camera.frames] == pytest.approx(list(film.times))
     shifts, turns = pose_errors([frame.camera_to_world for frame in camera.frames], poses)
     assert shifts.max() < 0.02 and turns.max() < 0.2

@@ -34,7 +34,7 @@ def jittered(data, sizes, seed=0):
 
 
 def train(dataset, *overrides, gains=None, stop=None):
-    trainer = Trainer(dataset, tiny_datasets.settings(*STEPS, *overrides))
+    trainer = Trainer(dataset, tiny_datasets.settings(*tiny_datasets.EXAMINED, *STEPS, *overrides))
     if gains is not None:
         for index, view in enumerate(trainer.given_views):
             image = np.clip(np.round(view.image * gains[view.camera.name]), 0, 255).astype(np.uint8)
@@ -137,7 +137,7 @@ def test_colours_are_corrected_before_gaussians_are_placed(tiny, monkeypatch):
         ]
 
     monkeypatch.setattr(train_views, "load", recolored)
-    trainer = Trainer(dataset, tiny_datasets.settings(*STEPS))
+    trainer = Trainer(dataset, tiny_datasets.settings(*tiny_datasets.EXAMINED, *STEPS))
     assert trainer.refinement.parts == {"camera_colours"}
     names = trainer.refinement.rig.names
 
@@ -194,7 +194,7 @@ def test_cameras_are_never_examined_if_everything_is_switched_off():
     config = tiny_datasets.settings(*STEPS, *(f"needs.{part}=off" for part in PARTS))
     assert trial.steps(config) == ()
     assert trial.steps(tiny_datasets.settings("train.iterations=99")) == ()
-    assert all(0 < step < 160 for step in trial.steps(tiny_datasets.settings(*STEPS)))
+    assert all(0 < step < 160 for step in trial.steps(tiny_datasets.settings(*tiny_datasets.EXAMINED, *STEPS)))
 
 
 def test_a_part_set_on_is_refined_without_need(tiny):

@@ -272,7 +272,7 @@ def test_the_table_names_objects_that_are_divided_into_parts():
     assert after.endswith("divided into parts: arm (2); 2 of 3 objects are rigid")
 
 
-SETTINGS = ("train.iterations=300", "residual.trial_steps=400", "identity.iterations=0")
+SETTINGS = ("train.iterations=240", "residual.trial_steps=250", "identity.iterations=0")
 
 
 @pytest.fixture(scope="module")
@@ -310,7 +310,7 @@ def test_residuals_improve_the_images_of_a_breathing_object(breathing):
     data, done, _ = breathing
     bent = make(data, *SETTINGS)
     bent.restore(checkpoint.load(done.folder))
-    rigid = advance(make(data, *SETTINGS, "needs.residuals=off"), 300)
+    rigid = advance(make(data, *SETTINGS, "needs.residuals=off"), 240)
     assert error_on_the_ball(bent, data) < 0.7 * error_on_the_ball(rigid, data)
 
 
