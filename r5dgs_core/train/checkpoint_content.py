@@ -13,8 +13,8 @@ from ..model import plain_tensors
 from ..model.gaussians import PARAMETERS
 
 FORMAT_VERSION = 1
-RESIDUAL_GAINS = "residual.gains"  # name of a tensor that may contain nan (unknown gains)
-CAMERA_GAINS = "refine.gains"  # name of a tensor that may contain nan (parts that were not examined)
+RESIDUAL_GAINS = "residual.gains"  # name of a tensor
+MAY_BE_NAN = (RESIDUAL_GAINS, "refine.gains", "refine.sizes")  # names of tensors with nan for what was not examined
 FROZEN = "held"  # name of a tensor: mask of the Gaussians whose centres are frozen
 DISCOVERED_MASKS = "discovery.masks"  # name of a tensor: packed masks of the training views
 DISCOVERED_LABELS = "discovery.labels"  # name of a tensor: labels that were found after the run instead of masks

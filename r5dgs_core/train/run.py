@@ -337,8 +337,8 @@ def _save(session: _Session, *, finished: bool, extra: dict[str, torch.Tensor] |
     if checkpoint_content.DISCOVERED_LABELS in tensors:  # objects found after the run count as observed at all times
         shape = len(tensors["object_ids"]) - 1, len(trainer.times)
         state = dataclasses.replace(state, observed=torch.ones(shape, dtype=torch.bool))
-    unknown = (checkpoint_content.RESIDUAL_GAINS, checkpoint_content.CAMERA_GAINS)
-    values = {name: t for name, t in tensors.items() if t.is_floating_point() and name not in unknown}
+    may_be_nan = checkpoint_content.MAY_BE_NAN
+    values = {name: t for name, t in tensors.items() if t.is_floating_point() and name not in may_be_nan}
     bad = [name for name, tensor in values.items() if not tensor.isfinite().all()]
     if bad:
         raise TrainingError(
