@@ -10,14 +10,13 @@ darken the Gaussians.
 from collections.abc import Sequence
 from dataclasses import replace
 
-import bmesh
 import bpy
 import numpy as np
 
 from ...r5dgs_core.scene import cameras
-from ...r5dgs_core.shapes import convex_hull, depth_surface
+from ...r5dgs_core.shapes import depth_surface
 from .. import compat
-from ..scene import evaluated_points, loaded_scenes, point_clouds
+from ..scene import hull_meshes, loaded_scenes
 from ..worker import jobs
 from . import mesh_merge, render_request, view_cameras, visible_clouds
 
@@ -127,31 +126,10 @@ def remove(scene: bpy.types.Scene) -> None:
 def _add_hull(proxies: bpy.types.Collection, visible: visible_clouds.VisibleCloud) -> None:
     """Add the convex hull of a point cloud as its child, so that it follows the cloud's motion."""
     cloud = visible.object
-    corners = np.reshape(cloud.get(loaded_scenes.HULL, ()), (-1, 3)) if visible.edit is None else ()
-    if not len(corners):
-        corners = _corners(cloud)
-    built = bmesh.new()
-    try:
-        for corner in corners:
-            built.verts.new(corner)
-        if len(corners) >= 4:
-            bmesh.ops.convex_hull(built, input=built.verts)
-        if not built.faces:
-            return
-        data = bpy.data.meshes.new(f"{cloud.name} shadow proxy")
-        built.to_mesh(data)
-    finally:
-        built.free()
-    _new_proxy(proxies, data).parent = cloud
-
-
-def _corners(cloud: bpy.types.Object) -> np.ndarray:
-    """Vertices of the hull of a point cloud's current points. [V, 3]"""
-    parts = {name: point_clouds.attribute(cloud.data, *kind[:2]) for name, kind in evaluated_points.PARTS.items()}
-    if any(part is None for part in parts.values()):
-        return np.zeros((0, 3))
-    values = {name: point_clouds.read(part, *evaluated_points.PARTS[name][2:]) for name, part in parts.items()}
-    return convex_hull.vertices(values["means"], values["quats"], values["scales"], values["base"][:, 3])
+    corners = hull_meshes.corners(cloud, stored=visible.edit is None)
+    data = hull_meshes.new_mesh(f"{cloud.name} shadow proxy", corners)
+    if data is not None:
+        _new_proxy(proxies, data).parent = cloud
 
 
 def _add_surface(proxies: bpy.types.Collection, view: view_cameras.ViewCamera, arrays: dict[str, np.ndarray]) -> None:

@@ -125,8 +125,8 @@ def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Cu
         return exact
 
     def sample(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        raw, raw_slopes = _cubic(exact.rotation, at)
-        moved, moved_slopes = _cubic(exact.location, at)
+        raw, raw_slopes = cubic(exact.rotation, at)
+        moved, moved_slopes = cubic(exact.location, at)
         norm = np.linalg.norm(raw, axis=-1, keepdims=True)
         unit = raw / norm
         return unit, moved, (raw_slopes - unit * (unit * raw_slopes).sum(-1, keepdims=True)) / norm, moved_slopes
@@ -158,7 +158,7 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
         h = (t1 - t0)[:, None]
         worst = np.zeros(len(t0))
         for u in (0.2, 0.4, 0.6, 0.8):
-            truth, _ = _cubic(keys, t0 + u * (t1 - t0))
+            truth, _ = cubic(keys, t0 + u * (t1 - t0))
             # To first order, quaternions at distance e move a point at radius r by at most 2 r e.
             missed = cubic_curves.hermite(v0, v1, m0, m1, h, u) - truth
             worst = np.maximum(worst, reach * np.linalg.norm(missed, axis=-1))
@@ -167,7 +167,7 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
     return False
 
 
-def _cubic(keys: Keys, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cubic(keys: Keys, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values and slopes of the cubic between keys, at times within their range. [S] -> [S, C], [S, C]"""
     k = np.clip(np.searchsorted(keys.times, at, side="right") - 1, 0, len(keys.times) - 2)
     h = (keys.times[k + 1] - keys.times[k])[:, None]

@@ -4,7 +4,7 @@ import bpy
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import models
-from ..motion import confidence_tubes, curve_place, duplicate_delete, physics, pivot, warnings
+from ..motion import confidence_tubes, curve_place, duplicate_delete, hand_over, physics, pivot, warnings
 from ..scene import loaded_scenes, retiming
 from ..ui import status_bar
 from . import sidebar
@@ -70,6 +70,23 @@ class R5DGS_PT_retime(sidebar.WithScene, bpy.types.Panel):
         for which, text in (("SELECTED", "Retime Selected"), ("SCENE", "Retime Scene")):
             button = layout.operator_menu_enum("r5dgs.retime", "kind", text=text, icon="MOD_TIME")
             button.which = which
+
+
+class R5DGS_PT_rigid_bodies(sidebar.WithScene, bpy.types.Panel):
+    """Hand-over of the selected objects to Blender's rigid bodies."""
+
+    bl_idname = "R5DGS_PT_rigid_bodies"
+    bl_parent_id = R5DGS_PT_motion.bl_idname
+    bl_label = "Rigid Bodies"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context):
+        proxies = hand_over.proxies_of(context.scene)
+        if proxies is None:
+            self.layout.operator_menu_enum("r5dgs.hand_over", "start", icon="RIGID_BODY")
+            return
+        self.layout.label(text=f"Simulated from frame {proxies[hand_over.FRAME]} on", icon="RIGID_BODY")
+        self.layout.operator("r5dgs.bake_back", icon="KEY_HLT")
 
 
 class R5DGS_PT_all_motions(sidebar.WithScene, bpy.types.Panel):
@@ -151,4 +168,4 @@ def _scene(layout, collection) -> None:
         status_bar.wrapped(layout, bpy.context, text, "ERROR")
 
 
-CLASSES = (R5DGS_PT_motion, R5DGS_PT_change_motion, R5DGS_PT_retime, R5DGS_PT_all_motions)
+CLASSES = (R5DGS_PT_motion, R5DGS_PT_change_motion, R5DGS_PT_retime, R5DGS_PT_rigid_bodies, R5DGS_PT_all_motions)

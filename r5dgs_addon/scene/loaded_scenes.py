@@ -104,7 +104,7 @@ def origin_text(origin: np.ndarray) -> str:
 @contextlib.contextmanager
 def nothing_left_after_error() -> Iterator[None]:
     """Remove all data-blocks created in the ``with`` block if it raises."""
-    kinds = ("collections", "objects", "cameras", "pointclouds", "actions", "materials", "node_groups")
+    kinds = ("collections", "objects", "cameras", "meshes", "pointclouds", "actions", "materials", "node_groups")
     before = {kind: {data.session_uid for data in getattr(bpy.data, kind)} for kind in kinds}
     try:
         yield

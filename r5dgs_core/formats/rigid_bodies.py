@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from .. import errors
 from ..motion import rotations
+from ..motion.models import MotionModel
 from ..playback import object_poses
 from ..scene import cameras
 from ..scene.hull import Hull
@@ -106,13 +108,26 @@ def gravity(scene: Scene) -> np.ndarray:
     The earth's needs units of length and time in the scene.
     """
     turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
-    models = [group.model for group in scene.groups if group.role == "body"]
-    found = np.array([turn @ model.acceleration for model in models if model.kind in _FLIGHTS]).reshape(-1, 3)
-    found = found[-found[:, 2] > _DOWNWARD * np.maximum(np.linalg.norm(found, axis=1), 1e-300)]
-    if len(found):
-        return np.median(found, axis=0) * (scene.units.meters_per_unit or 1.0) / _time_unit(scene) ** 2
+    found = gravity_of([group.model for group in scene.groups if group.role == "body"], turn)
+    if found is not None:
+        return found * (scene.units.meters_per_unit or 1.0) / _time_unit(scene) ** 2
     known = scene.units.meters_per_unit is not None and scene.units.seconds_per_unit is not None
     return np.array([0.0, 0.0, -_EARTH if known else 0.0])
+
+
+def gravity_of(models: Iterable[MotionModel], turn: np.ndarray) -> np.ndarray | None:
+    """Return the median acceleration of the thrown bodies among some motions, z up, or None. [3]
+
+    Args:
+        models: Motions past t_max.
+        turn: Rotation from their world to one with z up. [3, 3]
+    """
+    found = np.array([turn @ model.acceleration for model in models if model.kind in _FLIGHTS]).reshape(-1, 3)
+    norms = np.linalg.norm(found, axis=1)
+    found = found[
+        (-found[:, 2] > _DOWNWARD * norms) & (norms > norms.max(initial=0.0) / 2)
+    ]  # others do not fall freely
+    return np.median(found, axis=0) if len(found) else None
 
 
 def time_step(scene: Scene) -> float:

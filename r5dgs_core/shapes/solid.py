@@ -54,13 +54,13 @@ def of(points: np.ndarray) -> Solid:
     a, b, c = np.moveaxis(corners[triangles], 1, 0)
     inward = (np.cross(b - a, c - a) * found.equations[:, :3]).sum(axis=1) < 0
     triangles[inward] = triangles[inward][:, ::-1]
-    volume, center, inertia = _mass_properties(corners[triangles])
+    volume, center, inertia = mass_properties(corners[triangles])
     if volume < 1e-9:
         raise errors.ConfigError("the points of a hull lie in a plane")
     return Solid(corners * size + middle, triangles, volume * size**3, center * size + middle, inertia * size**5)
 
 
-def _mass_properties(corners: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+def mass_properties(corners: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Volume, centre of mass and inertia about it, from tetrahedra between the origin and triangles. [T, 3, 3]"""
     volumes = np.linalg.det(corners) / 6
     volume = volumes.sum()

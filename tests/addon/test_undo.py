@@ -12,6 +12,7 @@ OPERATORS = {  # call of each; None if another module tests it
     "add_crop_box": lambda ops: ops.add_crop_box(),
     "add_shadows": None,  # engine/test_mesh_shadows.py
     "assign_gaussians": None,  # clean_up/test_clean_up.py
+    "bake_back": lambda ops: ops.bake_back(),
     "brush_gaussians": None,  # needs a window: tests/blender/check_window.py
     "delete_gaussians": None,  # clean_up/test_clean_up.py
     "delete_object": lambda ops: ops.delete_object(),
@@ -19,6 +20,7 @@ OPERATORS = {  # call of each; None if another module tests it
     "exact_mode": None,  # motion/test_exact_mode.py
     "extrapolate_until": lambda ops: ops.extrapolate_until(t_end=1.4),
     "fit_timeline": lambda ops: ops.fit_timeline(),
+    "hand_over": lambda ops: ops.hand_over(),
     "isolate": lambda ops: ops.isolate(),
     "lasso_gaussians": None,  # needs a window: tests/blender/check_window.py
     "load_scene": None,  # scene/test_load_scene.py
@@ -58,6 +60,7 @@ def _select_two(bpy):
 
 
 PREPARATIONS = {  # state in which an operator has an effect
+    "bake_back": lambda bpy: bpy.ops.r5dgs.hand_over(),
     "fit_timeline": lambda bpy: setattr(bpy.context.scene, "frame_end", 7),
     "re_extrapolate": _push,
     "remove_alias": lambda bpy: bpy.ops.r5dgs.add_alias(word="tankard"),

@@ -159,6 +159,9 @@ def test_roll_pitch_and_yaw_are_those_of_urdf(angles):
 
 def test_gravity_is_that_of_thrown_bodies_or_of_the_earth_or_unknown(thrown):
     np.testing.assert_allclose(rigid_bodies.gravity(thrown), MODEL.acceleration)
+    sliding = MotionModel("translation", velocity=[1.0, 0, 0], acceleration=[0, 0.01, -0.1])
+    mixed = (*thrown.groups, dataclasses.replace(thrown.groups[1], model=sliding))
+    np.testing.assert_allclose(rigid_bodies.gravity(dataclasses.replace(thrown, groups=mixed)), MODEL.acceleration)
     groups = tuple(dataclasses.replace(group, model=MotionModel()) for group in thrown.groups)
     still = dataclasses.replace(thrown, groups=groups)
     assert not rigid_bodies.gravity(still).any()
