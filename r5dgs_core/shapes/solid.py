@@ -9,6 +9,8 @@ import numpy as np
 from .. import errors
 
 FOOT = 0.03  # of the size: height of the lowest layer of a hull that is pressed flat
+_MOST_FOOT = 0.12
+_MARGIN = 0.02  # of the size: distance of the centre of mass from the border of the foot
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ def with_flat_foot(vertices: np.ndarray, up: np.ndarray, foot: float = FOOT) -> 
     """Press the lowest part of a hull flat, so that the body rests where it was observed to rest.
 
     The bottom of an object is seldom seen, so its hull ends in a corner, on which the body would tip over. A layer of
-    ``foot`` times the size is cut off, and the vertices within such a layer above it are moved onto the cut.
+    ``foot`` times the size is cut off, and the vertices within such a layer above it are moved onto the cut. The layer
+    grows up to `_MOST_FOOT` until the centre of mass is well above the foot.
 
     Args:
         vertices: Corners of a hull. [V, 3]
@@ -86,9 +89,27 @@ def with_flat_foot(vertices: np.ndarray, up: np.ndarray, foot: float = FOOT) -> 
     Returns:
         Points whose convex hull is the new one [V, 3], and the height of its foot along ``up``: the height of the
         plane on which this body rests.
+
+    Raises:
+        ConfigError: The hull is flat.
     """
-    heights = vertices @ up
-    layer = foot * float(np.ptp(vertices, axis=0).max())
-    floor = heights.min() + layer
-    down = np.where(heights < floor + layer, floor - heights, 0.0)
-    return vertices + down[:, None] * up, float(floor)
+    size = float(np.ptp(vertices, axis=0).max())
+    heights, flat = vertices @ up, np.linalg.svd(up[None])[2][1:]
+    while True:
+        floor = float(heights.min()) + foot * size
+        low = heights < floor + foot * size
+        pressed = vertices + np.where(low, floor - heights, 0.0)[:, None] * up
+        if foot >= _MOST_FOOT or _inside(flat @ of(pressed).center, pressed[low] @ flat.T) > _MARGIN * size:
+            return pressed, floor
+        foot *= 1.25
+
+
+def _inside(point: np.ndarray, corners: np.ndarray) -> float:
+    """Distance of a point [2] from the border of a convex polygon with corners [V, 2]; negative outside."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        sides = ConvexHull(corners).equations
+    except (QhullError, ValueError):  # fewer than three corners
+        return -np.inf
+    return float(-(sides[:, :2] @ point + sides[:, 2]).max())

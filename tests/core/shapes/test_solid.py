@@ -46,3 +46,17 @@ def test_a_flat_foot_stands_on_three_corners_or_more():
     moved = np.abs(heights - vertices @ up)
     assert moved.max() < 0.07 * np.ptp(vertices, axis=0).max()
     np.testing.assert_allclose(np.cross(pressed - vertices, up), 0, atol=1e-9)
+
+
+def test_the_foot_grows_until_the_body_stands():
+    rng, up = np.random.default_rng(2), np.array([0.0, 0, 1])
+    towards = rng.normal(size=(200, 3))
+    vertices = towards / np.linalg.norm(towards, axis=1, keepdims=True) * [1, 1, 0.6]  # an egg on its belly
+    vertices[:, 0] += 2 * vertices[:, 2]  # leaning over
+    pressed, floor = solid.with_flat_foot(vertices, up, foot=0.005)
+    body = solid.of(pressed)
+    foot = body.vertices[np.abs(body.vertices[:, 2] - floor) < 1e-9, :2]
+    for angle in np.linspace(0, 2 * np.pi, 64):
+        side = np.array([np.cos(angle), np.sin(angle)])
+        assert (foot @ side).max() > body.center[:2] @ side
+    assert len(foot) >= 3
