@@ -27,6 +27,7 @@ from r5dgs_core.cli import live_run
 ROOT = Path(__file__).resolve().parents[1]
 LOG_EVERY = 5  # steps between two reports
 NEVER = 10_000_000  # steps
+WARM = 100  # steps before the first period
 
 
 class Training:
@@ -47,11 +48,7 @@ class Training:
         for line in self.process.stdout:
             event = json.loads(line)
             if event["event"] == "step":
-                self.step, self.seconds = event["iteration"], self._processor_seconds()
-
-    def _processor_seconds(self) -> float:
-        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-        return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+                self.step, self.seconds = event["iteration"], event["cpu_seconds"]
 
     def period(self, seconds: float) -> float:
         """Processor milliseconds per step of the next period."""
@@ -94,7 +91,7 @@ def measure(data: Path, pairs: int, seconds: float, threads: int) -> list[dict[s
         folder.mkdir()
         training = Training(data, run, threads)
         try:
-            while not (run / live_run.CHECKPOINT).exists():
+            while training.step < WARM or not (run / live_run.CHECKPOINT).exists():
                 time.sleep(1.0)
                 if training.process.poll() is not None:
                     raise SystemExit("the training has ended")
