@@ -2,6 +2,8 @@
 
     python -m benchmarks.cameras COMMAND [OPTIONS]
 
+    board   a real capture: poses of a ChArUco board that a person carries
+    dirty   from videos to a scene: wrong cameras against exact ones
     jitter  quality with wrong poses and colours, refined or not
 
 Results: docs/results/captures.md.

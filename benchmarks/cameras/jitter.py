@@ -57,7 +57,7 @@ def measure(data: Path, pixels: float, gain: float, settings: config.Config, see
     now = {name: corrections[name].camera(camera) if corrections else camera for name, camera in wrong.items()}
     before, after = disturbed.distance(wrong, given), disturbed.distance(now, given)
     row = {"pixels": pixels, "gain": gain, "seed": seed, "refined": record.get("refined", []), "cpu_seconds": seconds}
-    row |= {"gains_db": record.get("gains_db"), "error_before": before[1], "error": after[1], "error_raw": after[0]}
+    row |= {"sizes": record.get("sizes"), "error_before": before[1], "error": after[1], "error_raw": after[0]}
     for split, modes in found.items():
         row |= {split: modes["rigid"]["psnr"], f"{split}_aligned": aligned[split]["rigid"]["psnr_aligned"]}
     return row

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from r5dgs_core.capture.calibration.lens import Lens
 from r5dgs_core.scene.cameras import Camera
 
 SUPERSAMPLES = 2  # per side of a pixel
@@ -110,11 +111,26 @@ def floor(rng: np.random.Generator) -> Texture:
     return lambda p: colors[tree.query(p[:, :2])[1]]
 
 
-def render(camera: Camera, solids: Sequence[Solid], ground: Texture) -> tuple[np.ndarray, np.ndarray]:
-    """Render an image, sRGB in [0, 1] [H, W, 3], and its object ids, by vote of the samples of a pixel [H, W]."""
+def render(
+    camera: Camera, solids: Sequence[Solid], ground: Texture, lens: Lens | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Render an image.
+
+    Args:
+        camera: The camera.
+        solids: The solids.
+        ground: Texture of the floor.
+        lens: Lens of the camera; that of its camera matrix if None.
+
+    Returns:
+        The image, sRGB in [0, 1] [H, W, 3], and its object ids, by vote of the samples of a pixel [H, W].
+    """
     fine, k = (camera.height * SUPERSAMPLES, camera.width * SUPERSAMPLES), camera.intrinsics
     v, u = ((np.indices(fine) + 0.5) / SUPERSAMPLES).reshape(2, -1)
-    ways = np.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones_like(u)], -1)
+    if lens is None:
+        ways = np.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones_like(u)], -1)
+    else:
+        ways = lens.unproject(np.stack([u, v], -1))
     ways = ways / np.linalg.norm(ways, axis=1, keepdims=True) @ camera.T_cam_world[:3, :3]
     start = np.broadcast_to(camera.center, ways.shape)
     depth, hit = _nearest(start, ways, solids)

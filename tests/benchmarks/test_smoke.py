@@ -21,6 +21,10 @@ PROGRAMS = {
     "association.synthetic": ("--scenes=two", "--cases=A", "--errors=0.7", "--models=drift", "--seeds=1"),
     "association.large_scene": ("--gaussians", "900", "--objects", "3", "--images", "20", "--pixels", "24"),
     "raster.static_layer": ("--workloads", "train", "--moving", "0,1", *ONCE),
+    "cameras.dirty": (
+        *("--size=48", "--cameras=4", "--frames=4", "--scenes=balls", "--rows", "dirty", *SHORT),
+        *("--set", "train.iterations=10"),
+    ),
     "extrapolation.modes": ("{run}",),
     "raster.first_frame": ("--count", "200", "--size", "32", "--degrees", "0,0", "--repeats", "1"),
     "raster.frames": ("--count", "200", "--size", "32", "--frames", "3", "--degrees", "1,2", "--threads", "1"),
@@ -43,6 +47,7 @@ PROGRAMS = {
 LONG = (  # more than five seconds each
     "association.large_scene",
     "association.synthetic",
+    "cameras.dirty",
     "extrapolation.appearance",
     "extrapolation.modes",
     "futures.textures",

@@ -1,0 +1,205 @@
+"""A real capture: a ChArUco board that a person carries through a room, from the videos to its poses.
+
+    python -m benchmarks.cameras board FOLDER [--masks corners|none] [--without-camera NAME] [--lines 360]
+        [--set KEY=VALUE] [--keep FOLDER] [--json FILE]
+
+FOLDER is a session of caliscope with videos, ``camera_array.toml`` and the board's corners
+(``mprib/caliscope``, ``tests/sessions/post_optimization``). The videos are prepared with every eighth moment held out.
+With ``--masks corners``, the masks are the board's rectangle, from its corners in the world; views in which fewer than
+four corners were found are unknown there. The true poses of the board are those of its corners. One constant rigid
+offset between the trained group and the board is fitted over the clip, and nothing else. Results:
+docs/results/captures.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from r5dgs_core.bake import bake
+from r5dgs_core.cli.commands import prepare
+from r5dgs_core.config import config
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.data import images, masks
+from r5dgs_core.evaluation import evaluate, ground_truth_poses, metrics
+from r5dgs_core.prepare.plan import Plan
+from r5dgs_core.render import warm_up
+from r5dgs_core.scene.scene import Scene
+from r5dgs_core.train import run
+
+RECORDING = Path("calibration") / "extrinsic"
+CORNERS = RECORDING / "CHARUCO"
+LEAST = 4  # corners of a view with a mask, and of a posed board
+EDGE = 20  # points per side of the rectangle, which the lens bends
+
+
+class Board:
+    """The board's true poses, and its corners in the images.
+
+    Args:
+        folder: The session.
+
+    Attributes:
+        moments: Numbers of the moments, increasing. [T]
+        poses: Board to world; the identity if it is unknown. [T, 4, 4]
+        posed: True if the pose is known. [T] bool
+        outline: Corners of the printed rectangle, board axes, m. [4, 3]
+    """
+
+    def __init__(self, folder: Path):
+        own, world = {}, defaultdict(dict)
+        self._found: dict[tuple[int, int], int] = defaultdict(int)
+        for row in _rows(folder / CORNERS / "xy_CHARUCO.csv"):
+            own[int(row["keypoint_id"])] = [float(row[f"obj_loc_{axis}"]) for axis in "xyz"]
+            self._found[int(row["sync_index"]), int(row["cam_id"])] += 1
+        for row in _rows(folder / CORNERS / "xyz_CHARUCO.csv"):
+            place = [float(row[f"{axis}_coord"]) for axis in "xyz"]
+            world[int(row["sync_index"])][int(row["keypoint_id"])] = place
+        self._times = defaultdict(list)
+        for row in _rows(folder / RECORDING / "timestamps.csv"):
+            self._times[int(row["sync_index"])].append(float(row["frame_time"]))
+        self.moments = np.array(sorted(self._times))
+        self.poses, self.posed = np.tile(np.eye(4), (len(self.moments), 1, 1)), np.zeros(len(self.moments), bool)
+        for row, moment in enumerate(self.moments):
+            ids = sorted(world[moment])
+            if len(ids) >= LEAST:
+                self.poses[row], self.posed[row] = _rigid([own[k] for k in ids], [world[moment][k] for k in ids]), True
+        every = np.array(list(own.values()))
+        side = every[:, 0].min()
+        width, height = every[:, :2].max(0) + side
+        self.outline = np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0]])
+
+    def times(self, zero: float, unit: float) -> np.ndarray:
+        """Return the scene times of the moments, the means of the cameras' times. [T]
+
+        Args:
+            zero: Time of scene time 0, s from the first frame of all.
+            unit: Seconds per unit of scene time.
+        """
+        times = np.array([np.mean(self._times[moment]) for moment in self.moments])
+        return (times - min(min(found) for found in self._times.values()) - zero) / unit
+
+    def mask(self, row: int, camera: int, plan: Plan, number: int) -> np.ndarray:
+        """Return the ids of a frame. [H, W] uint16"""
+        one = plan.cameras[number]
+        ids = np.zeros((one.source.height, one.source.width), np.uint16)
+        if not self.posed[row]:
+            return ids
+        share = np.arange(EDGE)[:, None] / EDGE
+        ring = [a + share * (b - a) for a, b in zip(self.outline, np.roll(self.outline, -1, 0), strict=True)]
+        points = np.concatenate(ring) @ self.poses[row, :3, :3].T + self.poses[row, :3, 3]
+        inside = np.linalg.inv(one.pose(0))
+        pixels = one.lens(0).project(points @ inside[:3, :3].T + inside[:3, 3])
+        if np.isfinite(pixels).all():
+            known = self._found[int(self.moments[row]), camera] >= LEAST
+            corners = np.round((pixels - 0.5) * 16).astype(np.int32)
+            cv2.fillPoly(ids, [corners], 1 if known else masks.UNKNOWN, shift=4)
+        return ids
+
+
+def _rigid(before: list[list[float]], after: list[list[float]]) -> np.ndarray:
+    """Return the rigid motion that moves points to others best. [N][3] each -> [4, 4]"""
+    a, b = np.array(before), np.array(after)
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.align_vectors(b - b.mean(0), a - a.mean(0))[0].as_matrix()
+    matrix[:3, 3] = b.mean(0) - matrix[:3, :3] @ a.mean(0)
+    return matrix
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def prepared(folder: Path, out: Path, with_masks: bool, without: str | None, lines: int) -> Plan:
+    """Prepare the videos, with masks from the corners if wanted, and add the true poses."""
+    source, calibration = folder / RECORDING, folder / "camera_array.toml"
+    hold_out: dict[str, Any] = {"every": 8, "cameras": () if without is None else (without,)}
+    fields = {"calibration": calibration, "lines": lines, "hold_out": hold_out}
+    plan = prepare.run_prepare(source, out, **fields)
+    board = Board(folder)
+    if with_masks:
+        with tempfile.TemporaryDirectory() as room:
+            for number, camera in enumerate(plan.cameras):
+                for row in range(len(board.moments)):
+                    ids = board.mask(row, int(camera.name.rpartition("_")[2]), plan, number)
+                    images.write_png(Path(room) / camera.name / f"{row:06d}.png", ids)
+            (Path(room) / "objects.json").write_text(json.dumps({"1": "board"}))
+            plan = prepare.run_prepare(source, out, masks=room, **fields)
+    times = board.times(min(times[0] for times in plan.choice.times), plan.timeline.seconds_per_unit)
+    used = board.posed & (times >= 0)
+    row = {"id": 1, "name": "board", "matrices": board.poses[used].tolist()}
+    truth = {"t_max": plan.timeline.t_max, "times": times[used].tolist(), "objects": [row]}
+    (out / "ground_truth.json").write_text(json.dumps(truth))
+    return plan
+
+
+def pose_errors(scene: Scene, dataset: datasets.Dataset) -> dict[str, float]:
+    """Return errors of the board's poses at the observed times, mm and degrees; empty if no group is the board."""
+    assert dataset.ground_truth is not None
+    found = ground_truth_poses.bodies(scene, dataset.ground_truth)
+    if not found:
+        return {}
+    body = found[0]
+    predicted = ground_truth_poses.motion(scene, [body.group], body.times)[0]
+    seen = body.times <= scene.t_max + 1e-9
+    places, turns = metrics.pose_errors(predicted[seen], body.motion[seen], body.group.pivot)
+    return {
+        "mm": float(1e3 * np.median(places)),
+        "mm_worst": float(1e3 * places.max()),
+        "degrees": float(np.median(turns)),
+        "degrees_worst": float(turns.max()),
+        "mm_each": (1e3 * places).round(2).tolist(),
+        "degrees_each": turns.round(2).tolist(),
+    }
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--masks", choices=("corners", "none"), default="corners")
+    parser.add_argument("--without-camera", metavar="NAME")
+    parser.add_argument("--lines", type=int, default=360)
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument("--keep", type=Path, help="keep the data set and the run in this folder")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    warm_up.warm_up()
+    with tempfile.TemporaryDirectory() as folder:
+        room = args.keep or Path(folder)
+        prepared(args.folder, room / "data", args.masks == "corners", args.without_camera, args.lines)
+        began = time.process_time()
+        trained = run.train(room / "data", room / "run", config.load(None, args.set), overwrite=True)
+        seconds = time.process_time() - began
+        scene = bake.bake(trained)
+        dataset = datasets.read(room / "data")
+        result = evaluate.evaluate(scene, dataset, splits=("val",), align=True)
+    val, record = result["splits"]["val"]["rigid"], scene.provenance.get("cameras", {})
+    row = {
+        "val": val["psnr"],
+        "val_aligned": val["psnr_aligned"],
+        "val_objects": val["psnr_objects"],
+        "cpu_seconds": seconds,
+        "gaussians": len(scene.gaussians.means),
+        "refined": record.get("refined"),
+        "sizes": record.get("sizes"),
+        **pose_errors(scene, dataset),
+    }
+    print("\n".join(f"{name:>14} {value}" for name, value in row.items()))
+    if args.json:
+        args.json.write_text(json.dumps(row, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
