@@ -9,14 +9,14 @@ import contextlib
 import decimal
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import Any
 
 import numpy as np
 
-from ..motion import models, point_dynamics, rotations
+from ..motion import knots, models, point_dynamics, rotations
 
 MAX_SECONDS = 10.0  # of processor time, for a case to pass
 RADIUS = 0.3
@@ -166,9 +166,21 @@ def world_twist(twist: Twist) -> models.MotionModel:
 
 
 def model_of(kind: str, **rates: Any) -> models.MotionModel:
-    """Return a motion model of any kind; a top gets three different moments of inertia."""
-    inertia = np.diag([0.4, 0.8, 1.0]) if models.KINDS[kind].needs_inertia else None
-    return models.MotionModel(kind, radius=RADIUS, inertia=inertia, **rates)
+    """Return a motion model of any kind; a top gets three different moments of inertia, a trajectory two knots."""
+    needs = models.KINDS[kind]
+    inertia = np.diag([0.4, 0.8, 1.0]) if needs.needs_inertia else None
+    path = _path(rates) if needs.needs_knots else None
+    return models.MotionModel(kind, radius=RADIUS, inertia=inertia, knots=path, **rates)
+
+
+def _path(rates: Mapping[str, Any]) -> np.ndarray:
+    """Return the knots of a body with constant rates, of which one is after a unit of time."""
+    velocities, spins = (
+        np.tile(np.asarray(rates.get(name, np.zeros(3)), float), (2, 1)) for name in ("velocity", "angular_velocity")
+    )
+    times = np.array([0.0, 1.0])
+    poses = rotations.rotvecs_to_quats(times[:, None] * spins), times[:, None] * velocities
+    return knots.pack(times, poses, (velocities, velocities), (spins, spins))
 
 
 def rk2_points(twist: Twist, duration: float, points: np.ndarray, steps: int) -> np.ndarray:

@@ -122,7 +122,7 @@ def test_it_plays_and_loops_unless_motion_is_reduced(browser, url):
 
 def test_keys_and_clicks_control_it(browser, scene, url):
     camera = scene.cameras[0]
-    browser.open(f"{url}?t=0&camera=0", 640, 480)
+    browser.open(f"{url}?t=0&camera=0", 960, 720)
     browser.send(key="End")
     assert browser.eval("r5dgs.t") == END and browser.eval("document.body.classList.contains('future')")
     browser.send(key="ArrowLeft")
@@ -138,7 +138,7 @@ def test_keys_and_clicks_control_it(browser, scene, url):
     browser.send(key="Escape")
     assert browser.eval("[r5dgs.isolated, r5dgs.chosen]") == [None, None]
     browser.send(key="Home")
-    x, y = browser.eval("""(() => { for (let y = 60; y < 380; y += 4) for (let x = 20; x < 440; x += 4)
+    x, y = browser.eval("""(() => { for (let y = 100; y < 560; y += 4) for (let x = 20; x < 660; x += 4)
         if (r5dgs.pick(x, y) === 2) return [x, y]; })()""")
     browser.send(click=[x, y])
     assert browser.eval("r5dgs.chosen") == 2 and camera.width > 0

@@ -26,7 +26,7 @@ from tests.support import lpips_weights, tiny_datasets
 
 pytestmark = pytest.mark.heavy
 
-OVERRIDES = (*tiny_datasets.SETTINGS, "train.iterations=20", "identity.iterations=5")
+OVERRIDES = (*tiny_datasets.SETTINGS, "train.iterations=20", "train.log_every=1", "identity.iterations=5")
 
 
 def plan_for(tiny, out, **changes):
