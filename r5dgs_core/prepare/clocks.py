@@ -136,17 +136,23 @@ def _moving_regions(
 
 
 def _significant(sources: Sequence[CameraSource], found: Sequence[Offset]) -> tuple[list[Offset], list[str]]:
-    """Replace all offsets by 0 if none is significant; returns them, and a remark for each that was not measured."""
+    """Replace all offsets by 0 if none is significant; returns them, and a remark for each that was not measured.
+
+    Cameras that were not measured get the median of the others, as the first camera may be far from it.
+    """
+    pairs = list(zip(sources, found, strict=True))
+    measured = [one for source, one in pairs if one.sigma is not None and one.sigma <= UNSURE * source.interval]
+    used = any(one.sigma and abs(one.seconds) >= SIGNIFICANT * one.sigma for one in measured)
+    usual = float(np.median([one.seconds for one in measured])) if used else 0.0
     result, notes = [], []
-    for source, one in zip(sources, found, strict=True):
-        if one.sigma is None or one.sigma > UNSURE * source.interval:
-            notes.append(f"{source.name}: its clock could not be compared with the others; offset 0 is used")
-            result.append(Offset(0.0, None, "none"))
+    for source, one in pairs:
+        if one in measured:
+            result.append(one if used else Offset(0.0, one.sigma, one.method))
         else:
-            result.append(one)
-    if any(one.sigma and abs(one.seconds) >= SIGNIFICANT * one.sigma for one in result):
-        return result, notes
-    return [Offset(0.0, one.sigma, one.method) for one in result], notes
+            result.append(Offset(usual, None, "none"))
+            text = f"{source.name}: its clock could not be compared with the others; "
+            notes.append(text + (f"their median {1e3 * usual:+.1f} ms is used" if usual else "offset 0 is used"))
+    return result, notes
 
 
 def _distances(cameras: Sequence[CalibratedCamera], meters_per_unit: float | None) -> np.ndarray | None:

@@ -162,6 +162,17 @@ def test_objects_are_compared_with_themselves():
     np.testing.assert_allclose([one.seconds for one in found], shifts, atol=5e-4)
 
 
+def test_a_camera_that_cannot_be_compared_gets_the_median_of_the_others():
+    sources = [SimpleNamespace(name=f"cam{k}", interval=1 / 30) for k in range(4)]
+    found = [clock.Offset(seconds, sigma, "motion") for seconds, sigma in ((0, 0.0), (0.01, 1e-3), (0.012, 1e-3))]
+    result, notes = clocks._significant(sources, [*found, clock.Offset(0.0, None, "none")])
+    assert result[:3] == found and result[3] == clock.Offset(0.01, None, "none")
+    assert notes == ["cam3: its clock could not be compared with the others; their median +10.0 ms is used"]
+    small = [clock.Offset(one.seconds / 10, one.sigma, "motion") for one in found]
+    result, notes = clocks._significant(sources, [*small, clock.Offset(0.0, None, "none")])
+    assert [one.seconds for one in result] == [0.0] * 4 and "offset 0 is used" in notes[0]
+
+
 def test_steady_motion_gives_no_offset():
     rig, times, rng = recordings.make_rig(3, 320, 240), np.arange(40) / 30, np.random.default_rng(0)
     paths = {1: lambda t: np.array([0.5 * t, 0.3 * t, 0.2])}
