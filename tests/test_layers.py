@@ -55,7 +55,6 @@ ALLOWED = {
     "scene": {"motion"},
     "color": {"scene"},
     "shapes": {"motion", "scene"},
-    "contact": {"motion", "shapes"},
     "data": {"motion", "scene", "color"},
     "raster": {"motion", "scene"},
     "search": {"scene"},
@@ -67,6 +66,7 @@ ALLOWED = {
     "protocol": {"scene", "search"},
     "model": {"motion", "scene"},
     "render": {"motion", "scene", "raster", "playback"},
+    "contact": {"motion", "scene", "shapes", "playback", "render"},
     "importing": {"motion", "scene", "data", "formats", "model"},
     "evaluation": {"motion", "terminal", "scene", "data", "playback", "render"},
     "film": {"motion", "scene", "data", "color", "formats", "raster", "playback", "render"},
@@ -74,7 +74,7 @@ ALLOWED = {
     "train": {"motion", "motion_fit", "scene", "data", "raster", "config", "model", "render"},
     "masks": {"data", "language"},
     "worker": {"scene", "raster", "playback", "formats", "editing", "protocol", "render", "language"},
-    "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train", "shapes"},
+    "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train", "shapes", "contact"},
     "prepare": {"color", "motion", "scene", "data", "capture", "masks"},
     "check": {"motion", "terminal", "scene", "color", "data", "formats", "config", "train", "prepare"},
     "stability": {"motion", "motion_fit", "scene", "data", "raster", "config", "playback", "render", "train"},
@@ -113,6 +113,7 @@ ALLOWED = {
         "train",
         "masks",
         "prepare",
+        "contact",
         "bake",
         "check",
         "stability",
@@ -124,7 +125,7 @@ ALLOWED = {
 # Commands that import numpy or torch.
 COMMANDS = (
     *("associate", "bake", "bench", "demo", "evaluate", "export", "import_run", "info", "lookup", "masks", "name"),
-    *("objects", "prepare", "query", "render", "report", "train", "view", "warm_up"),
+    *("extrapolate", "objects", "prepare", "query", "render", "report", "train", "view", "warm_up"),
 )
 # Modules that may import modules of the project inside functions: the command line and the public functions, which
 # start fast, and the worker, which answers before torch is there and if it is missing.

@@ -13,10 +13,10 @@ from ..errors import CheckpointError
 from ..scene import scene_file
 from ..scene.scene import Scene
 from ..train import run_folder
-from . import assemble, hulls, needs, parts, point_motion, provenance, read_checkpoint, simplify_motion
+from . import assemble, contact, hulls, needs, parts, point_motion, provenance, read_checkpoint, simplify_motion
 from .draft import Stage
 
-STAGES: tuple[Stage, ...] = (point_motion, simplify_motion, parts, needs, hulls, provenance)
+STAGES: tuple[Stage, ...] = (point_motion, simplify_motion, parts, hulls, contact, needs, provenance)
 
 
 def bake(run: run_folder.Run, dataset: Dataset | None = None) -> Scene:

@@ -13,9 +13,8 @@ from ..motion_fit import noise as noises
 from ..scene import visibility
 from ..scene.scene import Scene
 from ..scene.splats import to_opacities
+from ..scene.world_axes import UP_AXIS
 from . import pose_errors
-
-UP_AXIS = {"blender": np.array([0.0, 0.0, 1.0]), "opengl": np.array([0.0, 1.0, 0.0])}
 
 
 def share_gravity(

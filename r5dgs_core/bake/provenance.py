@@ -16,8 +16,11 @@ from .draft import Context, Draft
 def apply(draft: Draft, context: Context) -> Draft:
     """Write the provenance of the scene."""
     state, moves = context.state, draft.observed.motion.moves
+    config = context.config.to_dict()
+    if config["needs"]["contact"] == "auto":  # so that scenes without contacts stay the same, byte for byte
+        del config["needs"]["contact"]
     record: dict[str, Any] = {
-        "config": context.config.to_dict(),
+        "config": config,
         "dataset_digest": context.run.digest,
         "versions": context.run.versions,
         "discovered": context.discovered,

@@ -10,7 +10,20 @@ from .exit_status import ExitStatus
 
 MODULES = (  # modules of `commands`
     *("demo", "prepare", "train", "masks", "associate", "bake", "import_run", "evaluate", "report", "bench"),
-    *("export", "render", "view", "info", "check", "objects", "lookup", "query", "name", "config", "warm_up"),
+    *(
+        "extrapolate",
+        "export",
+        "render",
+        "view",
+        "info",
+        "check",
+        "objects",
+        "lookup",
+        "query",
+        "name",
+        "config",
+        "warm_up",
+    ),
 )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..motion import rotations
 from .identify import PARAMETERS, Estimate, Fitter
+from .world import Material, State
 
 WIDENED = 2.0  # factor on the standard deviations of a fit, read off tosses of a cube
 _FACE = np.pi / 4  # angle to the most central future beyond which a body lies on another face
@@ -40,6 +41,12 @@ class Futures:
         last = self.quats[-1]
         apart = rotations.angle_between(last[:, None], last[None])
         return float((apart[np.argmin(np.median(apart, axis=1))] > _FACE).mean())
+
+
+def draw(fitter: Fitter, estimate: Estimate, rng: np.random.Generator) -> tuple[State, Material]:
+    """State and material drawn from an estimate, whose standard deviations are multiplied by `WIDENED`."""
+    x = WIDENED * np.linalg.cholesky(estimate.covariance) @ rng.normal(size=PARAMETERS)
+    return fitter.moved(estimate.state, estimate.material, x)
 
 
 def sample(

@@ -28,6 +28,7 @@ class NeedsSection:
         focal_lengths: Refinement of their focal lengths.
         time_offsets: Refinement of the offsets of their clocks.
         camera_colours: Refinement of the gain and offset of their colours.
+        contact: Contacts between bodies past t_max; needs the extra "contact".
     """
 
     tracks: str = "auto"
@@ -43,3 +44,4 @@ class NeedsSection:
     focal_lengths: str = "auto"
     time_offsets: str = "auto"
     camera_colours: str = "auto"
+    contact: str = "auto"

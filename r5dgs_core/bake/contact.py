@@ -1,0 +1,58 @@
+"""Stage of baking: motions past t_max with contacts, for bodies whose smooth motion passes through something."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+from ..contact import scene_future
+from ..contact.scene_future import Prediction
+from ..errors import BackendError
+from ..scene.scene import MotionGroup
+from .draft import Context, Draft, Need
+
+NAME = "contact"
+log = logging.getLogger(__name__)
+
+
+def apply(draft: Draft, context: Context) -> Draft:
+    """Replace the motion of bodies that touch others past t_max, and list them in the needs table."""
+    if context.wanted.contact == "off":
+        return draft
+    try:
+        found = scene_future.predict(draft.scene)
+    except BackendError as error:
+        log.warning("a predicted motion passes through another body or the ground; %s", error)
+        return draft
+    for line in found.lines:
+        log.warning("%s", line)
+    scene = dataclasses.replace(draft.scene, groups=found.groups)
+    return dataclasses.replace(draft, scene=scene, parts=(*draft.parts, *_rows(found)))
+
+
+def without(groups: Sequence[MotionGroup]) -> tuple[MotionGroup, ...]:
+    """Return the groups with their smooth motions. The band of a motion with contacts is left out."""
+    return tuple(group if group.smooth is None else _smoothed(group) for group in groups)
+
+
+def needs(rows: Sequence[dict[str, Any]], found: Prediction) -> tuple[dict[str, Any], ...]:
+    """Return the rows of a needs table with those of a new prediction."""
+    return (*(row for row in rows if row.get("name") != NAME), *_rows(found))
+
+
+def _smoothed(group: MotionGroup) -> MotionGroup:
+    assert group.smooth is not None
+    history = dataclasses.replace(group.history, band=None)
+    return dataclasses.replace(group, model=group.smooth, smooth=None, history=history)
+
+
+def _rows(found: Prediction) -> list[dict[str, Any]]:
+    rows = []
+    for name, material in found.taken.items():
+        depth = found.penetrations.get(name, 0.0)
+        reason = "without contacts, it passes into others, in sizes" if depth else "is pushed or hit by another body"
+        row = Need(NAME, depth, scene_future.PENETRATION, True, f"{reason}; {material}").row()
+        rows.append({"object": name, **row})
+    return rows

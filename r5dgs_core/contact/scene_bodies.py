@@ -1,0 +1,116 @@
+"""Bodies of a scene: shapes from their hulls, observed poses, and gravity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import errors
+from ..motion import models, rotations
+from ..scene import world_axes
+from ..scene.scene import MotionGroup, Scene
+from ..shapes import solid
+from .identify import Track
+
+STANDARD_GRAVITY = 9.81  # m/s^2
+_VERTICAL = 0.35  # largest angle between an acceleration and gravity of a body that falls, rad
+_PLACE_NOISE, _TURN_NOISE = 0.003, 0.004  # of poses without known errors: in sizes, and rad
+_FREE = ("translation", "ballistic_spin", "free_top", "drag", "bounce", "friction")
+
+
+@dataclass(frozen=True)
+class SceneBody:
+    """A body of a scene.
+
+    Attributes:
+        group: Its motion group; group 0 for an object that is part of the background's motion.
+        name: Name of its object.
+        solid: Its shape in the bind state.
+        moves: True if it moved in the observed time.
+        reason: Why its motion is not that of a free body, or "".
+    """
+
+    group: MotionGroup
+    name: str
+    solid: solid.Solid
+    moves: bool
+    reason: str
+
+    @property
+    def smooth(self) -> models.MotionModel:
+        """Its motion past t_max without contacts."""
+        return self.group.smooth or self.group.model
+
+
+def of(scene: Scene) -> tuple[list[SceneBody], list[str]]:
+    """Return the bodies of a scene whose hulls are sound, and a line about each of the others."""
+    names = {item.id: item.name for item in scene.objects}
+    found, lines = [], []
+    for hull in scene.hulls:
+        group, name = scene.groups[hull.motion_id], names[hull.object_id]
+        try:
+            shape = solid.of(hull.vertices)
+        except errors.ConfigError as error:
+            lines.append(f"{name}: has no contacts: {error}")
+            continue
+        moves = bool(group.id and np.any(scene.tracks.poses[group.id, :, 1:] != 0))
+        found.append(SceneBody(group, name, shape, moves, _reason(scene, group) if moves else ""))
+    return found, lines
+
+
+def gravity(scene: Scene, bodies: list[SceneBody]) -> np.ndarray | None:
+    """Return the acceleration of falling bodies, or None if it is unknown: no up axis, no fall and no units. [3]"""
+    up = world_axes.UP_AXIS.get(scene.world_convention)
+    if up is None:
+        return None
+    fallen = [float(-body.smooth.acceleration @ up) for body in bodies if _falls(body.smooth, up)]
+    if fallen:
+        return -float(np.median(fallen)) * up
+    seconds, meters = scene.units.seconds_per_unit, scene.units.meters_per_unit
+    if seconds is None or meters is None:
+        return None
+    return -STANDARD_GRAVITY * seconds**2 / meters * up
+
+
+def track(scene: Scene, body: SceneBody) -> Track:
+    """Return the observed poses of a body since it last set off, with their errors."""
+    group, times = body.group, scene.tracks.times
+    poses, center, size = scene.tracks.poses[group.id], body.solid.center, body.solid.size
+    arms = rotations.rotate(poses[:, :4], np.broadcast_to(center - group.pivot, (len(times), 3)))
+    place, turn = np.full(len(times), _PLACE_NOISE * size), np.full(len(times), _TURN_NOISE)
+    known = group.history.errors
+    if known is not None:
+        place, turn = np.maximum(place, known.place), np.maximum(turn, known.turn)
+    begins = [event.time for event in group.history.events if event.kind in ("start", "change")]
+    rows = np.isfinite(place) & (times > max(begins, default=-np.inf))
+    if group.seen is not None:
+        rows &= (times >= group.seen[0] - 1e-9) & (times <= group.seen[1] + 1e-9)
+    places = group.pivot + poses[:, 4:] + arms
+    return Track(times[rows], poses[rows, :4], places[rows], place[rows], turn[rows])
+
+
+def predicted(body: SceneBody, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations [T, 4] and centres of mass [T, 3] of a body's smooth motion at times since t_max."""
+    quats, moved = models.evaluate(body.smooth, tau)
+    arms = rotations.rotate(quats, np.broadcast_to(body.solid.center - body.group.pivot, moved.shape))
+    return quats, body.group.pivot + moved + arms
+
+
+def _falls(model: models.MotionModel, up: np.ndarray) -> bool:
+    a, length = model.acceleration, float(np.linalg.norm(model.acceleration))
+    falling = model.kind in ("translation", "ballistic_spin", "free_top", "bounce") and not model.frequency
+    return falling and length > 0 and float(-a @ up) > np.cos(_VERTICAL) * length
+
+
+def _reason(scene: Scene, group: MotionGroup) -> str:
+    """Return why a body is driven, such as by a hand, a motor or a string, or ""."""
+    model, up = group.smooth or group.model, world_axes.UP_AXIS.get(scene.world_convention)
+    if group.joint is not None or group.parent is not None or group.follows is not None:
+        return "it is a part of another body"
+    if model.kind not in _FREE or model.frequency > 0 or model.angular_acceleration.any() and model.center_offset.any():
+        return f"its motion is that of a driven body ({models.KINDS[model.kind].word})"
+    free = ("translation", "ballistic_spin", "free_top")
+    if model.kind in free and model.acceleration.any() and up is not None and not _falls(model, up):
+        return "it accelerates otherwise than by gravity"
+    return ""

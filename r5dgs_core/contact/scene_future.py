@@ -1,0 +1,213 @@
+"""Motion of a scene's bodies past t_max with contacts, where the smooth motion would pass through something."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..motion import history, rotations, se3
+from ..scene import predictability, world_axes
+from ..scene.scene import MotionGroup, Scene
+from . import futures, path_knots, recording, scene_bodies, scene_world, world
+from .recording import Recording
+from .scene_bodies import SceneBody
+from .scene_world import Wishes
+from .simulation import Simulation
+
+PENETRATION = 0.02  # of the size, by which a smooth motion passes through something before contacts are tried
+BAND_LEVEL = 0.95
+KNOTS = 16  # of a band
+UNPREDICTABLE = 0.35  # half width of a band, in sizes, beyond which a motion is not predictable
+_BEYOND = 4.0  # time that is simulated if the bodies do not come to rest, over the time to the horizon
+_TIMES = 64  # at which smooth motions are tested
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Result of `predict`.
+
+    Attributes:
+        groups: The scene's groups, those of bodies in contact with new motions.
+        penetrations: Penetration of the smooth motion, in sizes, of each body that would pass through something.
+        taken: Names of the bodies that got a motion with contacts, with their material in words.
+        lines: Reasons why others did not, one sentence each.
+        bodies: The simulated bodies.
+        sampled: Their sampled futures, by number.
+        recording: The most likely future.
+    """
+
+    groups: tuple[MotionGroup, ...]
+    penetrations: Mapping[str, float]
+    taken: Mapping[str, str]
+    lines: tuple[str, ...]
+    bodies: tuple[SceneBody, ...] = ()
+    sampled: Mapping[int, futures.Futures] = field(default_factory=dict)
+    recording: Recording | None = None
+
+
+def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
+    """Predict motions with contacts.
+
+    Args:
+        scene: A scene with hulls.
+        wishes: The user's changes. If it pushes a body, that body is simulated even without need.
+
+    Raises:
+        BackendError: Contacts are needed and MuJoCo is not installed.
+    """
+    wishes = wishes or Wishes()
+    bodies, lines = scene_bodies.of(scene)
+    bodies = [body for body in bodies if body.group.id not in wishes.ignored]
+    if not any(body.moves for body in bodies) and not wishes.pushes:
+        return Prediction(scene.groups, {}, {}, tuple(lines))
+    end = predictability.horizon(scene) if wishes.until is None else wishes.until
+    up = world_axes.UP_AXIS.get(scene.world_convention)
+    passing = _passing(scene, bodies, end, up)
+    depths = {bodies[number].name: depth for number, depth in passing.items()}
+    driven = [number for number in passing if bodies[number].reason]
+    lines += [f"{bodies[n].name}: moves on without contacts: {bodies[n].reason}" for n in driven]
+    pushed = {number for number, body in enumerate(bodies) if body.group.id in wishes.pushes}
+    tried = (set(passing) - set(driven)) | pushed
+    if not tried:
+        return Prediction(scene.groups, depths, {}, tuple(lines))
+    pull = scene_bodies.gravity(scene, bodies)
+    if pull is None or up is None:
+        reason = "gravity is unknown: no body was seen to fall, and the scene has no up axis or no units"
+        return Prediction(scene.groups, depths, {}, (*lines, f"no contacts are predicted: {reason}"))
+    made = scene_world.make(scene, bodies, tried, pull, end)
+    return _simulated(scene, made, wishes, end, depths, [*lines, *made.lines])
+
+
+def _simulated(
+    scene: Scene,
+    made: scene_world.SceneWorld,
+    wishes: Wishes,
+    end: float,
+    depths: Mapping[str, float],
+    lines: list[str],
+) -> Prediction:
+    """Simulate the bodies together, and give new motions to those that touch something."""
+    if not made.fits and not wishes.pushes:
+        return Prediction(scene.groups, depths, {}, tuple(lines))
+    materials = [
+        _material(body, wishes.materials.get(b.group.id))
+        for body, b in zip(made.world.bodies, made.bodies, strict=True)
+    ]
+    state = made.start(scene.t_max)
+    for number, body in enumerate(made.bodies):
+        state.velocities[number] += wishes.pushes.get(body.group.id, np.zeros(3))
+    duration = end - scene.t_max
+    runs = Simulation(made.world, made.stepping(state, duration))
+    runs.touch(materials)
+    found = recording.record(runs, state, _BEYOND * duration)  # it ends when all bodies rest
+    if runs.failed:
+        return Prediction(scene.groups, depths, {}, (*lines, "no contacts are predicted: the simulation failed"))
+    changed = _changed(made, found, {n for n, b in enumerate(made.bodies) if b.group.id in wishes.pushes})
+    untouched = set(made.fits) - changed
+    lines += [f"{made.bodies[n].name}: touches nothing when it is simulated" for n in sorted(untouched)]
+    times = np.linspace(0, duration, KNOTS)
+    sampled = made.sample(scene.t_max, times, materials, wishes) if changed else {}
+    groups = list(scene.groups)
+    for number in changed:
+        group = made.bodies[number].group
+        groups[group.id] = _with_contact(group, made, number, found, sampled.get(number), scene.t_max)
+    taken = {made.bodies[n].name: made.text(n, materials[n]) for n in sorted(changed)}
+    return Prediction(tuple(groups), depths, taken, tuple(lines), made.bodies, sampled, found)
+
+
+def _material(body: world.Body, wanted: tuple[float | None, float | None] | None) -> world.Material:
+    friction, restitution = wanted or (None, None)
+    own = body.material
+    return world.Material(
+        own.friction if friction is None else friction, own.restitution if restitution is None else restitution
+    )
+
+
+def _changed(made: scene_world.SceneWorld, found: Recording, pushed: set[int]) -> set[int]:
+    """Numbers of the bodies that were fitted and touch something, or that such a body touches."""
+    hit = {number for touch in found.touches for number in touch.bodies}
+    changed = {number for number in made.fits if number in hit} | pushed
+    while True:
+        more = {n for touch in found.touches if changed & set(touch.bodies) for n in touch.bodies if n >= 0} - changed
+        more = {n for n in more if not made.world.bodies[n].fixed}
+        if not more:
+            return {n for n in changed if made.bodies[n].group.id}
+        changed |= more
+
+
+def _with_contact(
+    group: MotionGroup,
+    made: scene_world.SceneWorld,
+    number: int,
+    found: Recording,
+    sampled: futures.Futures | None,
+    t_max: float,
+) -> MotionGroup:
+    body, smooth = made.bodies[number], group.smooth or group.model
+    model = path_knots.model(found, number, body.solid.center, group.pivot, body.solid.size, smooth.fade_time)
+    model = dataclasses.replace(model, radius=smooth.radius)
+    past = group.history
+    if sampled is not None and sampled.quats.shape[1]:
+        past = dataclasses.replace(past, band=_band(sampled, found, number, body.solid.size, t_max))
+    return dataclasses.replace(group, model=model, smooth=smooth, history=past)
+
+
+def _band(sampled: futures.Futures, found: Recording, number: int, size: float, t_max: float) -> history.Band:
+    rows = np.minimum(np.searchsorted(found.times, sampled.times), len(found.times) - 1)
+    widths = sampled.radii(found.places[rows, number], BAND_LEVEL)
+    angles = np.minimum(sampled.angles(found.quats[rows, number], BAND_LEVEL), np.pi)
+    late = np.flatnonzero(widths > UNPREDICTABLE * size)
+    times = t_max + sampled.times
+    until = float(times[late[0]]) if len(late) else None
+    return history.Band(tuple(times.tolist()), tuple(widths.tolist()), tuple(angles.tolist()), BAND_LEVEL, until)
+
+
+def _passing(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray | None) -> dict[int, float]:
+    """Penetration, in sizes, of the smooth motion of each body that passes through the plane or another body."""
+    tau = np.linspace(0, max(end - scene.t_max, 0.0), _TIMES)
+    paths = [scene_bodies.predicted(body, tau) for body in bodies]
+    moving = [number for number, body in enumerate(bodies) if body.moves]
+    found: dict[int, float] = {}
+    for number in moving:
+        others = (n for n in range(len(bodies)) if n != number)
+        depths = [_overlap(bodies[number], paths[number], bodies[n], paths[n]) for n in others]
+        found[number] = max(depths, default=0.0)
+    sinking = [] if up is None else [n for n in moving if _sinks(scene, bodies[n], paths[n], up)]
+    plane = scene_world.plane(scene, bodies, end, up) if sinking and up is not None else None
+    for number in sinking if plane is not None else ():
+        assert plane is not None
+        body, track = world.Body(bodies[number].solid), scene_bodies.track(scene, bodies[number])
+        lowest = min(float(world.gaps(body, plane, track.places, track.quats).min()), 0.0)
+        found[number] = max(
+            found[number], lowest - float(world.gaps(body, plane, paths[number][1], paths[number][0]).min())
+        )
+    sizes = {number: bodies[number].solid.size for number in found}
+    return {number: depth / sizes[number] for number, depth in found.items() if depth > PENETRATION * sizes[number]}
+
+
+def _sinks(scene: Scene, body: SceneBody, path: se3.Pose, up: np.ndarray) -> bool:
+    """Return True if a body is predicted to be lower than it was ever seen."""
+    track, flat = scene_bodies.track(scene, body), world.Plane(up, 0.0)
+    seen, ahead = (
+        float(world.gaps(world.Body(body.solid), flat, places, quats).min())
+        for quats, places in ((track.quats, track.places), path)
+    )
+    return ahead < seen - PENETRATION * body.solid.size
+
+
+def _overlap(body: SceneBody, path: se3.Pose, other: SceneBody, others_path: se3.Pose) -> float:
+    """Largest increase of the overlap of two bodies since t_max, along the line of their centres."""
+    apart = others_path[1] - path[1]
+    distances = np.maximum(np.linalg.norm(apart, axis=1), 1e-12)
+    towards = apart / distances[:, None]
+    depths = _reach(body, path[0], towards) + _reach(other, others_path[0], -towards) - distances
+    return float((depths - max(depths[0], 0.0)).max())
+
+
+def _reach(body: SceneBody, quats: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """Farthest point of a turned body along directions, from its centre. [T, 4], [T, 3] -> [T]"""
+    arms = body.solid.vertices - body.solid.center
+    return (rotations.rotate(rotations.conjugate(quats), towards) @ arms.T).max(axis=1)

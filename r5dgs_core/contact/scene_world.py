@@ -1,0 +1,220 @@
+"""World of a scene's bodies: floors, states and materials from their observed poses."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..motion import models
+from ..scene.scene import Scene
+from ..shapes import solid
+from . import futures, scene_bodies, stepping, support, world
+from .identify import Estimate, Fitter
+from .scene_bodies import SceneBody
+from .simulation import Simulation
+from .stepping import Stepping
+from .world import Body, Material, Plane, State, World
+
+SAMPLES = 32
+_MISFIT = 30.0  # mean squared residual in units of the noise above which contacts do not explain the poses
+_TOUCHED = 0.05  # lowest observed gap, in sizes, of a body that has touched the plane
+_STANDS = 0.15  # the same of a body that stands on it; others are held by something
+_ROUNDS = 6  # of shrinking bodies that overlap
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """Changes by the user.
+
+    Attributes:
+        pushes: Changes of the velocity at t_max by group, world units per unit of time. [3] each
+        materials: Friction and restitution by group; None keeps the fitted one.
+        ignored: Groups that touch nothing.
+        until: Scene time up to which to simulate; None for the horizon.
+        samples: Number of sampled futures.
+        seed: Seed of the samples.
+    """
+
+    pushes: Mapping[int, np.ndarray] = field(default_factory=dict)
+    materials: Mapping[int, tuple[float | None, float | None]] = field(default_factory=dict)
+    ignored: frozenset[int] = frozenset()
+    until: float | None = None
+    samples: int = SAMPLES
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class SceneWorld:
+    """Bodies of a scene that may touch each other.
+
+    Attributes:
+        bodies: The B bodies.
+        world: They, with shapes and materials, and the supporting plane.
+        fits: Fitter and result by number, of the bodies that contacts were tried for.
+        lines: Reasons why others were not fitted.
+    """
+
+    bodies: tuple[SceneBody, ...]
+    world: World
+    fits: Mapping[int, tuple[Fitter, Estimate]]
+    lines: tuple[str, ...]
+
+    def start(self, t_max: float) -> State:
+        """Most likely state at t_max."""
+        state = world.at_rest(self.world)
+        for number, body in enumerate(self.bodies):
+            if number in self.fits:
+                _put(state, number, self.fits[number][0].at(self.fits[number][1], t_max))
+            elif body.moves:
+                _, _, spin, velocity = models.evaluate_with_rates(body.smooth, 0.0)
+                state.spins[number] = spin
+                state.velocities[number] = velocity + np.cross(spin, body.solid.center - body.group.pivot)
+        return state
+
+    def stepping(self, state: State, duration: float, draft: bool = False) -> Stepping:
+        """Frequency of contacts and time step for a simulation from a state."""
+        sizes = [body.solid.size for body in self.world.bodies]
+        return _stepping(self.world, state, duration, min(sizes), draft)
+
+    def sample(
+        self, t_max: float, times: np.ndarray, materials: list[Material], wishes: Wishes
+    ) -> dict[int, futures.Futures]:
+        """Sampled futures of all bodies at times since t_max, by number."""
+        rng, start = np.random.default_rng(wishes.seed), self.start(t_max)
+        runs = Simulation(self.world, self.stepping(start, float(times[-1]), draft=True))
+        quats = np.empty((len(times), wishes.samples, len(self.bodies), 4))
+        places = np.empty((len(times), wishes.samples, len(self.bodies), 3))
+        for n in range(wishes.samples):
+            state, used = self.start(t_max) if n == 0 else _copy(start), list(materials)
+            for number, (fitter, estimate) in self.fits.items():
+                drawn, material = futures.draw(fitter, estimate, rng)
+                _put(state, number, fitter.at(dataclasses.replace(estimate, state=drawn, material=material), t_max))
+                friction, restitution = wishes.materials.get(self.bodies[number].group.id, (None, None))
+                used[number] = Material(
+                    material.friction if friction is None else friction,
+                    material.restitution if restitution is None else restitution,
+                )
+            for number, body in enumerate(self.bodies):
+                state.velocities[number] += wishes.pushes.get(body.group.id, np.zeros(3))
+            runs.touch(used)
+            quats[:, n], places[:, n] = runs.poses(state, times)
+        good = np.isfinite(places).all(axis=(0, 2, 3))
+        rows = range(len(self.bodies))
+        return {k: futures.Futures(times, quats[:, good, k], places[:, good, k]) for k in rows}
+
+    def text(self, number: int, material: Material) -> str:
+        """Material of a body in words."""
+        words = f"friction {material.friction:.2g}, restitution {material.restitution:.2g}"
+        if number not in self.fits:
+            return f"{words}, both assumed"
+        deviation = float(np.sqrt(self.fits[number][1].covariance[12, 12]))
+        return f"{words}, friction known to {100 * np.expm1(deviation):.0f} %"
+
+
+def plane(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray) -> Plane | None:
+    """Plane below the observed and predicted places of the bodies that move, or below all if none does."""
+    chosen = [body for body in bodies if body.moves] or bodies
+    tau = np.linspace(0, max(end - scene.t_max, 0.0), 8)
+    points = [np.concatenate([scene_bodies.predicted(b, tau)[1], scene_bodies.track(scene, b).places]) for b in chosen]
+    return support.find(scene, up, np.concatenate(points), min(body.solid.size for body in chosen))
+
+
+def make(scene: Scene, bodies: list[SceneBody], tried: set[int], gravity: np.ndarray, end: float) -> SceneWorld:
+    """Build the world of the bodies that are not driven, and fit those with numbers in ``tried``."""
+    up = -gravity / max(float(np.linalg.norm(gravity)), 1e-300)
+    below = plane(scene, bodies, end, up)
+    lines = [] if below is not None else ["no plane was found under the bodies"]
+    kept = [number for number, body in enumerate(bodies) if not (body.moves and body.reason) or number in tried]
+    chosen = [bodies[number] for number in kept]
+    made = _apart(World(tuple(_body(scene, body, below) for body in chosen), below, gravity))
+    fits = {}
+    for row, number in enumerate(kept):
+        if number not in tried or not chosen[row].moves:
+            continue
+        fitter, estimate = _fit(scene, chosen[row], made.bodies[row], below, gravity, end)
+        if estimate is None or estimate.misfit > _MISFIT:
+            lines.append(f"{chosen[row].name}: moves on without contacts: they do not explain its poses")
+            continue
+        fits[row] = fitter, estimate
+        changed = dataclasses.replace(made.bodies[row], material=estimate.material)
+        made = dataclasses.replace(made, bodies=(*made.bodies[:row], changed, *made.bodies[row + 1 :]))
+    return SceneWorld(tuple(chosen), made, fits, tuple(lines))
+
+
+def _body(scene: Scene, body: SceneBody, below: Plane | None) -> Body:
+    """Shape and floor of a body."""
+    if below is None:
+        return Body(body.solid, fixed=not body.moves)
+    own = Body(body.solid)
+    if body.moves:
+        track = scene_bodies.track(scene, body)
+        lowest = float(world.gaps(own, below, track.places, track.quats).min())
+        touched = lowest < _TOUCHED * body.solid.size
+        return dataclasses.replace(own, floor=below.height + lowest if touched else None)
+    gap = float((body.solid.vertices @ below.normal).min()) - below.height
+    if abs(gap) > _STANDS * body.solid.size or not body.group.id:
+        return dataclasses.replace(own, fixed=True)
+    points, floor = solid.with_flat_foot(body.solid.vertices, below.normal)
+    return Body(solid.of(points), floor=floor)
+
+
+def _apart(made: World) -> World:
+    """Shrink bodies that overlap in the bind state, whose penetration would become speed."""
+    runs = Simulation(made, Stepping(100.0, 1e-3))
+    for _ in range(_ROUNDS):
+        deep = {pair: depth for pair, depth in runs.deepest(world.at_rest(made)).items() if min(pair) >= 0}
+        if not deep:
+            return made
+        bodies = list(made.bodies)
+        for pair, depth in deep.items():
+            for number in pair:
+                size = bodies[number].solid.size
+                shape = bodies[number].solid
+                factor = max(1 - 0.6 * depth / size, 0.5)
+                anchor = shape.center.copy()
+                if made.plane is not None:  # the foot stays where it is
+                    down = (shape.vertices - anchor) @ made.plane.normal
+                    anchor += down.min() * made.plane.normal
+                smaller = solid.of(anchor + factor * (shape.vertices - anchor))
+                bodies[number] = dataclasses.replace(bodies[number], solid=smaller)
+        made = dataclasses.replace(made, bodies=tuple(bodies))
+        runs = Simulation(made, Stepping(100.0, 1e-3))
+    return made
+
+
+def _fit(
+    scene: Scene, body: SceneBody, shape: Body, below: Plane | None, gravity: np.ndarray, end: float
+) -> tuple[Fitter, Estimate | None]:
+    """Fit a body alone over the plane."""
+    alone = World((shape,), below, gravity)
+    track = scene_bodies.track(scene, body)
+    span = end - (track.times[0] if len(track) else end)
+    state = world.at_rest(alone)
+    if len(track) > 1:
+        state.velocities[0] = np.diff(track.places, axis=0).max(axis=0) / np.diff(track.times).min()
+    chosen = _stepping(alone, state, span, shape.solid.size, draft=True)
+    fitter = Fitter(Simulation(alone, chosen), track)
+    return fitter, fitter.run() if len(track) >= 3 else None
+
+
+def _stepping(made: World, state: State, duration: float, size: float, draft: bool) -> Stepping:
+    g = float(np.linalg.norm(made.gravity))
+    speed = float(np.linalg.norm(state.velocities, axis=1).max())
+    if made.plane is not None:
+        drop = max(float((state.places @ made.plane.normal).max()) - made.plane.height, 0.0)
+        speed = float(np.hypot(speed, np.sqrt(2 * g * drop)))
+    else:
+        speed += g * duration
+    return stepping.choose(speed, size, g, duration, draft)
+
+
+def _put(state: State, number: int, one: State) -> None:
+    for name in ("places", "quats", "velocities", "spins"):
+        getattr(state, name)[number] = getattr(one, name)[0]
+
+
+def _copy(state: State) -> State:
+    return State(*(x.copy() for x in (state.places, state.quats, state.velocities, state.spins)))

@@ -1,0 +1,50 @@
+"""The stage of baking that adds contacts."""
+
+import builtins
+import types
+
+import pytest
+
+from r5dgs_core.bake import contact
+from r5dgs_core.bake.draft import Draft
+from r5dgs_core.config.sections.needs import NeedsSection
+from tests.support import contact_scenes
+
+FALLING, RESTING = contact_scenes.scene(contact_scenes.falling()), contact_scenes.scene(contact_scenes.resting())
+
+
+def baked(scene, wanted="auto"):
+    draft = Draft(scene, None, None, None, None, parts=({"name": "motion"},))
+    return draft, contact.apply(draft, types.SimpleNamespace(wanted=NeedsSection(contact=wanted)))
+
+
+def test_a_body_that_would_pass_through_the_floor_gets_contacts_and_a_row_with_the_evidence():
+    pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
+    draft, after = baked(FALLING)
+    assert (
+        after.scene.groups[1].model.kind == "trajectory" and after.scene.groups[1].smooth is draft.scene.groups[1].model
+    )
+    before, row = after.parts
+    assert before == {"name": "motion"} and row["object"] == "box 1" and row["name"] == "contact"
+    assert row["decision"] == "on" and row["value"] > row["threshold"] == 0.02 and "friction" in row["reason"]
+
+
+@pytest.mark.parametrize(("scene", "wanted"), [(RESTING, "auto"), (FALLING, "off")])
+def test_without_need_or_by_the_users_wish_the_draft_stays(scene, wanted):
+    draft, after = baked(scene, wanted)
+    assert after.scene.groups is draft.scene.groups and after.parts is draft.parts
+
+
+def test_without_mujoco_the_smooth_motion_stays_and_the_command_is_named(monkeypatch, caplog):
+    original = builtins.__import__
+
+    def refuse(name, *rest):
+        if name == "mujoco":
+            raise ImportError("No module named 'mujoco'", name="mujoco")
+        return original(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    draft, after = baked(FALLING)
+    assert after is draft
+    (record,) = caplog.records
+    assert "passes through" in record.getMessage() and "pip install 'r5dgs[contact]'" in record.getMessage()

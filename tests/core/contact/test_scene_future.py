@@ -1,0 +1,131 @@
+"""Scenes get motions with contacts where their smooth motions pass through something, and only there."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.contact import scene_future, scene_world, simulation, world
+from r5dgs_core.contact.scene_world import Wishes
+from r5dgs_core.motion import models, rotations
+from r5dgs_core.motion.models import MotionModel
+from r5dgs_core.scene import scene_file
+from tests.support import contact_scenes
+from tests.support.contact_scenes import SIZE
+
+pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
+FEW = Wishes(samples=6)
+
+
+def lowest(scene, group, t):
+    """Height of the lowest corner of a box at a time."""
+    quats, moved = models.evaluate(group.model, t - scene.t_max)
+    corners = next(hull.vertices for hull in scene.hulls if hull.motion_id == group.id)
+    return float((rotations.rotate(quats, corners - group.pivot) + group.pivot + moved)[:, 2].min())
+
+
+@pytest.fixture(scope="module")
+def fallen():
+    scene = contact_scenes.scene(contact_scenes.falling(), contact_scenes.resting(2.0))
+    return scene, scene_future.predict(scene, FEW)
+
+
+def test_a_falling_box_comes_to_rest_on_the_floor_and_keeps_its_smooth_motion(fallen):
+    scene, found = fallen
+    assert list(found.taken) == ["box 1"] and "friction 0.3" in found.taken["box 1"] and not found.lines
+    assert found.penetrations["box 1"] > 1
+    box, other = found.groups[1], found.groups[2]
+    assert box.smooth == scene.groups[1].model and other is scene.groups[2]
+    assert lowest(scene, scene.groups[1], 1.0) < -SIZE
+    heights = [lowest(scene, box, t) for t in (0.8, 1.0, 2.5)]
+    assert np.abs(heights).max() < 0.3 * SIZE and abs(heights[-1]) < 0.1 * SIZE
+    before, after = (models.evaluate(group.model, 0.05)[1] for group in (scene.groups[1], box))
+    np.testing.assert_allclose(before, after, atol=0.02 * SIZE)  # in flight
+    assert np.linalg.norm(models.evaluate(box.model, 9.0)[1] - models.evaluate(box.model, 2.0)[1]) < 1e-9
+
+
+def test_the_band_widens_at_the_first_impact(fallen):
+    _, found = fallen
+    band = found.groups[1].history.band
+    times, widths = np.array(band.times) - 0.6, np.array(band.half_width)
+    impact = found.recording.touches[0].time if found.recording.touches[0].bodies == (-1, 0) else 0.17
+    assert widths[times < impact - 0.02].max() < 0.1 * SIZE < widths[times > impact + 0.1].max()
+
+
+def test_a_scene_with_contacts_is_stored_and_read(fallen, tmp_path):
+    scene, found = fallen
+    path = scene_file.write(dataclasses.replace(scene, groups=found.groups), tmp_path / "scene.r5dgs")
+    back = scene_file.read(path)
+    assert back.groups[1].model == found.groups[1].model and back.groups[1].smooth == scene.groups[1].model
+
+
+def test_a_sliding_box_pushes_the_one_that_it_hits():
+    scene = contact_scenes.with_units(contact_scenes.scene(contact_scenes.sliding(1.5), contact_scenes.resting(0.8)))
+    found = scene_future.predict(scene, FEW)
+    assert set(found.taken) == {"box 1", "box 2"} and "both assumed" in found.taken["box 2"]
+    first, second = (models.evaluate(group.model, 0.8)[1] for group in found.groups[1:])
+    assert second[0] > 0.05 * SIZE and first[0] < 0.4 + second[0] + 0.05 * SIZE
+    assert models.evaluate(scene.groups[1].model, 0.8)[1][0] == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize(
+    ("bodies", "line"),
+    [
+        ([contact_scenes.sliding(0.4)], ""),
+        ([contact_scenes.resting()], ""),
+        (
+            [(MotionModel("constant_twist", velocity=[0, 0, -2], angular_velocity=[0, 0, 1]), np.array([0, 0, 0.6]))],
+            "box 1: moves on without contacts: its motion is that of a driven body (screw)",
+        ),
+        (
+            [(MotionModel("translation", velocity=[0, 0, -2], acceleration=[9, 0, 0]), np.array([0, 0, 0.6]))],
+            "box 1: moves on without contacts: it accelerates otherwise than by gravity",
+        ),
+        (
+            [(MotionModel("translation", velocity=[0, 0, -2.0]), np.array([0, 0, 0.6]))],
+            "no contacts are predicted: gravity is unknown",
+        ),
+    ],
+)
+def test_without_need_or_reason_the_groups_stay_and_nothing_is_simulated(bodies, line, monkeypatch):
+    monkeypatch.setattr(simulation, "Simulation", None)
+    monkeypatch.setattr(scene_world, "Simulation", None)
+    scene = contact_scenes.scene(*bodies)
+    found = scene_future.predict(scene)
+    assert found.groups is scene.groups and not found.taken
+    assert [text for text in found.lines if line and text.startswith(line)] == list(found.lines)
+    assert bool(found.lines) == bool(line)
+
+
+def test_users_push_bodies_change_materials_and_leave_bodies_out(fallen):
+    scene, _ = fallen
+    ice = Wishes(materials={1: (0.0, 0.0)}, pushes={2: np.array([0.0, 1.0, 0.0])}, samples=2)
+    found = scene_future.predict(scene, ice)
+    assert found.taken["box 1"].startswith("friction 0, restitution 0,")
+    assert models.evaluate(found.groups[2].model, 0.5)[1][1] > 0.1
+    assert not scene_future.predict(scene, Wishes(ignored=frozenset({1}))).taken
+
+
+def test_the_plane_of_the_floor_is_found_to_a_few_percent_of_the_size(fallen):
+    scene, _ = fallen
+    bodies = scene_future.scene_bodies.of(scene)[0]
+    plane = scene_world.plane(scene, bodies, 1.0, np.array([0, 0, 1.0]))
+    assert plane.normal[2] > 0.999 and abs(plane.height) < 0.1 * SIZE  # a pixel is 0.12 * SIZE
+
+
+def test_bodies_that_overlap_at_t_max_are_shrunk_until_they_do_not():
+    scene = contact_scenes.scene(contact_scenes.resting(0.0), contact_scenes.resting(0.38))
+    bodies = tuple(world.Body(body.solid) for body in scene_future.scene_bodies.of(scene)[0])
+    made = world.World(bodies, world.Plane(np.array([0, 0, 1.0]), 0.0), np.array([0, 0, -4.0]))
+    apart = scene_world._apart(made)
+    assert sum(body.solid.volume for body in apart.bodies) < sum(body.solid.volume for body in bodies)
+    runs = simulation.Simulation(apart, simulation.Stepping(100.0, 1e-3))
+    assert (0, 1) not in runs.deepest(world.at_rest(apart))
+    assert min(body.solid.vertices[:, 2].min() for body in apart.bodies) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_flat_hull_is_named_and_left_out():
+    scene = contact_scenes.scene(contact_scenes.falling())
+    hull = dataclasses.replace(scene.hulls[0], vertices=scene.hulls[0].vertices * [1, 1, 0])
+    found = scene_future.predict(dataclasses.replace(scene, hulls=(hull,)))
+    assert found.lines == ("box 1: has no contacts: the points of a hull lie in a plane",)
