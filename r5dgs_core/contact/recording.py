@@ -44,7 +44,8 @@ class Recording:
         velocities: Of the centres of mass. [N, B, 3]
         touching: True while a body is pushed. [N, B]
         touches: Begins of contacts, in order.
-        rests: True if all bodies rest at the end.
+        rests: True if all bodies have rested for a while at the end.
+        slow: True for bodies that hardly move at the end. [B]
         frequency: Angular frequency of the contacts.
     """
 
@@ -56,6 +57,7 @@ class Recording:
     touching: np.ndarray
     touches: tuple[Touch, ...]
     rests: bool
+    slow: np.ndarray
     frequency: float
 
 
@@ -72,7 +74,7 @@ def record(simulation: Simulation, state: State, duration: float) -> Recording:
     for n in range(count):
         times[n], positions[n], rates[n] = data.time, data.qpos, data.qvel
         if n % _CHECKED == 0 and model.nv:
-            slow = _is_slow(simulation)
+            slow = _slow(simulation).all()
             slow_since = (data.time if slow_since is None else slow_since) if slow else None
             rests = slow_since is not None and data.time - slow_since > _rest_time(simulation)
         if rests or n == count - 1:
@@ -114,16 +116,18 @@ def _recording(
         later = min(int(np.searchsorted(times, times[n] + wait)), count - 1)
         change = float(np.linalg.norm(velocities[later, body] - velocities[n, body]))
         touches.append(Touch(float(times[n]), pair, change if change > felt else 0.0))
-    frequency = simulation.stepping.frequency
-    return Recording(times, quats, places, spins, velocities, touching, tuple(touches), rests, frequency)
+    slow, frequency = np.ones(len(bodies), bool), simulation.stepping.frequency
+    slow[moving] = _slow(simulation)
+    return Recording(times, quats, places, spins, velocities, touching, tuple(touches), bool(rests), slow, frequency)
 
 
-def _is_slow(simulation: Simulation) -> bool:
+def _slow(simulation: Simulation) -> np.ndarray:
+    """True for each moving body that hardly moves."""
     g = float(np.linalg.norm(simulation.world.gravity))
     sizes = np.array([body.solid.size for body in simulation.world.bodies if not body.fixed])
     rates = simulation.data.qvel.reshape(-1, 6)
     speeds = np.linalg.norm(rates[:, :3], axis=1) + sizes * np.linalg.norm(rates[:, 3:], axis=1)
-    return bool((speeds < _REST_SPEED * np.sqrt(max(g, 1e-300) * sizes)).all())
+    return speeds < _REST_SPEED * np.sqrt(max(g, 1e-300) * sizes)
 
 
 def _rest_time(simulation: Simulation) -> float:

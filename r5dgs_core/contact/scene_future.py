@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -34,8 +34,8 @@ class Prediction:
         penetrations: Penetration of the smooth motion, in sizes, of each body that would pass through something.
         taken: Names of the bodies that got a motion with contacts, with their material in words.
         lines: Reasons why others did not, one sentence each.
-        bodies: The simulated bodies.
-        sampled: Their sampled futures, by number.
+        world: The simulated bodies.
+        materials: Their materials.
         recording: The most likely future.
     """
 
@@ -43,8 +43,8 @@ class Prediction:
     penetrations: Mapping[str, float]
     taken: Mapping[str, str]
     lines: tuple[str, ...]
-    bodies: tuple[SceneBody, ...] = ()
-    sampled: Mapping[int, futures.Futures] = field(default_factory=dict)
+    world: scene_world.SceneWorld | None = None
+    materials: tuple[world.Material, ...] = ()
     recording: Recording | None = None
 
 
@@ -93,8 +93,7 @@ def _simulated(
     if not made.fits and not wishes.pushes:
         return Prediction(scene.groups, depths, {}, tuple(lines))
     materials = [
-        _material(body, wishes.materials.get(b.group.id))
-        for body, b in zip(made.world.bodies, made.bodies, strict=True)
+        wishes.material(b.group.id, own.material) for b, own in zip(made.bodies, made.world.bodies, strict=True)
     ]
     state = made.start(scene.t_max)
     for number, body in enumerate(made.bodies):
@@ -115,15 +114,7 @@ def _simulated(
         group = made.bodies[number].group
         groups[group.id] = _with_contact(group, made, number, found, sampled.get(number), scene.t_max)
     taken = {made.bodies[n].name: made.text(n, materials[n]) for n in sorted(changed)}
-    return Prediction(tuple(groups), depths, taken, tuple(lines), made.bodies, sampled, found)
-
-
-def _material(body: world.Body, wanted: tuple[float | None, float | None] | None) -> world.Material:
-    friction, restitution = wanted or (None, None)
-    own = body.material
-    return world.Material(
-        own.friction if friction is None else friction, own.restitution if restitution is None else restitution
-    )
+    return Prediction(tuple(groups), depths, taken, tuple(lines), made, tuple(materials), found)
 
 
 def _changed(made: scene_world.SceneWorld, found: Recording, pushed: set[int]) -> set[int]:

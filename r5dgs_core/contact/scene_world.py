@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -45,6 +45,14 @@ class Wishes:
     samples: int = SAMPLES
     seed: int = 0
 
+    def material(self, group: int, fitted: Material) -> Material:
+        """Material of a group with the user's values in place of fitted ones."""
+        friction, restitution = self.materials.get(group, (None, None))
+        return Material(
+            fitted.friction if friction is None else friction,
+            fitted.restitution if restitution is None else restitution,
+        )
+
 
 @dataclass(frozen=True)
 class SceneWorld:
@@ -83,27 +91,34 @@ class SceneWorld:
         self, t_max: float, times: np.ndarray, materials: list[Material], wishes: Wishes
     ) -> dict[int, futures.Futures]:
         """Sampled futures of all bodies at times since t_max, by number."""
-        rng, start = np.random.default_rng(wishes.seed), self.start(t_max)
-        runs = Simulation(self.world, self.stepping(start, float(times[-1]), draft=True))
+        runs = self.draft(t_max, float(times[-1]))
         quats = np.empty((len(times), wishes.samples, len(self.bodies), 4))
         places = np.empty((len(times), wishes.samples, len(self.bodies), 3))
-        for n in range(wishes.samples):
-            state, used = self.start(t_max) if n == 0 else _copy(start), list(materials)
-            for number, (fitter, estimate) in self.fits.items():
-                drawn, material = futures.draw(fitter, estimate, rng)
-                _put(state, number, fitter.at(dataclasses.replace(estimate, state=drawn, material=material), t_max))
-                friction, restitution = wishes.materials.get(self.bodies[number].group.id, (None, None))
-                used[number] = Material(
-                    material.friction if friction is None else friction,
-                    material.restitution if restitution is None else restitution,
-                )
-            for number, body in enumerate(self.bodies):
-                state.velocities[number] += wishes.pushes.get(body.group.id, np.zeros(3))
+        for n, (state, used) in enumerate(self.draws(t_max, materials, wishes)):
             runs.touch(used)
             quats[:, n], places[:, n] = runs.poses(state, times)
         good = np.isfinite(places).all(axis=(0, 2, 3))
         rows = range(len(self.bodies))
         return {k: futures.Futures(times, quats[:, good, k], places[:, good, k]) for k in rows}
+
+    def draft(self, t_max: float, duration: float) -> Simulation:
+        """Simulation of sampled futures."""
+        return Simulation(self.world, self.stepping(self.start(t_max), duration, draft=True))
+
+    def draws(self, t_max: float, materials: list[Material], wishes: Wishes) -> Iterator[tuple[State, list[Material]]]:
+        """Sampled states at t_max, after the pushes, and materials."""
+        rng, start = np.random.default_rng(wishes.seed), self.start(t_max)
+        for number, body in enumerate(self.bodies):
+            start.velocities[number] += wishes.pushes.get(body.group.id, np.zeros(3))
+        for _ in range(wishes.samples):
+            state, used = _copy(start), list(materials)
+            for number, (fitter, estimate) in self.fits.items():
+                group = self.bodies[number].group.id
+                drawn, material = futures.draw(fitter, estimate, rng)
+                _put(state, number, fitter.at(dataclasses.replace(estimate, state=drawn, material=material), t_max))
+                state.velocities[number] += wishes.pushes.get(group, np.zeros(3))
+                used[number] = wishes.material(group, material)
+            yield state, used
 
     def text(self, number: int, material: Material) -> str:
         """Material of a body in words."""

@@ -7,7 +7,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ... import errors, folder_lock, input_paths
 from .. import options
@@ -92,8 +92,6 @@ def run_extrapolate(
     bounces = [_number("--bounce", text, 1.0) for text in bounce]
     input_paths.check_scene(path)
     input_paths.check_scene_output(out)
-    import numpy as np
-
     from ...bake import contact
     from ...contact import scene_future, scene_world
     from ...scene import scene_file
@@ -101,20 +99,9 @@ def run_extrapolate(
     options.use_threads(threads)
     scene = scene_file.read(path)
     scene = dataclasses.replace(scene, groups=contact.without(scene.groups))
-    materials: dict[int, tuple[float | None, float | None]] = {}
-    for words, value in frictions:
-        materials |= {g: (value, materials.get(g, (None, None))[1]) for g in _groups(scene, words, "--friction")}
-    for words, value in bounces:
-        materials |= {g: (materials.get(g, (None, None))[0], value) for g in _groups(scene, words, "--bounce")}
-    factor = _si_factor(scene, path) if si else 1.0
-    wishes = scene_world.Wishes(
-        pushes={g: factor * np.array(vector) for words, vector in velocities for g in _groups(scene, words, "--push")},
-        materials=materials,
-        ignored=frozenset(g for words in ignore for g in _groups(scene, words, "--ignore-contact")),
-        until=until,
-        samples=samples,
-        seed=seed,
-    )
+    named = {"ignore": ignore, "push": velocities, "friction": frictions, "bounce": bounces}
+    changes = _by_group(scene, named, _si_factor(scene, path) if si else 1.0)
+    wishes = scene_world.Wishes(**changes, until=until, samples=samples, seed=seed)
     found = scene_future.predict(scene, wishes)
     changed = dataclasses.replace(scene, groups=found.groups, needs=contact.needs(scene.needs, found))
     scene_file.write(changed, out, exact=scene_file.is_exact(path))
@@ -122,6 +109,20 @@ def run_extrapolate(
         print(line)
     print(f"written: {out}" + ("" if found.taken else "; all motions are smooth"))
     return changed
+
+
+def _by_group(scene: Scene, named: dict[str, Any], factor: float) -> dict[str, Any]:
+    """Pushes, materials and ignored bodies as fields of `Wishes`; pushes are multiplied by ``factor``."""
+    import numpy as np
+
+    materials: dict[int, tuple[float | None, float | None]] = {}
+    for words, value in named["friction"]:
+        materials |= {g: (value, None) for g in _groups(scene, words, "--friction")}
+    for words, value in named["bounce"]:
+        materials |= {g: (materials.get(g, (None,))[0], value) for g in _groups(scene, words, "--bounce")}
+    pushes = {g: factor * np.array(v) for words, v in named["push"] for g in _groups(scene, words, "--push")}
+    ignored = frozenset(g for words in named["ignore"] for g in _groups(scene, words, "--ignore-contact"))
+    return {"pushes": pushes, "materials": materials, "ignored": ignored}
 
 
 def _check(until: float | None, samples: int) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
-from ... import terminal
+from ... import errors, terminal
 from .. import inputs, options, pictures
 
 NAME = "objects"
@@ -24,13 +25,16 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--data", type=Path, metavar="DIR", help=data)
     legend = "write a picture of the scene labelled with ids and names"
     p.add_argument("--legend", type=Path, metavar="FILE.png", help=legend)
+    futures = "print probabilities from N sampled futures with contacts"
+    p.add_argument("--futures", type=int, metavar="N", help=futures)
     p.add_argument("--json", action="store_true", help="print JSON instead of the table")
     pictures.add_arguments(p)
 
 
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
-    run_objects(args.target, args.data, legend=args.legend, as_json=args.json, **pictures.values_of(args))
+    given = {"legend": args.legend, "futures": args.futures, "as_json": args.json}
+    run_objects(args.target, args.data, **given, **pictures.values_of(args))
 
 
 def run_objects(
@@ -38,6 +42,7 @@ def run_objects(
     data: Path | None = None,
     *,
     legend: Path | None = None,
+    futures: int | None = None,
     camera: str | None = None,
     t: float | None = None,
     mode: str = "rigid",
@@ -56,6 +61,7 @@ def run_objects(
         mode: Playback mode past t_max.
         size: Pixels of the picture along its longer side.
         threads: Threads of the kernels; see `options.use_threads`.
+        futures: Number of sampled futures for probabilities of contacts, or None.
         as_json: Print JSON instead of the table.
 
     Returns:
@@ -63,6 +69,7 @@ def run_objects(
     """
     pictures.check("--legend", legend, camera, t, size)
     inputs.check_mode(mode)
+    _check_futures(futures)
     inputs.check_target(target, data)
     from ...evaluation import object_table
     from ...scene import sampling
@@ -74,23 +81,51 @@ def run_objects(
     if legend is not None:
         object_ids = [item.id for item in scene.objects if item.id > 0]
         viewpoint = pictures.best_viewpoint(scene, object_ids, camera, t, mode)
-    if dataset is None:
-        views: list[Any] = object_table.own_views(scene)
-    else:
+    views: list[Any] = object_table.own_views(scene) if dataset is None else []
+    if dataset is not None:
         views = sampling.spread((*dataset.val, *dataset.test) or dataset.train, object_table.MAX_VIEWS)
     rows = object_table.measure(scene, views, mode)
     result = object_table.to_json(scene, rows, len(views))
+    if futures is not None:
+        from ...contact import odds
+
+        result["futures"] = [dataclasses.asdict(row) for row in odds.of(scene, futures)]
     if as_json:
         print(json.dumps(result, indent=2))
     else:
-        console = terminal.console()
-        console.print(object_table.table(scene, rows, len(views)))
-        outlook = object_table.outlook_table(scene, rows)
-        if outlook is not None:
-            console.print(outlook)
+        _print(scene, rows, len(views), result.get("futures"))
     if legend is not None and viewpoint is not None:
         _draw_legend(legend, scene, viewpoint, mode, size, quiet=as_json)
     return result
+
+
+def _check_futures(futures: int | None) -> None:
+    if futures is not None and not 1 <= futures <= 10_000:
+        raise errors.UsageError(f"--futures {futures}: expected 1 to 10000")
+
+
+def _print(scene: Any, rows: Any, views: int, futures: list[dict[str, Any]] | None) -> None:
+    """Print the tables of the objects, and probabilities if there are any."""
+    from ...evaluation import object_table
+
+    console = terminal.console()
+    console.print(object_table.table(scene, rows, views))
+    outlook = object_table.outlook_table(scene, rows)
+    if outlook is not None:
+        console.print(outlook)
+    if futures is not None:
+        _print_odds(futures)
+
+
+def _print_odds(rows: list[dict[str, Any]]) -> None:
+    """Print probabilities of contacts, one line for each object."""
+    if not rows:
+        print("no motion is predicted to touch anything")
+    for row in rows:
+        hits = "".join(f", touches {name} first {share:.0%}" for name, share in row["hits"].items())
+        print(
+            f"{row['name']}: comes to rest {row['rests']:.0%}, is off the ground at the end {row['leaves']:.0%}{hits}"
+        )
 
 
 def _draw_legend(path: Path, scene: Any, viewpoint: Any, mode: str, size: int | None, *, quiet: bool) -> None:

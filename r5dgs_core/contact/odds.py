@@ -1,0 +1,84 @@
+"""Probabilities of events in the predicted motion of a scene, from sampled futures."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from ..scene import predictability
+from ..scene.scene import Scene
+from . import recording, scene_future, world
+from .recording import Recording
+from .scene_world import SceneWorld, Wishes
+
+_ABOVE = 0.1  # height over its plane, in sizes, above which a body has left it
+
+
+@dataclass(frozen=True)
+class Odds:
+    """Probabilities up to the end of the prediction.
+
+    Attributes:
+        name: Name of the object.
+        rests: It comes to rest.
+        leaves: It is off the plane that supports it at the end.
+        hits: It touches an object before any other, by name; objects that it never touches are left out.
+    """
+
+    name: str
+    rests: float
+    leaves: float
+    hits: dict[str, float]
+
+
+def of(scene: Scene, count: int, seed: int = 0) -> list[Odds]:
+    """Return the odds of the bodies for which contacts are simulated; none if no motion needs contacts.
+
+    Args:
+        scene: The scene; motions with contacts that it stores are predicted again.
+        count: Number of sampled futures.
+        seed: Their seed.
+
+    Raises:
+        BackendError: Contacts are needed and MuJoCo is not installed.
+    """
+    wishes = Wishes(samples=count, seed=seed)
+    smooth = tuple(
+        group if group.smooth is None else dataclasses.replace(group, model=group.smooth) for group in scene.groups
+    )
+    found = scene_future.predict(dataclasses.replace(scene, groups=smooth), dataclasses.replace(wishes, samples=1))
+    made, duration = found.world, predictability.horizon(scene) - scene.t_max
+    if made is None or duration <= 0:
+        return []
+    runs, futures = made.draft(scene.t_max, duration), []
+    for state, materials in made.draws(scene.t_max, list(found.materials), wishes):
+        runs.touch(materials)
+        futures.append(recording.record(runs, state, duration))
+    return [_odds(made, number, futures) for number, body in enumerate(made.bodies) if body.name in found.taken]
+
+
+def _odds(made: SceneWorld, number: int, futures: list[Recording]) -> Odds:
+    firsts = [_first(number, future) for future in futures]
+    hits = {
+        made.bodies[other].name: firsts.count(other) / len(futures)
+        for other in sorted({first for first in firsts if first is not None})
+    }
+    rests = sum(bool(future.slow[number]) for future in futures) / len(futures)
+    leaves = sum(_is_off(made, number, future) for future in futures) / len(futures)
+    return Odds(made.bodies[number].name, rests, leaves, hits)
+
+
+def _first(number: int, future: Recording) -> int | None:
+    """Body that a body touches first, or None."""
+    for touch in future.touches:
+        if number in touch.bodies and min(touch.bodies) >= 0:
+            return touch.bodies[0] if touch.bodies[1] == number else touch.bodies[1]
+    return None
+
+
+def _is_off(made: SceneWorld, number: int, future: Recording) -> bool:
+    body, plane = made.world.bodies[number], made.world.plane
+    if plane is None:
+        return False
+    gap = world.gaps(body, plane, future.places[-1, number], future.quats[-1, number])
+    return bool(gap > _ABOVE * body.solid.size)

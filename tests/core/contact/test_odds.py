@@ -1,0 +1,20 @@
+"""Probabilities from sampled futures."""
+
+import pytest
+
+from r5dgs_core.contact import odds
+from tests.support import contact_scenes
+
+pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
+
+
+def test_a_body_that_slides_into_another_touches_it_first_in_every_future():
+    scene = contact_scenes.with_units(contact_scenes.scene(contact_scenes.sliding(1.5), contact_scenes.resting(0.7)))
+    first, second = odds.of(scene, 4)
+    assert (first.name, first.hits) == ("box 1", {"box 2": 1.0})
+    assert (second.name, second.hits) == ("box 2", {"box 1": 1.0})
+    assert 0.0 <= first.rests <= 1.0 and first.leaves == 0.0
+
+
+def test_a_scene_without_need_of_contacts_has_no_odds():
+    assert odds.of(contact_scenes.scene(contact_scenes.resting()), 4) == []
