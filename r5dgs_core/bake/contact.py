@@ -28,6 +28,8 @@ def apply(draft: Draft, context: Context) -> Draft:
         return draft
     for line in found.lines:
         log.warning("%s", line)
+    if not found.taken:
+        return draft
     scene = dataclasses.replace(draft.scene, groups=found.groups)
     return dataclasses.replace(draft, scene=scene, parts=(*draft.parts, *_rows(found)))
 
