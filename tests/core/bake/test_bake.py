@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from r5dgs_core.bake import bake
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import CheckpointError, Interrupted
 from r5dgs_core.evaluation import evaluate
@@ -53,7 +54,7 @@ def test_a_baked_scene_is_valid_and_complete(baked, trained):
     assert baked.object(1).aliases == ("block",)
     assert [g.role for g in baked.groups][:3] == ["pinned", "body", "body"]
     assert baked.t_max == pytest.approx(tiny_datasets.T_MAX) and baked.frames_per_unit == 40
-    assert baked.provenance["config"] == trained.config.to_dict()
+    assert config.from_dict(baked.provenance["config"]) == trained.config
     assert baked.provenance["train"]["finished"] and baked.provenance["train"]["iterations"] == 300
     assert len(baked.cameras) == 7
 
