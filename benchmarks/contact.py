@@ -13,8 +13,7 @@ per axis. ``impact`` stops before the first contact, ``share`` after 60 % of the
 
 Errors are those of the end of the toss: place in widths, rotation in degrees. ``covered`` is the share of
 tosses whose end lies in the 90 % band, ``radius`` the median radius of the band, ``face_auroc`` how well the share of
-samples on other faces finds the predictions on a wrong face. Odd tosses tuned nothing. Results are in
-docs/results/contact.md.
+samples on other faces finds the predictions on a wrong face. Odd tosses tuned nothing.
 """
 
 from __future__ import annotations
