@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -65,16 +66,47 @@ def test_the_extra_all_has_every_extra_that_runs_on_a_cpu():
     assert own.name == "r5dgs" and own.extras == set(EXTRAS) - UNTESTED_EXTRAS - NOT_RUN
 
 
+@dataclass(frozen=True)
+class Source:
+    """Facts about a module.
+
+    Attributes:
+        lines: Number of lines.
+        writes_extra: True if it contains a pip command with an extra.
+        extras: Extras that calls of `r5dgs_core.extras` name literally.
+        packages: Packages that it imports at its top.
+        late_packages: Packages that it imports anywhere.
+        long: Functions of more than 60 lines, with their lengths.
+    """
+
+    lines: int
+    writes_extra: bool
+    extras: set[str]
+    packages: set[str]
+    late_packages: set[str]
+    long: list[str]
+
+
 @functools.cache
-def source(path: Path) -> tuple[str, ast.Module, list[ast.AST]]:
-    """Text, syntax tree, and all nodes of a module."""
+def source(path: Path) -> Source:
+    """Parse a module once for all tests."""
     text = path.read_text(encoding="utf-8")
     tree = ast.parse(text)
-    return text, tree, list(ast.walk(tree))
+    nodes = list(ast.walk(tree))
+    functions = [node for node in nodes if isinstance(node, ast.FunctionDef)]
+    lengths = [f.end_lineno - min([f.lineno, *(d.lineno for d in f.decorator_list)]) + 1 for f in functions]
+    return Source(
+        text.count("\n"),
+        "'r5dgs[" in text,
+        named_extras(nodes),
+        packages(tree.body),
+        packages(nodes),
+        [f"{f.name}, {length} lines" for f, length in zip(functions, lengths, strict=True) if length > 60],
+    )
 
 
 def named_extras(nodes: list[ast.AST]) -> set[str]:
-    """Extras that calls of `r5dgs_core.extras` in a module name literally."""
+    """Extras that calls of `r5dgs_core.extras` name literally."""
     position = {"required": 1, "command": 0}
     calls = [
         node
@@ -86,12 +118,22 @@ def named_extras(nodes: list[ast.AST]) -> set[str]:
     return {argument.value for argument in given if isinstance(argument, ast.Constant)}
 
 
+def packages(nodes: list[ast.AST] | list[ast.stmt]) -> set[str]:
+    """Packages that import statements name."""
+    found = set()
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            found.add((node.module or "").split(".")[0])
+    return found
+
+
 def test_every_extra_in_a_message_exists_and_only_one_module_writes_the_command():
     named, by_hand = set(), []
     for path in (ROOT / "r5dgs_core").rglob("*.py"):
-        text, _, nodes = source(path)
-        named |= named_extras(nodes)
-        if "'r5dgs[" in text and path.name != "extras.py":
+        named |= source(path).extras
+        if source(path).writes_extra and path.name != "extras.py":
             by_hand.append(path)
     named |= {export_formats.get(name).extra for name in export_formats.MODULES} - {None}
     assert {"encoders", "open_clip", "cuda"} <= named <= set(EXTRAS) and not by_hand
@@ -113,12 +155,7 @@ def imported_packages(*, late: bool) -> set[str]:
     """Packages that modules of the core import at their top and, if ``late``, inside functions too."""
     found = set()
     for path in (ROOT / "r5dgs_core").rglob("*.py"):
-        _, tree, nodes = source(path)
-        for node in nodes if late else tree.body:
-            if isinstance(node, ast.Import):
-                found |= {alias.name.split(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and not node.level:
-                found.add((node.module or "").split(".")[0])
+        found |= source(path).late_packages if late else source(path).packages
     return {normal(name) for name in found - sys.stdlib_module_names}
 
 
@@ -261,12 +298,6 @@ def test_files_and_functions_of_the_product_stay_short():
     files = [p for room in ("r5dgs_core", "r5dgs_addon", "operators") for p in (ROOT / room).rglob("*.py")]
     long = []
     for path in (p for p in files if kernels not in p.parents):
-        text, _, nodes = source(path)
-        if text.count("\n") > 350:
-            long.append(f"{path.relative_to(ROOT)}: {text.count(chr(10))} lines")
-        for node in nodes:
-            if isinstance(node, ast.FunctionDef):
-                first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
-                if node.end_lineno - first + 1 > 60:
-                    long.append(f"{path.relative_to(ROOT)}: {node.name}, {node.end_lineno - first + 1} lines")
+        name, facts = path.relative_to(ROOT), source(path)
+        long += [f"{name}: {facts.lines} lines"] * (facts.lines > 350) + [f"{name}: {text}" for text in facts.long]
     assert len(files) > 500 and long == []
