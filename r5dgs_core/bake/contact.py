@@ -9,7 +9,7 @@ from typing import Any
 
 from ..contact import scene_future
 from ..contact.scene_future import Prediction
-from ..errors import BackendError
+from ..errors import BackendError, Interrupted, R5dgsError
 from ..scene.scene import MotionGroup
 from .draft import Context, Draft, Need
 
@@ -25,6 +25,11 @@ def apply(draft: Draft, context: Context) -> Draft:
         found = scene_future.predict(draft.scene)
     except BackendError as error:
         log.warning("a predicted motion passes through another body or the ground; %s", error)
+        return draft
+    except Interrupted:
+        raise
+    except R5dgsError as error:
+        log.warning("no contacts are predicted: %s", error)
         return draft
     for line in found.lines:
         log.warning("%s", line)

@@ -10,6 +10,7 @@ from .. import errors
 
 FOOT = 0.03  # of the size: height of the lowest layer of a hull that is pressed flat
 _MOST_FOOT = 0.12
+_MOST_OF_HEIGHT = 0.25  # the same as a share of the height of a hull that is thin
 _MARGIN = 0.02  # of the size: distance of the centre of mass from the border of the foot
 
 
@@ -30,6 +31,15 @@ class Solid:
     volume: float
     center: np.ndarray
     inertia: np.ndarray
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Outward unit normals of the F triangles that are no lines. [F, 3]"""
+        a, b, c = np.moveaxis(self.vertices[self.triangles], 1, 0)
+        normals = np.cross(b - a, c - a)
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        rows = lengths[:, 0] > 1e-12 * self.size**2
+        return normals[rows] / lengths[rows]
 
     @property
     def size(self) -> float:
@@ -79,7 +89,7 @@ def with_flat_foot(vertices: np.ndarray, up: np.ndarray, foot: float = FOOT) -> 
 
     The bottom of an object is seldom seen, so its hull ends in a corner, on which the body would tip over. A layer of
     ``foot`` times the size is cut off, and the vertices within such a layer above it are moved onto the cut. The layer
-    grows up to `_MOST_FOOT` until the centre of mass is well above the foot.
+    grows up to `_MOST_FOOT` until the centre of mass is well above the foot. It is at most a quarter of the height.
 
     Args:
         vertices: Corners of a hull. [V, 3]
@@ -93,15 +103,17 @@ def with_flat_foot(vertices: np.ndarray, up: np.ndarray, foot: float = FOOT) -> 
     Raises:
         ConfigError: The hull is flat.
     """
-    size = float(np.ptp(vertices, axis=0).max())
+    size, tall = float(np.ptp(vertices, axis=0).max()), float(np.ptp(vertices @ up))
+    most = min(_MOST_FOOT, _MOST_OF_HEIGHT * tall / max(size, 1e-300))
+    foot = min(foot, most)
     heights, flat = vertices @ up, np.linalg.svd(up[None])[2][1:]
     while True:
         floor = float(heights.min()) + foot * size
         low = heights < floor + foot * size
         pressed = vertices + np.where(low, floor - heights, 0.0)[:, None] * up
-        if foot >= _MOST_FOOT or _inside(flat @ of(pressed).center, pressed[low] @ flat.T) > _MARGIN * size:
+        if foot >= most or _inside(flat @ of(pressed).center, pressed[low] @ flat.T) > _MARGIN * size:
             return pressed, floor
-        foot *= 1.25
+        foot = min(1.25 * foot, most)
 
 
 def _inside(point: np.ndarray, corners: np.ndarray) -> float:

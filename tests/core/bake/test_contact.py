@@ -5,6 +5,7 @@ import types
 
 import pytest
 
+from r5dgs_core import errors
 from r5dgs_core.bake import contact
 from r5dgs_core.bake.draft import Draft
 from r5dgs_core.config.sections.needs import NeedsSection
@@ -33,6 +34,15 @@ def test_a_body_that_would_pass_through_the_floor_gets_contacts_and_a_row_with_t
 def test_without_need_or_by_the_users_wish_the_draft_stays(scene, wanted):
     draft, after = baked(scene, wanted)
     assert after is draft
+
+
+def test_an_object_that_cannot_be_simulated_does_not_stop_the_bake(monkeypatch, caplog):
+    def refuse(scene):
+        raise errors.ConfigError("the points of a hull lie in a plane")
+
+    monkeypatch.setattr(contact.scene_future, "predict", refuse)
+    draft, after = baked(FALLING)
+    assert after is draft and "no contacts are predicted: the points of a hull" in caplog.text
 
 
 def test_without_mujoco_the_smooth_motion_stays_and_the_command_is_named(monkeypatch, caplog):

@@ -60,3 +60,18 @@ def test_the_foot_grows_until_the_body_stands():
         side = np.array([np.cos(angle), np.sin(angle)])
         assert (foot @ side).max() > body.center[:2] @ side
     assert len(foot) >= 3
+
+
+@pytest.mark.parametrize("thickness", [0.05, 0.01, 1e-4])
+def test_a_thin_body_keeps_most_of_its_height(thickness):
+    up = np.array([0.0, 0, 1])
+    pressed, floor = solid.with_flat_foot(CORNERS * [1, 1, thickness], up)
+    assert np.ptp(solid.of(pressed).vertices @ up) >= 0.7 * thickness
+    assert floor + 0.5 * thickness <= 0.3 * thickness
+
+
+def test_the_normals_of_a_box_are_those_of_its_sides():
+    found = solid.of(CORNERS * [1, 2, 3]).normals
+    assert {tuple(row) for row in found.round(9) + 0.0} == {
+        tuple(row) for row in np.concatenate([np.eye(3), -np.eye(3)])
+    }
