@@ -55,7 +55,6 @@ def sample(
     times: np.ndarray,
     count: int,
     rng: np.random.Generator,
-    widened: float = WIDENED,
 ) -> Futures:
     """Simulate samples of an estimate.
 
@@ -65,12 +64,10 @@ def sample(
         times: Times, increasing and not before that of the estimate. [T]
         count: Number of samples N.
         rng: Source of the samples.
-        widened: Factor on the standard deviations.
     """
-    deviations = rng.normal(size=(count, PARAMETERS)) @ np.linalg.cholesky(estimate.covariance).T * widened
     quats, places = np.empty((len(times), count, 4)), np.empty((len(times), count, 3))
-    for n, x in enumerate(deviations):
-        state, material = fitter.moved(estimate.state, estimate.material, x)
+    for n in range(count):
+        state, material = draw(fitter, estimate, rng)
         quats[:, n], places[:, n] = fitter.poses(state, material, times - estimate.time)
     good = np.isfinite(places).all(axis=(0, 2))
     return Futures(times, quats[:, good], places[:, good])

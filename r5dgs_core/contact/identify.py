@@ -7,7 +7,7 @@ the body and times in sqrt(size / g), then the logarithm of the friction and the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -169,8 +169,7 @@ class Fitter:
         """State of an estimate at a later time."""
         self.simulation.touch(self._materials(estimate.material))
         self.simulation.load(self._all(estimate.state))
-        self.simulation.advance(time - estimate.time)
-        return self.simulation.state().one(self.body)
+        return self.simulation.state_at(time - estimate.time).one(self.body)
 
     def poses(self, state: State, material: Material, times: np.ndarray) -> se3.Pose:
         """Poses of the body at times since a state. [T, 4], [T, 3]"""
@@ -234,8 +233,3 @@ def _logs(material: Material) -> np.ndarray:
     """Logarithm of the friction and logit of the restitution. [2]"""
     e = min(max(material.restitution, 1e-3), 1 - 1e-3)
     return np.array([np.log(max(material.friction, 1e-4)), np.log(e / (1 - e))])
-
-
-def scaled(estimate: Estimate, factor: float) -> Estimate:
-    """Estimate with standard deviations multiplied by a factor."""
-    return replace(estimate, covariance=factor**2 * estimate.covariance)

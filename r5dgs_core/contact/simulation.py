@@ -90,6 +90,13 @@ class Simulation:
         if steps > 0:
             self.mujoco.mj_step(self.model, self.data, steps)
 
+    def state_at(self, time: float) -> State:
+        """Simulate up to a time, the rest after the last whole step at constant rates, and return the state there."""
+        self.advance(time)
+        now, rest = self.state(), time - self.data.time
+        quats = rotations.multiply(rotations.rotvecs_to_quats(rest * now.spins), now.quats)
+        return State(now.places + rest * now.velocities, quats, now.velocities, now.spins)
+
     @property
     def failed(self) -> bool:
         """True if MuJoCo has reset the state because of a number that is not finite or huge."""
@@ -111,10 +118,8 @@ class Simulation:
         self.load(state)
         quats, places = np.empty((len(times), len(state.places), 4)), np.empty((len(times), len(state.places), 3))
         for row, time in enumerate(times):
-            self.advance(float(time))
-            now, rest = self.state(), float(time) - self.data.time
-            places[row] = now.places + rest * now.velocities
-            quats[row] = rotations.multiply(rotations.rotvecs_to_quats(rest * now.spins), now.quats)
+            now = self.state_at(float(time))
+            quats[row], places[row] = now.quats, now.places
         if self.failed:
             places[:], quats[:] = np.nan, np.nan
         return quats, places

@@ -13,7 +13,7 @@ PENETRATION = 0.01  # of the size, at an impact
 DRAFT_PENETRATION = 0.04  # the same for fits and samples, whose final poses are as good
 SAG = 30.0  # lowest frequency of a contact, in units of sqrt(g / size)
 DRAFT_STEP, FINE_STEP = 0.25, 0.1  # w dt
-MOST_STEPS = 200_000  # in one simulation
+MOST_STEPS = 200_000  # up to the horizon; the shown path goes on until all bodies rest, for a few times as long
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,3 @@ def choose(speed: float, size: float, gravity: float, duration: float, draft: bo
     frequency = max(speed / (share * size), SAG * math.sqrt(gravity / size), 1e-6)
     frequency = min(frequency, fraction * MOST_STEPS / max(duration, 1e-12))
     return Stepping(frequency, fraction / frequency)
-
-
-def penetration(speed: float, stepping: Stepping, e: float) -> float:
-    """Estimate the largest penetration at an impact: between 0.14 v / w without bounce and 0.95 v / w at e = 0.9."""
-    return speed / stepping.frequency * min(0.14 + 1.2 * e, 1.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r5dgs_core.contact import futures, identify
+from r5dgs_core.contact import futures, identify, world
 from r5dgs_core.motion import rotations
 from tests.support import contacts
 from tests.support.contacts import SIZE
@@ -57,8 +57,19 @@ def test_a_flight_tells_nothing_about_the_material():
     estimate = fitter.run()
     assert len(fitter.track) >= 3
     np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance))[12:], [0.6, 1.0], rtol=0.2)
-    narrow, wide = (
+    first, again = (
         futures.sample(fitter, estimate, times[[3, -1]], 24, np.random.default_rng(1)).radii(places[[3, -1]], 0.9)
         for _ in range(2)
     )
-    assert narrow.tolist() == wide.tolist() and wide[1] > 2 * wide[0]
+    assert first.tolist() == again.tolist() and first[1] > 2 * first[0]
+
+
+def test_the_state_between_two_steps_is_that_of_the_poses_there():
+    fitter, _, _ = observed(0.11, height=0.22)
+    start = fitter.ballistic(fitter.track)
+    estimate = identify.Estimate(start, 0.0, world.Material(0.3, 0.3), np.eye(identify.PARAMETERS), 0.0, 0.0)
+    late = 20.9 * fitter.simulation.stepping.step
+    quats, places = fitter.poses(start, estimate.material, np.array([late]))
+    found = fitter.at(estimate, late)
+    np.testing.assert_allclose(found.places, places, atol=1e-12)
+    np.testing.assert_allclose(found.quats, quats, atol=1e-12)

@@ -121,6 +121,5 @@ def test_a_missing_package_is_one_error_with_the_command(monkeypatch):
 def test_the_step_shrinks_with_speed_and_never_exceeds_the_number_of_steps():
     slow, fast = (stepping.choose(speed, SIZE, G, 1.0) for speed in (1.0, 3.0))
     assert fast.step == pytest.approx(slow.step / 3) and stepping.choose(1.0, SIZE, G, 1.0, True).step > slow.step
-    assert 1e6 / stepping.choose(1e3, SIZE, G, 1e6).step <= stepping.MOST_STEPS * (1 + 1e-9) * 1e6
+    assert 1e6 / stepping.choose(1e3, SIZE, G, 1e6).step <= stepping.MOST_STEPS * (1 + 1e-9)
     assert stepping.choose(0.0, SIZE, 0.0, 1.0).step > 0
-    assert stepping.penetration(2.0, fast, 0.9) > stepping.penetration(2.0, fast, 0.1) > 0
