@@ -37,7 +37,7 @@ def of(scene: Scene, count: int, seed: int = 0) -> list[Odds]:
     Args:
         scene: The scene; motions with contacts that it stores are predicted again.
         count: Number of sampled futures.
-        seed: Their seed.
+        seed: Their seed. Futures whose simulation fails are left out.
 
     Raises:
         BackendError: Contacts are needed and MuJoCo is not installed.
@@ -53,7 +53,11 @@ def of(scene: Scene, count: int, seed: int = 0) -> list[Odds]:
     runs, futures = made.draft(scene.t_max, duration), []
     for state, materials in made.draws(scene.t_max, list(found.materials), wishes):
         runs.touch(materials)
-        futures.append(recording.record(runs, state, duration))
+        future = recording.record(runs, state, duration)
+        if not runs.failed:
+            futures.append(future)
+    if not futures:
+        return []
     return [_odds(made, number, futures) for number, body in enumerate(made.bodies) if body.name in found.taken]
 
 
