@@ -26,9 +26,14 @@ def of_damping(z: float) -> float:
     return math.exp(-z / s * phase)
 
 
+def limited(e: float) -> float:
+    """Restitution that is simulated for a wanted one."""
+    return min(max(e, LEAST), MOST)
+
+
 def damping_of(e: float) -> float:
     """Damping ratio of a restitution, clipped to [`LEAST`, `MOST`]; inverse of `of_damping`."""
-    e = min(max(e, LEAST), MOST)
+    e = limited(e)
     low, high = 0.0, _HEAVY
     for _ in range(60):
         middle = 0.5 * (low + high)

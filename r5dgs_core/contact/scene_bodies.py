@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,8 +28,8 @@ class SceneBody:
         group: Its motion group; group 0 for an object that is part of the background's motion.
         name: Name of its object.
         solid: Its shape in the bind state.
-        moves: True if it moved in the observed time.
-        reason: Why its motion is not that of a free body, or "".
+        moves: True if it moves at t_max.
+        reason: Reason for not simulating its motion, or "".
     """
 
     group: MotionGroup
@@ -54,8 +55,8 @@ def of(scene: Scene) -> tuple[list[SceneBody], list[str]]:
         except errors.ConfigError as error:
             lines.append(f"{name}: has no contacts: {error}")
             continue
-        moves = bool(group.id and np.any(scene.tracks.poses[group.id, :, 1:] != 0))
-        found.append(SceneBody(group, name, shape, moves, _reason(scene, group) if moves else ""))
+        body = SceneBody(group, name, shape, _moves(scene, group), "")
+        found.append(dataclasses.replace(body, reason=_reason(scene, body) if body.moves else ""))
     return found, lines
 
 
@@ -73,10 +74,17 @@ def gravity(scene: Scene, bodies: list[SceneBody]) -> np.ndarray | None:
     return -STANDARD_GRAVITY * seconds**2 / meters * up
 
 
-def track(scene: Scene, body: SceneBody) -> Track:
-    """Return the observed poses of a body since it last set off, with their errors."""
+def track(scene: Scene, body: SceneBody, center: np.ndarray | None = None) -> Track:
+    """Return the observed poses of a body since it last set off, with their errors.
+
+    Args:
+        scene: The scene.
+        body: The body.
+        center: Centre of mass in the bind state whose places to return; None for that of the body's shape. [3]
+    """
+    center = body.solid.center if center is None else center
     group, times = body.group, scene.tracks.times
-    poses, center, size = scene.tracks.poses[group.id], body.solid.center, body.solid.size
+    poses, size = scene.tracks.poses[group.id], body.solid.size
     arms = rotations.rotate(poses[:, :4], np.broadcast_to(center - group.pivot, (len(times), 3)))
     place, turn = np.full(len(times), _PLACE_NOISE * size), np.full(len(times), _TURN_NOISE)
     known = group.history.errors
@@ -103,9 +111,14 @@ def _falls(model: models.MotionModel, up: np.ndarray) -> bool:
     return falling and length > 0 and float(-a @ up) > np.cos(_VERTICAL) * length
 
 
-def _reason(scene: Scene, group: MotionGroup) -> str:
-    """Return why a body is driven, such as by a hand, a motor or a string, or ""."""
-    model, up = group.smooth or group.model, world_axes.UP_AXIS.get(scene.world_convention)
+def _moves(scene: Scene, group: MotionGroup) -> bool:
+    still = (group.smooth or group.model).kind == "static" and group.parent is None and group.follows is None
+    return bool(group.id and not still and np.any(scene.tracks.poses[group.id, :, 1:] != 0))
+
+
+def _reason(scene: Scene, body: SceneBody) -> str:
+    """Return the reason for not simulating a body, such as that a hand, a motor or a string drives it, or ""."""
+    group, model, up = body.group, body.smooth, world_axes.UP_AXIS.get(scene.world_convention)
     if group.joint is not None or group.parent is not None or group.follows is not None:
         return "it is a part of another body"
     if model.kind not in _FREE or model.frequency > 0 or model.angular_acceleration.any() and model.center_offset.any():
@@ -113,4 +126,6 @@ def _reason(scene: Scene, group: MotionGroup) -> str:
     free = ("translation", "ballistic_spin", "free_top")
     if model.kind in free and model.acceleration.any() and up is not None and not _falls(model, up):
         return "it accelerates otherwise than by gravity"
+    if not len(track(scene, body)):
+        return "it was not seen since it set off"
     return ""

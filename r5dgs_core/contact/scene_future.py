@@ -1,4 +1,4 @@
-"""Motion of a scene's bodies past t_max with contacts, where the smooth motion would pass through something."""
+"""Motion of a scene's bodies past t_max with contacts, if the smooth motion would pass through something."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from ..motion import history, rotations, se3
 from ..scene import predictability, world_axes
 from ..scene.scene import MotionGroup, Scene
+from ..shapes import directions
 from . import futures, path_knots, recording, scene_bodies, scene_world, world
 from .recording import Recording
 from .scene_bodies import SceneBody
@@ -23,6 +24,7 @@ KNOTS = 16  # of a band
 UNPREDICTABLE = 0.35  # half width of a band, in sizes, beyond which a motion is not predictable
 _BEYOND = 4.0  # time that is simulated if the bodies do not come to rest, over the time to the horizon
 _TIMES = 64  # at which smooth motions are tested
+_DIRECTIONS = directions.sphere(128)  # in which an overlap is measured, besides those of the faces
 
 
 @dataclass(frozen=True)
@@ -67,9 +69,9 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     up = world_axes.UP_AXIS.get(scene.world_convention)
     passing = _passing(scene, bodies, end, up)
     depths = {bodies[number].name: depth for number, depth in passing.items()}
-    driven = [number for number in passing if bodies[number].reason]
-    lines += [f"{bodies[n].name}: moves on without contacts: {bodies[n].reason}" for n in driven]
     pushed = {number for number, body in enumerate(bodies) if body.group.id in wishes.pushes}
+    driven = [n for n in passing if bodies[n].reason and n not in pushed]
+    lines += [f"{bodies[n].name}: moves on without contacts: {bodies[n].reason}" for n in driven]
     tried = (set(passing) - set(driven)) | pushed
     if not tried:
         return Prediction(scene.groups, depths, {}, tuple(lines))
@@ -77,7 +79,7 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     if pull is None or up is None:
         reason = "gravity is unknown: no body was seen to fall, and the scene has no up axis or no units"
         return Prediction(scene.groups, depths, {}, (*lines, f"no contacts are predicted: {reason}"))
-    made = scene_world.make(scene, bodies, tried, pull, end)
+    made = scene_world.make(scene, bodies, tried, pushed, pull, end)
     return _simulated(scene, made, wishes, end, depths, [*lines, *made.lines])
 
 
@@ -138,7 +140,8 @@ def _with_contact(
     t_max: float,
 ) -> MotionGroup:
     body, smooth = made.bodies[number], group.smooth or group.model
-    model = path_knots.model(found, number, body.solid.center, group.pivot, body.solid.size, smooth.fade_time)
+    center = made.world.bodies[number].solid.center
+    model = path_knots.model(found, number, center, group.pivot, body.solid.size, smooth.fade_time)
     model = dataclasses.replace(model, radius=smooth.radius)
     past = group.history
     if sampled is not None and sampled.quats.shape[1]:
@@ -171,7 +174,7 @@ def _passing(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray |
     for number in sinking if plane is not None else ():
         assert plane is not None
         body, track = world.Body(bodies[number].solid), scene_bodies.track(scene, bodies[number])
-        lowest = min(float(world.gaps(body, plane, track.places, track.quats).min()), 0.0)
+        lowest = float(world.gaps(body, plane, track.places, track.quats).min(initial=0.0))
         found[number] = max(
             found[number], lowest - float(world.gaps(body, plane, paths[number][1], paths[number][0]).min())
         )
@@ -180,25 +183,33 @@ def _passing(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray |
 
 
 def _sinks(scene: Scene, body: SceneBody, path: se3.Pose, up: np.ndarray) -> bool:
-    """Return True if a body is predicted to be lower than it was ever seen."""
+    """Return True if a body is predicted to be lower than it was ever seen, or was not seen."""
     track, flat = scene_bodies.track(scene, body), world.Plane(up, 0.0)
     seen, ahead = (
-        float(world.gaps(world.Body(body.solid), flat, places, quats).min())
+        float(world.gaps(world.Body(body.solid), flat, places, quats).min(initial=np.inf))
         for quats, places in ((track.quats, track.places), path)
     )
     return ahead < seen - PENETRATION * body.solid.size
 
 
 def _overlap(body: SceneBody, path: se3.Pose, other: SceneBody, others_path: se3.Pose) -> float:
-    """Largest increase of the overlap of two bodies since t_max, along the line of their centres."""
+    """Largest increase of the overlap of two bodies since t_max: the least shift, of many, that takes them apart."""
     apart = others_path[1] - path[1]
-    distances = np.maximum(np.linalg.norm(apart, axis=1), 1e-12)
-    towards = apart / distances[:, None]
-    depths = _reach(body, path[0], towards) + _reach(other, others_path[0], -towards) - distances
+    lines = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
+    turns, others_turns = rotations.quats_to_rotmats(path[0]), rotations.quats_to_rotmats(others_path[0])
+    normals, others_normals = body.solid.normals, other.solid.normals
+
+    def depth(time: int, towards: np.ndarray) -> float:
+        own, others = _reach(body, towards @ turns[time]), _reach(other, -towards @ others_turns[time])
+        return float((own + others - towards @ apart[time]).min())
+
+    depths = np.array([depth(time, lines[time : time + 1]) for time in range(len(apart))])
+    for time in np.flatnonzero(depths >= 0).tolist():  # elsewhere, they do not overlap
+        faces = normals @ turns[time].T, -others_normals @ others_turns[time].T
+        depths[time] = min(depths[time], depth(time, np.concatenate([_DIRECTIONS, *faces])))
     return float((depths - max(depths[0], 0.0)).max())
 
 
-def _reach(body: SceneBody, quats: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """Farthest point of a turned body along directions, from its centre. [T, 4], [T, 3] -> [T]"""
-    arms = body.solid.vertices - body.solid.center
-    return (rotations.rotate(rotations.conjugate(quats), towards) @ arms.T).max(axis=1)
+def _reach(body: SceneBody, towards: np.ndarray) -> np.ndarray:
+    """Farthest point of a body along directions in its bind state, from its centre. [D, 3] -> [D]"""
+    return (towards @ (body.solid.vertices - body.solid.center).T).max(axis=1)

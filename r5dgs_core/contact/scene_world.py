@@ -11,7 +11,7 @@ import numpy as np
 from ..motion import models
 from ..scene.scene import Scene
 from ..shapes import solid
-from . import futures, scene_bodies, stepping, support, world
+from . import futures, restitution, scene_bodies, stepping, support, world
 from .identify import Estimate, Fitter
 from .scene_bodies import SceneBody
 from .simulation import Simulation
@@ -19,6 +19,7 @@ from .stepping import Stepping
 from .world import Body, Material, Plane, State, World
 
 SAMPLES = 32
+_LEAST_POSES = 3
 _MISFIT = 30.0  # mean squared residual in units of the noise above which contacts do not explain the poses
 _TOUCHED = 0.05  # lowest observed gap, in sizes, of a body that has touched the plane
 _STANDS = 0.15  # the same of a body that stands on it; others are held by something
@@ -79,7 +80,7 @@ class SceneWorld:
             elif body.moves:
                 _, _, spin, velocity = models.evaluate_with_rates(body.smooth, 0.0)
                 state.spins[number] = spin
-                state.velocities[number] = velocity + np.cross(spin, body.solid.center - body.group.pivot)
+                state.velocities[number] = velocity + np.cross(spin, state.places[number] - body.group.pivot)
         return state
 
     def stepping(self, state: State, duration: float, draft: bool = False) -> Stepping:
@@ -121,8 +122,8 @@ class SceneWorld:
             yield state, used
 
     def text(self, number: int, material: Material) -> str:
-        """Material of a body in words."""
-        words = f"friction {material.friction:.2g}, restitution {material.restitution:.2g}"
+        """Material of a body in words, as it is simulated."""
+        words = f"friction {material.friction:.2g}, restitution {restitution.limited(material.restitution):.2g}"
         if number not in self.fits:
             return f"{words}, both assumed"
         deviation = float(np.sqrt(self.fits[number][1].covariance[12, 12]))
@@ -137,41 +138,67 @@ def plane(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray) -> 
     return support.find(scene, up, np.concatenate(points), min(body.solid.size for body in chosen))
 
 
-def make(scene: Scene, bodies: list[SceneBody], tried: set[int], gravity: np.ndarray, end: float) -> SceneWorld:
-    """Build the world of the bodies that are not driven, and fit those with numbers in ``tried``."""
+def make(
+    scene: Scene, bodies: list[SceneBody], tried: set[int], pushed: set[int], gravity: np.ndarray, end: float
+) -> SceneWorld:
+    """Build the world of the bodies whose motion may be simulated.
+
+    Args:
+        scene: The scene.
+        bodies: Its bodies.
+        tried: Numbers of those to fit. Without a fit, they are left out, as driven bodies are.
+        pushed: Numbers of those among them that the user pushes; they are kept and not fixed.
+        gravity: Acceleration of a falling body. [3]
+        end: Scene time up to which to simulate.
+    """
     up = -gravity / max(float(np.linalg.norm(gravity)), 1e-300)
     below = plane(scene, bodies, end, up)
     lines = [] if below is not None else ["no plane was found under the bodies"]
-    kept = [number for number, body in enumerate(bodies) if not (body.moves and body.reason) or number in tried]
-    chosen = [bodies[number] for number in kept]
-    made = _apart(World(tuple(_body(scene, body, below) for body in chosen), below, gravity))
-    fits = {}
-    for row, number in enumerate(kept):
-        if number not in tried or not chosen[row].moves:
-            continue
-        fitter, estimate = _fit(scene, chosen[row], made.bodies[row], below, gravity, end)
-        if estimate is None or estimate.misfit > _MISFIT:
-            lines.append(f"{chosen[row].name}: moves on without contacts: they do not explain its poses")
-            continue
-        fits[row] = fitter, estimate
-        changed = dataclasses.replace(made.bodies[row], material=estimate.material)
-        made = dataclasses.replace(made, bodies=(*made.bodies[:row], changed, *made.bodies[row + 1 :]))
-    return SceneWorld(tuple(chosen), made, fits, tuple(lines))
+    kept = [n for n, body in enumerate(bodies) if not (body.moves and body.reason) or n in tried]
+    shapes = tuple(_body(scene, bodies[n], below, n in pushed) for n in kept)
+    made = _apart(World(shapes, below, gravity))
+    chosen, own, fits = [], [], {}
+    for number, shape in zip(kept, made.bodies, strict=True):
+        body = bodies[number]
+        if number in tried and body.moves:
+            fitter, estimate = _fit(scene, body, shape, below, gravity, end)
+            reason = _misfit(estimate)
+            if estimate is not None and not reason:
+                fits[len(chosen)] = fitter, estimate
+                shape = dataclasses.replace(shape, material=estimate.material)
+            elif number in pushed:
+                lines.append(f"{body.name}: is pushed out of its smooth motion: {reason}")
+            else:
+                lines.append(f"{body.name}: moves on without contacts: {reason}")
+                continue
+        chosen.append(body)
+        own.append(shape)
+    return SceneWorld(tuple(chosen), World(tuple(own), below, gravity), fits, tuple(lines))
 
 
-def _body(scene: Scene, body: SceneBody, below: Plane | None) -> Body:
+def _misfit(estimate: Estimate | None) -> str:
+    """Return the reason for not using an estimate, or ""."""
+    if estimate is None:
+        return f"fewer than {_LEAST_POSES} poses were seen since it set off"
+    return "" if estimate.misfit <= _MISFIT else "contacts do not explain its poses"  # not a number is a misfit too
+
+
+def _body(scene: Scene, body: SceneBody, below: Plane | None, pushed: bool) -> Body:
     """Shape and floor of a body."""
     if below is None:
-        return Body(body.solid, fixed=not body.moves)
+        return Body(body.solid, fixed=not (body.moves or pushed))
     own = Body(body.solid)
     if body.moves:
         track = scene_bodies.track(scene, body)
-        lowest = float(world.gaps(own, below, track.places, track.quats).min())
+        lowest = float(world.gaps(own, below, track.places, track.quats).min(initial=np.inf))
         touched = lowest < _TOUCHED * body.solid.size
         return dataclasses.replace(own, floor=below.height + lowest if touched else None)
     gap = float((body.solid.vertices @ below.normal).min()) - below.height
-    if abs(gap) > _STANDS * body.solid.size or not body.group.id:
+    stands = abs(gap) <= _STANDS * body.solid.size and body.group.id
+    if not stands and not pushed:
         return dataclasses.replace(own, fixed=True)
+    if not stands and gap > 0:  # it stands on something else
+        return own
     points, floor = solid.with_flat_foot(body.solid.vertices, below.normal)
     return Body(solid.of(points), floor=floor)
 
@@ -203,16 +230,16 @@ def _apart(made: World) -> World:
 def _fit(
     scene: Scene, body: SceneBody, shape: Body, below: Plane | None, gravity: np.ndarray, end: float
 ) -> tuple[Fitter, Estimate | None]:
-    """Fit a body alone over the plane."""
+    """Fit a body alone over the plane; no estimate if it was seen too seldom."""
     alone = World((shape,), below, gravity)
-    track = scene_bodies.track(scene, body)
+    track = scene_bodies.track(scene, body, shape.solid.center)
     span = end - (track.times[0] if len(track) else end)
     state = world.at_rest(alone)
     if len(track) > 1:
-        state.velocities[0] = np.diff(track.places, axis=0).max(axis=0) / np.diff(track.times).min()
+        state.velocities[0] = np.abs(np.diff(track.places, axis=0)).max(axis=0) / np.diff(track.times).min()
     chosen = _stepping(alone, state, span, shape.solid.size, draft=True)
     fitter = Fitter(Simulation(alone, chosen), track)
-    return fitter, fitter.run() if len(track) >= 3 else None
+    return fitter, fitter.run() if len(track) >= _LEAST_POSES else None
 
 
 def _stepping(made: World, state: State, duration: float, size: float, draft: bool) -> Stepping:

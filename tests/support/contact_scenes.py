@@ -108,3 +108,12 @@ def with_units(made: Scene) -> Scene:
     """The scene with units in which gravity is `G`."""
     units = dataclasses.replace(made.units, seconds_per_unit=1.0, meters_per_unit=9.81 / G)
     return dataclasses.replace(made, units=units)
+
+
+def with_hull(made: Scene, number: int, center: list[float], sides: list[float]) -> Scene:
+    """The scene with the hull of a box replaced by a box with other sides."""
+    corners = contacts.box(np.array(center), tuple(sides)).solid.vertices
+    hulls = tuple(
+        dataclasses.replace(hull, vertices=corners) if hull.object_id == number else hull for hull in made.hulls
+    )
+    return dataclasses.replace(made, hulls=hulls)

@@ -97,11 +97,43 @@ def test_without_need_or_reason_the_groups_stay_and_nothing_is_simulated(bodies,
     assert bool(found.lines) == bool(line)
 
 
+def test_a_body_that_slides_on_a_board_does_not_pass_into_it(monkeypatch):
+    monkeypatch.setattr(scene_world, "Simulation", None)
+    model, center = contact_scenes.sliding(0.8)
+    scene = contact_scenes.scene((model, center + [0, 0, 0.04]), contact_scenes.resting(0.4))
+    scene = contact_scenes.with_hull(scene, 2, [0.4, 0.2, 0.02], [2.4, 1.2, 0.04])
+    assert not scene_future.predict(scene).penetrations
+
+
+def test_a_body_whose_poses_contacts_do_not_explain_moves_on_and_nothing_hits_it(monkeypatch):
+    fit = scene_world._fit
+
+    def unsound(scene, body, *rest):
+        fitter, estimate = fit(scene, body, *rest)
+        return fitter, estimate if body.name == "box 1" else dataclasses.replace(estimate, misfit=np.nan)
+
+    monkeypatch.setattr(scene_world, "_fit", unsound)
+    made = contact_scenes.scene(contact_scenes.sliding(1.5), contact_scenes.sliding(-0.5, 0.8))
+    found = scene_future.predict(contact_scenes.with_units(made), Wishes(samples=1))
+    assert "box 2: moves on without contacts: contacts do not explain its poses" in found.lines
+    assert found.groups[2] is made.groups[2] and "box 2" not in found.taken
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.3])
+def test_a_pushed_body_at_rest_moves_off_and_stays_over_the_floor(gap):
+    model, center = contact_scenes.resting()
+    scene = contact_scenes.with_units(contact_scenes.scene((model, center + [0, 0, gap])))
+    found = scene_future.predict(scene, Wishes(pushes={1: np.array([0.5, 0, 0])}, samples=1))
+    first, last = (models.evaluate(found.groups[1].model, tau)[1] for tau in (0.01, 2.0))
+    assert last[0] > 0.01 and abs(first[2]) < 1e-3 * SIZE
+    assert last[2] == pytest.approx(-gap, abs=1e-3 * SIZE if not gap else 0.1 * SIZE)
+
+
 def test_users_push_bodies_change_materials_and_leave_bodies_out(fallen):
     scene, _ = fallen
     ice = Wishes(materials={1: (0.0, 0.0)}, pushes={2: np.array([0.0, 1.0, 0.0])}, samples=2)
     found = scene_future.predict(scene, ice)
-    assert found.taken["box 1"].startswith("friction 0, restitution 0,")
+    assert found.taken["box 1"].startswith("friction 0, restitution 0.05,")  # the least that is simulated
     assert models.evaluate(found.groups[2].model, 0.5)[1][1] > 0.1
     assert not scene_future.predict(scene, Wishes(ignored=frozenset({1}))).taken
 
