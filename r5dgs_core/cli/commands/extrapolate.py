@@ -83,7 +83,8 @@ def run_extrapolate(
 
     Raises:
         UsageError: An argument is malformed.
-        ConfigError: Words match no object, or ``si`` is given for a scene without units.
+        ConfigError: Words match no object or one that is not simulated, ``until`` is not after t_max, or ``si`` is
+            given for a scene without units.
         BackendError: Contacts are needed and MuJoCo is not installed.
     """
     _check(until, samples)
@@ -98,6 +99,8 @@ def run_extrapolate(
 
     options.use_threads(threads)
     scene = scene_file.read(path)
+    if until is not None and until <= scene.t_max:
+        raise errors.ConfigError(f"--until {until:g}: expected a time after t_max = {scene.t_max:g}")
     scene = dataclasses.replace(scene, groups=contact.without(scene.groups))
     named = {"ignore": ignore, "push": velocities, "friction": frictions, "bounce": bounces}
     changes = _by_group(scene, named, _si_factor(scene, path) if si else 1.0)
@@ -117,11 +120,14 @@ def _by_group(scene: Scene, named: dict[str, Any], factor: float) -> dict[str, A
 
     materials: dict[int, tuple[float | None, float | None]] = {}
     for words, value in named["friction"]:
-        materials |= {g: (value, None) for g in _groups(scene, words, "--friction")}
+        materials |= {g: (value, None) for g in _simulated(scene, words, "--friction")}
     for words, value in named["bounce"]:
-        materials |= {g: (materials.get(g, (None,))[0], value) for g in _groups(scene, words, "--bounce")}
-    pushes = {g: factor * np.array(v) for words, v in named["push"] for g in _groups(scene, words, "--push")}
+        materials |= {g: (materials.get(g, (None,))[0], value) for g in _simulated(scene, words, "--bounce")}
+    pushes = {g: factor * np.array(v) for words, v in named["push"] for g in _simulated(scene, words, "--push")}
     ignored = frozenset(g for words in named["ignore"] for g in _groups(scene, words, "--ignore-contact"))
+    for number in sorted(ignored & pushes.keys()):
+        name = next(item.name for item in scene.objects if item.id == scene.groups[number].object_id)
+        raise errors.UsageError(f"--push and --ignore-contact both name {name}; remedy: leave one of them out")
     return {"pushes": pushes, "materials": materials, "ignored": ignored}
 
 
@@ -158,6 +164,19 @@ def _groups(scene: Scene, words: str, option: str) -> list[int]:
     """Bodies of the objects that words name."""
     ids = export.object_ids(scene, words, option)
     return [group.id for group in scene.groups if group.role == "body" and group.object_id in ids]
+
+
+def _simulated(scene: Scene, words: str, option: str) -> list[int]:
+    """Bodies of the objects that words name, each of which must have one that can be simulated."""
+    from ...contact import scene_bodies
+
+    bodies, lines = scene_bodies.of(scene)
+    usable = {body.group.id for body in bodies} & set(_groups(scene, words, option))
+    missing = export.object_ids(scene, words, option) - {scene.groups[number].object_id for number in usable}
+    for name in (item.name for item in scene.objects if item.id in missing):
+        reason = next((line for line in lines if line.startswith(f"{name}: ")), f"{name}: has no hull that can move")
+        raise errors.ConfigError(f"{option} {words!r}: {reason}; remedy: name other objects")
+    return sorted(usable)
 
 
 def _si_factor(scene: Scene, path: Path) -> float:

@@ -28,7 +28,7 @@ class NeedsSection:
         focal_lengths: Refinement of their focal lengths.
         time_offsets: Refinement of the offsets of their clocks.
         camera_colours: Refinement of the gain and offset of their colours.
-        contact: Contacts between bodies past t_max; needs the extra "contact".
+        contact: Contacts between bodies past t_max; needs the extra "contact". "on" equals "auto".
     """
 
     tracks: str = "auto"

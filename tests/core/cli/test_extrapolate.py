@@ -1,5 +1,7 @@
 """`r5dgs extrapolate`: pushes, materials and objects by words."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,8 @@ def test_ignoring_all_contacts_restores_the_smooth_motions(path, pushed, capsys)
         ({"samples": 0}, errors.UsageError, "--samples 0: expected 1 to 10000"),
         ({"until": np.inf}, errors.UsageError, "--until inf: expected a scene time"),
         ({"push": [("teapot", "1,0,0")]}, errors.ConfigError, "--push 'teapot'"),
+        ({"push": [("box 1", "1,0,0")], "ignore": ["box 1"]}, errors.UsageError, "both name box 1"),
+        ({"until": 0.6}, errors.ConfigError, "--until 0.6: expected a time after t_max = 0.6"),
         ({"push": [("box 1", "1,0,0")], "si": True}, errors.ConfigError, "--si: .* has no meters_per_unit"),
     ],
 )
@@ -66,3 +70,15 @@ def test_wrong_arguments_are_named(path, given, kind, message):
     with pytest.raises(kind, match=message):
         extrapolate.run_extrapolate(path, path.with_name("never.r5dgs"), **given)
     assert not path.with_name("never.r5dgs").exists()
+
+
+def test_objects_that_cannot_be_simulated_are_named(tmp_path):
+    made = contact_scenes.scene(contact_scenes.resting(), contact_scenes.resting(2.0))
+    flat = dataclasses.replace(made.hulls[0], vertices=made.hulls[0].vertices * [1, 1, 0])
+    path = scene_file.write(dataclasses.replace(made, hulls=(flat,)), tmp_path / "scene.r5dgs")
+    for given, message in [
+        ({"push": [("box 1", "1,0,0")]}, "--push 'box 1': box 1: has no contacts: the points of a hull lie in a plane"),
+        ({"friction": ["box 2=0.1"]}, "--friction 'box 2': box 2: has no hull that can move"),
+    ]:
+        with pytest.raises(errors.ConfigError, match=message):
+            extrapolate.run_extrapolate(path, path.with_name("never.r5dgs"), **given)
