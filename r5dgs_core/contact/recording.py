@@ -106,8 +106,8 @@ def _recording(
     quats = rotations.identity(count, len(bodies))
     spins, velocities = np.zeros((count, len(bodies), 3)), np.zeros((count, len(bodies), 3))
     poses, slopes = positions.reshape(count, -1, 7), rates.reshape(count, -1, 6)
-    places[:, moving], quats[:, moving] = poses[..., :3], poses[..., 3:]
-    velocities[:, moving] = slopes[..., :3]
+    places[:, moving], quats[:, moving] = simulation.unit * poses[..., :3], poses[..., 3:]
+    velocities[:, moving] = simulation.unit * slopes[..., :3]
     spins[:, moving] = rotations.rotate(poses[..., 3:], slopes[..., 3:])
     felt, wait = _FELT * np.abs(velocities).max(initial=0.0), 10 / simulation.stepping.frequency
     touches = []
@@ -126,7 +126,7 @@ def _slow(simulation: Simulation) -> np.ndarray:
     g = float(np.linalg.norm(simulation.world.gravity))
     sizes = np.array([body.solid.size for body in simulation.world.bodies if not body.fixed])
     rates = simulation.data.qvel.reshape(-1, 6)
-    speeds = np.linalg.norm(rates[:, :3], axis=1) + sizes * np.linalg.norm(rates[:, 3:], axis=1)
+    speeds = simulation.unit * np.linalg.norm(rates[:, :3], axis=1) + sizes * np.linalg.norm(rates[:, 3:], axis=1)
     return speeds < _REST_SPEED * np.sqrt(max(g, 1e-300) * sizes)
 
 

@@ -2,6 +2,7 @@
 
 MuJoCo's friction cone is elliptic, as the pyramidal one is wrong by 41 % in diagonal directions; its matrices are
 dense, as these are faster for few bodies; speculative contacts keep thin bodies from passing through each other.
+Its unit of length is the size of the largest body, because MuJoCo has smallest and largest values.
 """
 
 from __future__ import annotations
@@ -27,6 +28,11 @@ _TOUCHING = 1e-3  # penetration that stays in the initial state, as a share of a
 class Simulation:
     """A compiled world. Calls are independent of each other.
 
+    Attributes:
+        world, stepping: Those given.
+        unit: World units per MuJoCo's unit of length.
+        model, data, mujoco: MuJoCo's model, state and module.
+
     Raises:
         BackendError: MuJoCo is not installed.
         ConfigError: MuJoCo refuses a body.
@@ -39,7 +45,8 @@ class Simulation:
         mujoco.set_mju_user_warning(log.debug)  # it would write MUJOCO_LOG.TXT into the working directory
         self.mujoco = mujoco
         self.world, self.stepping = world, stepping
-        spec = _specification(mujoco, world, stepping)
+        self.unit = max((body.solid.size for body in world.bodies), default=1.0)
+        spec = _specification(mujoco, world, stepping, self.unit)
         try:
             self.model = spec.compile()
         except ValueError as error:
@@ -66,9 +73,9 @@ class Simulation:
         """Set the state at time 0."""
         self.mujoco.mj_resetData(self.model, self.data)
         for k, i in enumerate(self._moving):
-            self.data.qpos[7 * k : 7 * k + 3] = state.places[i]
+            self.data.qpos[7 * k : 7 * k + 3] = state.places[i] / self.unit
             self.data.qpos[7 * k + 3 : 7 * k + 7] = state.quats[i]
-            self.data.qvel[6 * k : 6 * k + 3] = state.velocities[i]
+            self.data.qvel[6 * k : 6 * k + 3] = state.velocities[i] / self.unit
             self.data.qvel[6 * k + 3 : 6 * k + 6] = rotations.rotate(
                 rotations.conjugate(state.quats[i]), state.spins[i]
             )
@@ -79,8 +86,8 @@ class Simulation:
         places = np.array([body.solid.center for body in self.world.bodies]).reshape(count, 3)
         quats, velocities, spins = rotations.identity(count), np.zeros((count, 3)), np.zeros((count, 3))
         poses, rates = self.data.qpos.reshape(-1, 7), self.data.qvel.reshape(-1, 6)
-        places[self._moving], quats[self._moving] = poses[:, :3], poses[:, 3:]
-        velocities[self._moving] = rates[:, :3]
+        places[self._moving], quats[self._moving] = self.unit * poses[:, :3], poses[:, 3:]
+        velocities[self._moving] = self.unit * rates[:, :3]
         spins[self._moving] = rotations.rotate(poses[:, 3:], rates[:, 3:])
         return State(places, quats, velocities, spins)
 
@@ -143,8 +150,9 @@ class Simulation:
         for contact in self.data.contact[: self.data.ncon]:
             pair = self._pair(contact)
             size = min(self.world.bodies[i].solid.size for i in pair if i >= 0)
-            if contact.dist < -_TOUCHING * size:
-                found[pair] = max(found.get(pair, 0.0), -float(contact.dist))
+            depth = -self.unit * float(contact.dist)
+            if depth > _TOUCHING * size:
+                found[pair] = max(found.get(pair, 0.0), depth)
         return found
 
     def _pair(self, contact: Any) -> tuple[int, int]:
@@ -154,40 +162,39 @@ class Simulation:
         return first, second
 
 
-def _specification(mujoco: Any, world: World, stepping: Stepping) -> Any:
-    """Model of a world before it is compiled: an `MjSpec`."""
+def _specification(mujoco: Any, world: World, stepping: Stepping, unit: float) -> Any:
+    """Model of a world before it is compiled: an `MjSpec`, with lengths in a unit and masses in that of the largest."""
     spec = mujoco.MjSpec()
     option = spec.option
-    option.timestep, option.gravity = stepping.step, world.gravity
+    option.timestep, option.gravity = stepping.step, world.gravity / unit
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.enableflags = int(mujoco.mjtEnableBit.mjENBL_SPECULATIVE)
     geom = spec.default.geom
     geom.condim, geom.solimp = 3, _IMPEDANCE
+    heaviest = max((body.density * body.solid.volume for body in world.bodies), default=1.0)
     for i, body in enumerate(world.bodies):
-        _add_body(mujoco, spec, i, body)
+        _add_body(mujoco, spec, i, body, unit, body.density * unit**3 / heaviest)
         if world.plane is not None and not body.fixed:
-            _add_floor(mujoco, spec, i, body, world)
+            _add_floor(mujoco, spec, i, body, world, unit)
     return spec
 
 
-def _add_body(mujoco: Any, spec: Any, number: int, body: Body) -> None:
+def _add_body(mujoco: Any, spec: Any, number: int, body: Body, unit: float, density: float) -> None:
     solid, name, radius = body.solid, f"body{number}", body.ball_radius
-    # Bodies of mass 1e-6 and of mass 1 behave alike, but MuJoCo has least values of mass and inertia.
-    added = spec.worldbody.add_body(name=name, pos=solid.center)
+    added = spec.worldbody.add_body(name=name, pos=solid.center / unit)
     if not body.fixed:
         added.add_freejoint()
-    density = body.density / solid.volume
     if radius is not None:
-        added.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], density=density)
+        added.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius / unit, 0, 0], density=density)
         return
     mesh = spec.add_mesh(name=name)
-    mesh.uservert, mesh.userface = (solid.vertices - solid.center).ravel(), solid.triangles.ravel()
+    mesh.uservert, mesh.userface = ((solid.vertices - solid.center) / unit).ravel(), solid.triangles.ravel()
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
     added.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, density=density)
 
 
-def _add_floor(mujoco: Any, spec: Any, number: int, body: Body, world: World) -> None:
+def _add_floor(mujoco: Any, spec: Any, number: int, body: Body, world: World, unit: float) -> None:
     """Add the plane on which a body rests; it touches that body alone."""
     assert world.plane is not None
     normal, height = world.plane.normal, world.plane.height if body.floor is None else body.floor
@@ -196,7 +203,7 @@ def _add_floor(mujoco: Any, spec: Any, number: int, body: Body, world: World) ->
         name=f"floor{number}",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=[0, 0, 0.05],
-        pos=height * normal,
+        pos=height / unit * normal,
         quat=quat,
         contype=0,
         conaffinity=0,

@@ -8,6 +8,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.contact import recording, simulation, stepping, world
+from r5dgs_core.shapes import solid
 from tests.support import contacts
 from tests.support.contacts import SIZE, G
 
@@ -57,6 +58,35 @@ def test_two_balls_exchange_momentum_and_keep_it():
     np.testing.assert_allclose(after[0] + 3 * after[1], [1, 0, 0], atol=1e-6)
     normal = np.array([0.3, 0.02, 0]) / np.hypot(0.3, 0.02)
     assert after[0, 0] < 0.0 < after[1, 0] and 0.5 < (after[1] - after[0]) @ normal <= 0.95
+
+
+def test_bodies_of_equal_density_have_masses_by_volume():
+    small = contacts.ball([0, 0, 0], restitution=0.9)
+    large = dataclasses.replace(small, solid=solid.of(2 * small.solid.vertices + [0.3, 0, 0]))
+    runs, state = contacts.simulate(world.World((small, large), None, np.zeros(3)))
+    state.velocities[0, 0] = 1.0
+    runs.load(state)
+    runs.advance(0.6)
+    after = runs.state().velocities
+    assert after[1, 0] > 0.1
+    np.testing.assert_allclose(after[0] + 8 * after[1], [1, 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [2.0**-40, 2.0**40])
+def test_the_unit_of_length_does_not_matter(scale):
+    def thrown(unit):
+        box = contacts.box([0, 0, 0.2], restitution=0.3)
+        box = dataclasses.replace(box, solid=solid.of(unit * box.solid.vertices))
+        place = world.World((box,), world.Plane(np.array([0, 0, 1.0]), -0.1 * unit), np.array([0, 0, -G * unit]))
+        runs, state = contacts.simulate(place, speed=2.0 * unit)
+        state.velocities[0], state.spins[0] = [unit, 0, 0], [1, 2, 3]
+        found = recording.record(runs, state, 0.6)
+        return found.places / unit, found.quats, len(found.touches)
+
+    (places, quats, touches), (expected, turns, count) = thrown(scale), thrown(1.0)
+    assert touches == count > 0
+    np.testing.assert_allclose(places, expected, atol=1e-5)
+    np.testing.assert_allclose(quats, turns, atol=1e-4)
 
 
 @pytest.mark.parametrize(
