@@ -104,7 +104,8 @@ def _draw(points: np.ndarray, covariances: np.ndarray, opacities: np.ndarray, sh
     far = (base < -radius[:, None]) | (base > np.array(shape) + radius[:, None])
     far |= radius[:, None] > _WINDOWS[-1]  # a larger one is no part of the object
     bucket = np.where(far.any(axis=1), len(_WINDOWS), np.searchsorted(_WINDOWS, radius))
-    rim = int(_WINDOWS[-1]) + 1  # around the picture, so that no window needs to be cut
+    # No window needs to be cut: centres are up to a window's half side off the picture, and the window reaches as far.
+    rim = 2 * int(_WINDOWS[bucket[bucket < len(_WINDOWS)]].max(initial=0)) + 2
     width = shape[1] + 2 * rim
     total = np.zeros((shape[0] + 2 * rim) * width)
     first = (base[:, 0] + rim) * width + base[:, 1] + rim

@@ -56,3 +56,16 @@ def test_a_silhouette_is_the_outline_of_the_joint_opacity():
     for found in silhouettes.of(*one):
         reach = found.sides - found.basis @ one[0][0] @ silhouettes.directions.circle(silhouettes.SIDES).T
         np.testing.assert_allclose(reach, radius, rtol=0.06)
+
+
+def test_large_gaussians_beside_the_picture_are_drawn():
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(20, 28, (50, 2)), [[-60.0, 24.0], [110.0, 24.0], [24.0, -60.0]]])
+    covariances = np.concatenate([np.tile(np.eye(2), (50, 1, 1)), np.tile(28.0**2 * np.eye(2), (3, 1, 1))])
+    opacities = np.full(53, 0.9)
+    found = silhouettes._draw(points, covariances, opacities, (49, 49))
+    cells = np.stack(np.meshgrid(np.arange(49), np.arange(49), indexing="ij"), axis=-1)
+    apart = cells[:, :, None] - points
+    sigma = np.sqrt(covariances[:, 0, 0] + silhouettes._BLUR**2)
+    alpha = opacities * np.exp(-0.5 * (apart**2).sum(axis=-1) / sigma**2)
+    np.testing.assert_allclose(found, 1 - np.prod(1 - alpha, axis=-1), atol=0.02)
