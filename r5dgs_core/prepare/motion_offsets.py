@@ -93,7 +93,7 @@ def measure(
     for k in range(first + 1, len(guess)):
         if known[k] and np.isfinite(spread[k]) and last.distinct(k):
             found[k] = Offset(float(guess[k]), float(max(spread[k], FINE * step)), "motion")
-    return found
+    return found if any(found[k].sigma is not None for k in range(first + 1, len(found))) else None
 
 
 def _pairs(tracks: Tracks, T_cam_world: Sequence[np.ndarray]) -> list[_Pair]:

@@ -173,14 +173,33 @@ def test_a_camera_that_cannot_be_compared_gets_the_median_of_the_others():
     assert [one.seconds for one in result] == [0.0] * 4 and "offset 0 is used" in notes[0]
 
 
-def test_steady_motion_gives_no_offset():
-    rig, times, rng = recordings.make_rig(3, 320, 240), np.arange(40) / 30, np.random.default_rng(0)
+def steady_tracks(rig, times):
+    """Tracks of an object that moves steadily, with noise."""
+    rng = np.random.default_rng(0)
     paths = {1: lambda t: np.array([0.5 * t, 0.3 * t, 0.2])}
     tracks = [tracks_of(camera, times, 0.0, paths) for camera in rig.cameras]
     for track in tracks:
         track[1].points[:] += rng.normal(0, 0.3 * track[1].pixel, track[1].points.shape)
-    found = motion_offsets.measure(tracks, [camera.T_cam_world for camera in rig.cameras], [1 / 30] * 3)
-    assert [one.sigma for one in found[1:]] == [None, None]
+    return tracks
+
+
+def test_steady_motion_gives_no_offset():
+    rig = recordings.make_rig(3, 320, 240)
+    tracks = steady_tracks(rig, np.arange(40) / 30)
+    assert motion_offsets.measure(tracks, [camera.T_cam_world for camera in rig.cameras], [1 / 30] * 3) is None
+
+
+def test_moving_regions_are_tried_if_the_objects_of_masks_move_steadily(monkeypatch):
+    rig, times = recordings.make_rig(3, 320, 240), np.arange(40) / 30
+    shifts = (0.0, 0.006, -0.009)
+    given = zip(rig.cameras, shifts, strict=True)
+    swinging = [tracks_of(camera, times, shift, {0: recordings.ball}) for camera, shift in given]
+    monkeypatch.setattr(clocks, "_masked_tracks", lambda *arguments: steady_tracks(rig, times))
+    monkeypatch.setattr(clocks, "_moving_regions", lambda *arguments: swinging)
+    sources = [SimpleNamespace(name=camera.name, interval=1 / 30) for camera in rig.cameras]
+    found, notes = clocks._by_motion(sources, rig.cameras, lambda event: None, Path("masks"))
+    np.testing.assert_allclose([one.seconds for one in found], shifts, atol=5e-4)
+    assert notes == []
 
 
 def test_objects_are_followed_while_all_of_them_is_visible():
