@@ -67,7 +67,7 @@ class Format:
         per_frame: True if each frame is a file of its own.
         has_times: True if a file holds all of `Options.times`.
         parts: Returns names of the files if a scene is written to several, such as one for each object, or None.
-        companions: Returns ends of the names of files that are written before and beside the file itself, or None.
+        companions: Returns ends of the names of files that are written before and beside the others, or None.
         has_objects: True if a file holds objects, so that `Options.object_ids` applies.
         has_motion: True if a file holds the motion up to `Options.until`; `Options.times` then do not apply.
         has_still: True if a file holds `Options.still`.
@@ -118,11 +118,11 @@ class Format:
         """Return the files that `write` makes."""
         if self.parts is not None:
             return [path.with_name(f"{path.stem}_{part}{path.suffix}") for part in self.parts(scene, options)]
-        if self.companions is not None:
-            return [*(path.with_name(f"{path.stem}_{end}") for end in self.companions(scene, options)), path]
+        ends = [] if self.companions is None else self.companions(scene, options)
+        beside = [path.with_name(f"{path.stem}_{end}") for end in ends]
         if not self.per_frame or options.frames is None:
-            return [path]
-        return [numbered(path, frame) for frame in options.frames]
+            return [*beside, path]
+        return [*beside, *(numbered(path, frame) for frame in options.frames)]
 
 
 def get(name: str) -> Format:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from ..shapes import object_hulls, solid
 from ..shapes.solid import Solid
 from . import registry, scene_nodes
 
+WORLD = "world"  # name that URDF files use, and MuJoCo reserves
 DENSITY = 1000.0  # unknown; masses of bodies are proportional to their volumes
 FRICTION = 0.3
 _EARTH = 9.80665  # m / s^2
@@ -66,19 +68,20 @@ def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
     Raises:
         ConfigError: No selected object has a hull.
     """
-    hulls = [hull for hull in _hulls(scene) if options.object_ids is None or hull.object_id in options.object_ids]
-    if not hulls:
-        wanted = "expected objects with enough Gaussians for a hull"
-        raise errors.ConfigError(f"{scene.name}: {wanted}, found none in the selection")
-    names = _names(scene, hulls)
+    wanted = options.object_ids
+    chosen = _solids(hull for hull in _hulls(scene) if wanted is None or hull.object_id in wanted)
+    if not chosen:
+        expected = "expected objects with enough Gaussians for a hull"
+        raise errors.ConfigError(f"{scene.name}: {expected}, found none in the selection")
+    names = _names(scene, [hull for hull, _ in chosen])
     steady = dataclasses.replace(scene, groups=tuple(_without_offset(group) for group in scene.groups))
     poses = {(one.object_id, one.group): one for one in object_poses.at(steady, (t,))}
     start = {(one.object_id, one.group): one for one in object_poses.at(scene, (t,))}
     turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
     axes, length, time = rotations.rotmats_to_quats(turn), scene.units.meters_per_unit or 1.0, _time_unit(scene)
     found = []
-    for hull, name in zip(hulls, names, strict=True):
-        group, body = scene.groups[hull.motion_id], solid.of(hull.vertices)
+    for (hull, body), name in zip(chosen, names, strict=True):
+        group = scene.groups[hull.motion_id]
         center = _center_of_mass(group, body)
         pose, rates = (one.get((hull.object_id, hull.motion_id)) for one in (start, poses))
         position, quat, velocity, spin = center, rotations.identity(), np.zeros(3), np.zeros(3)
@@ -108,7 +111,7 @@ def gravity(scene: Scene) -> np.ndarray:
     The earth's needs units of length and time in the scene.
     """
     turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
-    found = gravity_of([group.model for group in scene.groups if group.role == "body"], turn)
+    found = gravity_of([group.smooth or group.model for group in scene.groups if group.role == "body"], turn)
     if found is not None:
         return found * (scene.units.meters_per_unit or 1.0) / _time_unit(scene) ** 2
     known = scene.units.meters_per_unit is not None and scene.units.seconds_per_unit is not None
@@ -119,7 +122,7 @@ def gravity_of(models: Iterable[MotionModel], turn: np.ndarray) -> np.ndarray | 
     """Return the median acceleration of the thrown bodies among some motions, z up, or None. [3]
 
     Args:
-        models: Motions past t_max.
+        models: Motions past t_max without contacts.
         turn: Rotation from their world to one with z up. [3, 3]
     """
     found = np.array([turn @ model.acceleration for model in models if model.kind in _FLIGHTS]).reshape(-1, 3)
@@ -137,11 +140,13 @@ def time_step(scene: Scene) -> float:
 
 def losses(scene: Scene) -> list[str]:
     """Parts of this scene that rigid bodies do not hold, as sentences."""
-    found = []
-    present = {(hull.object_id, hull.motion_id) for hull in _hulls(scene)}
-    missing = sorted({pair[0] for pair in object_hulls.bodies(scene) - present})
-    if missing:
-        found.append(f"objects without a hull: {', '.join(scene.object(number).name for number in missing)}")
+    found, hulls = [], _hulls(scene)
+    present = {(hull.object_id, hull.motion_id) for hull in hulls}
+    sound = {(hull.object_id, hull.motion_id) for hull, _ in _solids(hulls)}
+    lacks = {"without a hull": object_hulls.bodies(scene) - present, "with a flat hull": present - sound}
+    for lack, pairs in lacks.items():
+        names = [scene.object(number).name for number in sorted({pair[0] for pair in pairs})]
+        found += [f"objects {lack}: {', '.join(names)}"] if names else []
     if any(group.joint is not None for group in scene.groups):
         found.append("joints: parts are bodies of their own")
     return found + scene_nodes.lost_bending(scene)
@@ -157,6 +162,15 @@ def _hulls(scene: Scene) -> tuple[Hull, ...]:
     return scene.hulls or object_hulls.of(scene)
 
 
+def _solids(hulls: Iterable[Hull]) -> list[tuple[Hull, Solid]]:
+    """Hulls with their solids, without flat ones."""
+    found = []
+    for hull in hulls:
+        with contextlib.suppress(errors.ConfigError):
+            found.append((hull, solid.of(hull.vertices)))
+    return found
+
+
 def _time_unit(scene: Scene) -> float:
     return scene.units.seconds_per_unit or 1.0
 
@@ -168,14 +182,17 @@ def _without_offset(group: MotionGroup) -> MotionGroup:
 
 
 def _center_of_mass(group: MotionGroup, body: Solid) -> np.ndarray:
-    """Centre of the hull; of a body in flight, the point about which it spins, which the motion tells better. [3]"""
+    """Centre of the hull; of a body in flight, the point about which it spins, which the motion determines better. [3]
+
+    Motions with contacts were simulated about the centre of the hull.
+    """
     point = group.pivot + group.model.center_offset
     flies = group.model.kind in _FLIGHTS and group.model.acceleration.any()
     return point if flies and np.linalg.norm(point - body.center) < _NEAR * body.size else body.center
 
 
 def _names(scene: Scene, hulls: list[Hull]) -> list[str]:
-    groups, used = scene_nodes.group_names(scene), set()
+    groups, used = scene_nodes.group_names(scene), {WORLD}
     found = []
     for hull in hulls:
         first = name = groups[hull.motion_id] if hull.motion_id else scene.object(hull.object_id).name

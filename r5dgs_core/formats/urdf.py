@@ -19,26 +19,26 @@ from . import registry, rigid_bodies
 from .mjcf import numbers
 from .rigid_bodies import RigidBody
 
-_WORLD = "world"
-
 
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
-    """Write the bodies at the first time. Implements `registry.Format.write`."""
+    """Write the meshes, and the bodies at each time. Implements `registry.Format.write`."""
     bodies = rigid_bodies.of(scene, options.times[0], options)
-    meshes = [path.with_name(f"{path.stem}_{name}") for name in _mesh_names(bodies)]
+    targets = FORMAT.paths(path, options, scene)
+    meshes = targets[: len(bodies)]
     for body, target in zip(bodies, meshes, strict=True):
         with registry.writing(target):
             atomic_files.write(target, _obj(body).encode())
         yield target
-    tree = _robot(scene, bodies, [target.name for target in meshes])
-    ElementTree.indent(tree)
-    with registry.writing(path):
-        atomic_files.write(path, ElementTree.tostring(tree, "utf-8", xml_declaration=True) + b"\n")
-    yield path
+    for t, target in zip(options.times, targets[len(bodies) :], strict=True):
+        tree = _robot(scene, rigid_bodies.of(scene, t, options), [mesh.name for mesh in meshes])
+        ElementTree.indent(tree)
+        with registry.writing(target):
+            atomic_files.write(target, ElementTree.tostring(tree, "utf-8", xml_declaration=True) + b"\n")
+        yield target
 
 
 def companions(scene: Scene, options: registry.Options) -> list[str]:
-    """Names of the meshes beside the file."""
+    """Names of the meshes beside the files."""
     return _mesh_names(rigid_bodies.of(scene, options.times[0], options))
 
 
@@ -53,7 +53,7 @@ def _robot(scene: Scene, bodies: list[RigidBody], meshes: list[str]) -> ElementT
     add(extension, "compiler", discardvisual="true", fusestatic="false")
     add(extension, "option", gravity=numbers(rigid_bodies.gravity(scene)), cone="elliptic", integrator="RK4")
     extension[1].set("timestep", numbers([rigid_bodies.time_step(scene)]))
-    add(root, "link", name=_WORLD)
+    add(root, "link", name=rigid_bodies.WORLD)
     for body, mesh in zip(bodies, meshes, strict=True):
         link = add(root, "link", name=body.name)
         inertial = add(link, "inertial")
@@ -66,7 +66,7 @@ def _robot(scene: Scene, bodies: list[RigidBody], meshes: list[str]) -> ElementT
         friction.set("value", numbers([rigid_bodies.FRICTION]))
         joint = add(root, "joint", name=f"{body.name} joint", type="floating" if body.moves else "fixed")
         add(joint, "origin", xyz=numbers(body.position), rpy=numbers(_roll_pitch_yaw(body.quat)))
-        add(joint, "parent", link=_WORLD)
+        add(joint, "parent", link=rigid_bodies.WORLD)
         add(joint, "child", link=body.name)
         if body.moves:
             add(root, "r5dgs_state", link=body.name, linear=numbers(body.velocity), angular=numbers(body.spin))
@@ -92,9 +92,11 @@ FORMAT = registry.Format(
     name="urdf",
     label="URDF",
     suffix=".urdf",
-    keeps="convex hulls as links with mass, inertia and friction; poses, velocities; one OBJ file per hull beside it",
+    keeps="convex hulls as links with mass, inertia and friction; poses, velocities; one file per frame, and "
+    "one OBJ file per hull beside them",
     loses="Gaussians, colours, learned motion, joints, concave shapes, support, cameras",
     write=export,
+    per_frame=True,
     companions=companions,
     losses=rigid_bodies.simulator_losses,
     extra="contact",

@@ -2,13 +2,14 @@
 
 import dataclasses
 import itertools
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.formats import hulls, mjcf, registry, rigid_bodies, urdf
-from r5dgs_core.motion import rotations
+from r5dgs_core.motion import knots, rotations
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.playback.scene_player import Player
 from r5dgs_core.scene import cameras
@@ -159,6 +160,11 @@ def test_roll_pitch_and_yaw_are_those_of_urdf(angles):
 
 def test_gravity_is_that_of_thrown_bodies_or_of_the_earth_or_unknown(thrown):
     np.testing.assert_allclose(rigid_bodies.gravity(thrown), MODEL.acceleration)
+    still = np.zeros((1, 3))
+    rest = ((np.array([[1.0, 0, 0, 0]]), still), (still, still), (still, still))
+    contact = MotionModel("trajectory", knots=knots.pack(np.zeros(1), *rest))
+    bounced = (thrown.groups[0], dataclasses.replace(thrown.groups[1], model=contact, smooth=MODEL))
+    np.testing.assert_allclose(rigid_bodies.gravity(dataclasses.replace(thrown, groups=bounced)), MODEL.acceleration)
     sliding = MotionModel("translation", velocity=[1.0, 0, 0], acceleration=[0, 0.01, -0.1])
     mixed = (*thrown.groups, dataclasses.replace(thrown.groups[1], model=sliding))
     np.testing.assert_allclose(rigid_bodies.gravity(dataclasses.replace(thrown, groups=mixed)), MODEL.acceleration)
@@ -178,3 +184,28 @@ def test_objects_without_a_hull_are_named_and_refused_if_no_other_is_left():
     assert "objects without a hull: red apple" in hulls.FORMAT.losses(faint)
     with pytest.raises(errors.ConfigError, match="expected objects with enough Gaussians for a hull, found none"):
         rigid_bodies.of(faint, 0.3, registry.Options((0.3,), object_ids=frozenset({2})))
+
+
+def test_objects_with_a_flat_hull_are_left_out_and_named():
+    scene = scenes.make_scene(n=900)
+    flat, *others = object_hulls.of(scene)
+    flat = dataclasses.replace(flat, vertices=flat.vertices * [1, 1, 0])
+    made = dataclasses.replace(scene, hulls=(flat, *others))
+    assert {body.name for body in rigid_bodies.of(made, 0.3, OPTIONS)} == {"red apple", "toy car"}
+    assert hulls.FORMAT.losses(made) == ["objects with a flat hull: mug"]
+
+
+def test_an_object_named_world_gets_another_name(thrown):
+    items = tuple(dataclasses.replace(item, name="world") if item.id == 1 else item for item in thrown.objects)
+    (body,) = rigid_bodies.of(dataclasses.replace(thrown, objects=items), 0.3, OPTIONS)
+    assert body.name == "world 2"
+
+
+def test_urdf_has_a_file_for_each_frame_and_meshes_for_all(thrown, tmp_path):
+    options = registry.Options((0.3, 0.5), (19, 31))
+    paths = list(urdf.export(thrown, tmp_path / "a.urdf", options))
+    assert [path.name for path in paths] == ["a_0_mug.obj", "a_0019.urdf", "a_0031.urdf"]
+    assert paths == urdf.FORMAT.paths(tmp_path / "a.urdf", options, thrown)
+    (body,) = rigid_bodies.of(thrown, 0.5, options)
+    origin = ElementTree.parse(paths[2]).find("joint/origin")
+    np.testing.assert_allclose([float(part) for part in origin.get("xyz").split()], body.position, rtol=1e-9)
