@@ -34,7 +34,7 @@ def bake(context: bpy.types.Context, share: float) -> list[bpy.types.Object]:
     release, end = int(proxies[hand_over.FRAME]), scene.frame_end
     if end <= release:
         raise errors.ConfigError(f"the frame range ends at {end}; set an end after the release at {release}")
-    anchors = [obj for obj in bpy.data.objects if hand_over.NAME in obj.constraints]
+    anchors = hand_over.anchors_of(proxies)
     shadows = extrapolate.followers(anchors)
     starts = {}
     for anchor in (*anchors, *shadows):
@@ -61,7 +61,10 @@ def bake(context: bpy.types.Context, share: float) -> list[bpy.types.Object]:
 def _simulated(scene: bpy.types.Scene, anchors: list[bpy.types.Object], release: int, end: int) -> np.ndarray:
     """Poses of anchors relative to their parents at the frames from the release on. [F, A, 4, 4]"""
     now, subframe = scene.frame_current, scene.frame_subframe
-    start = scene.rigidbody_world.point_cache.frame_start if scene.rigidbody_world is not None else release
+    start = release
+    if scene.rigidbody_world is not None:
+        cache = scene.rigidbody_world.point_cache
+        start, cache.frame_end = cache.frame_start, max(cache.frame_end, end)  # Bullet stops at the end of its cache
     found = []
     try:
         for frame in range(min(start, release), end + 1):  # Bullet simulates frame after frame

@@ -5,7 +5,7 @@ release it is animated (kinematic). Bullet then continues with the velocity of t
 with exactly the velocity to continue with. From the release on, the anchor copies the pose of a child of its proxy.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import bpy
@@ -22,8 +22,7 @@ from . import curve_place, duplicate_delete, extrapolate, physics
 
 NAME = "R5DGS Rigid Bodies"  # of the collection of proxies, and of the constraint of each anchor
 FRAME = "r5dgs_release"  # custom property of the collection: frame of release
-_GRAVITY = "r5dgs_gravity"  # the same: gravity of the Blender scene before
-_OWN_WORLD = "r5dgs_own_world"  # the same: true if the rigid-body world was made here
+_BEFORE = "r5dgs_before_hand_over"  # of the Blender scene: its gravity before, and frames of the cache of its own world
 _SUBSTEPS = 20  # per frame, in a world that is made here
 _RAMP = 2  # animated frames before the release that move with the velocity to continue with
 _STEP = 0.25  # frames between the poses from which the velocity of edited keys is taken
@@ -55,6 +54,13 @@ def proxies_of(scene: bpy.types.Scene) -> bpy.types.Collection | None:
     return next((one for one in scene.collection.children_recursive if FRAME in one), None)
 
 
+def anchors_of(proxies: bpy.types.Collection) -> list[bpy.types.Object]:
+    """Anchors that follow the proxies of a collection."""
+    helpers = set(proxies.objects)
+    bound = [obj for obj in bpy.data.objects if NAME in obj.constraints]
+    return [obj for obj in bound if obj.constraints[NAME].target in helpers]
+
+
 def hand_over(context: bpy.types.Context, anchors: Sequence[bpy.types.Object], frame: int) -> bpy.types.Collection:
     """Turn objects into rigid bodies from a frame on. Parts move with the object that carries them.
 
@@ -67,7 +73,8 @@ def hand_over(context: bpy.types.Context, anchors: Sequence[bpy.types.Object], f
         The collection of the proxies.
 
     Raises:
-        ConfigError: There is nothing to hand over, or an anchor has no hull or cannot be written; nothing was changed.
+        ConfigError: There is nothing to hand over, or an anchor has no hull or cannot be written; nothing was changed,
+            but what is left of a hand-over whose collection was deleted is removed.
     """
     scene = context.scene
     if proxies_of(scene) is not None:
@@ -80,6 +87,10 @@ def hand_over(context: bpy.types.Context, anchors: Sequence[bpy.types.Object], f
         place = curve_place.find(anchor)
         if place.strip is not None:
             raise errors.ConfigError(f"{anchor.name}: its action is in the NLA; make it active again first")
+    _clean(context)
+    for anchor in movers:
+        if NAME in anchor.constraints:
+            raise errors.ConfigError(f"{anchor.name}: it is a rigid body in another Blender scene; bake it back there")
     with loaded_scenes.nothing_left_after_error():
         bodies = _bodies(context, movers, min(scene.frame_start, frame - _RAMP), frame)
         return _create(context, bodies, frame)
@@ -87,23 +98,48 @@ def hand_over(context: bpy.types.Context, anchors: Sequence[bpy.types.Object], f
 
 def take_away(context: bpy.types.Context, proxies: bpy.types.Collection) -> None:
     """Remove the proxies and all that `hand_over` added; other rigid bodies of the scene are kept."""
-    scene = context.scene
+    objects = list(proxies.objects)
+    bpy.data.collections.remove(proxies)
+    _delete(objects)
+    _clean(context)
+
+
+def _delete(proxies: Iterable[bpy.types.Object]) -> None:
+    """Delete proxies and children of proxies with their meshes and actions."""
+    objects = list(proxies)
+    actions = [obj.animation_data.action for obj in objects if obj.animation_data and obj.animation_data.action]
+    bpy.data.batch_remove([*objects, *(obj.data for obj in objects if obj.data is not None), *actions])
+
+
+def _clean(context: bpy.types.Context) -> None:
+    """Remove what belongs to no collection of proxies, and restore the Blender scene if it has none."""
+    kept = {obj for scene in bpy.data.scenes if (proxies := proxies_of(scene)) for obj in proxies.objects}
+    lost: set[bpy.types.Object] = set()
     for obj in bpy.data.objects:
         constraint = obj.constraints.get(NAME)
-        if constraint is not None:
-            path = f'constraints["{NAME}"].influence'
-            owned = compat.own_fcurves(obj, obj.name)
-            for curve in [curve for curve in owned if curve.data_path == path]:
-                owned.remove(curve)
-            obj.constraints.remove(constraint)
-    scene.gravity = proxies[_GRAVITY]
-    own_world = proxies[_OWN_WORLD]
-    objects = list(proxies.objects)
-    actions = [obj.animation_data.action for obj in objects if obj.animation_data and obj.animation_data.action]
-    meshes = [obj.data for obj in objects if obj.data is not None]
-    bpy.data.batch_remove([*objects, *meshes, *actions, proxies])
+        if constraint is None or constraint.target in kept:
+            continue
+        if constraint.target is not None:  # the collection was deleted without its objects
+            lost |= {constraint.target, constraint.target.parent} - {None}
+        path = f'constraints["{NAME}"].influence'
+        owned = compat.own_fcurves(obj, obj.name)
+        for curve in [curve for curve in owned if curve.data_path == path]:
+            owned.remove(curve)
+        obj.constraints.remove(constraint)
+    _delete(lost)
+    if proxies_of(context.scene) is None and _BEFORE in context.scene:
+        _restore(context)
+
+
+def _restore(context: bpy.types.Context) -> None:
+    """Restore the gravity of the Blender scene, and its rigid-body world as far as no other object uses it."""
+    scene, before = context.scene, context.scene[_BEFORE].to_dict()
+    del scene[_BEFORE]
+    scene.gravity = before["gravity"]
     world = scene.rigidbody_world
-    if own_world and world is not None and not (world.collection and len(world.collection.objects)):
+    if world is not None and "cache" in before:
+        world.point_cache.frame_start, world.point_cache.frame_end = before["cache"]
+    elif world is not None and not (world.collection and len(world.collection.objects)):
         collection = world.collection
         with context.temp_override(scene=scene):
             bpy.ops.rigidbody.world_remove()
@@ -179,13 +215,17 @@ def _keyed_rates(matrices: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray
 def _create(context: bpy.types.Context, bodies: Sequence[_Body], frame: int) -> bpy.types.Collection:
     scene = context.scene
     proxies = bpy.data.collections.new(NAME)
-    proxies[FRAME], proxies[_GRAVITY] = frame, list(scene.gravity)
-    proxies[_OWN_WORLD] = scene.rigidbody_world is None
+    proxies[FRAME] = frame
     made = [_proxy(proxies, body) for body in bodies]  # before anything else that an error would have to undo
     scene.collection.children.link(proxies)
-    if proxies[_OWN_WORLD]:
+    before = {"gravity": list(scene.gravity)}
+    if scene.rigidbody_world is None:
         bpy.ops.rigidbody.world_add()
         scene.rigidbody_world.substeps_per_frame = _SUBSTEPS
+    else:
+        cache = scene.rigidbody_world.point_cache
+        before["cache"] = [cache.frame_start, cache.frame_end]
+    scene[_BEFORE] = before
     world = scene.rigidbody_world
     cache = world.point_cache
     cache.frame_start, cache.frame_end = min(cache.frame_start, frame - _RAMP), max(cache.frame_end, scene.frame_end)
@@ -209,7 +249,7 @@ def _set_gravity(scene: bpy.types.Scene, anchor: bpy.types.Object) -> None:
     movers = [one for one in loaded_scenes.members(collection, "ANCHOR") if physics.has_motion(one)]
     free = [one for one in movers if physics.follow_matrix(one.r5dgs_motion) is None]
     parent = np.eye(4) if anchor.parent is None else np.array(anchor.parent.matrix_world)
-    found = rigid_bodies.gravity_of([physics.model(one) for one in free], parent[:3, :3])
+    found = rigid_bodies.gravity_of([physics.smooth(one) for one in free], parent[:3, :3])
     if found is not None:
         scene.gravity = found * (scene.render.fps / scene.render.fps_base / times.frames_per_unit) ** 2
 

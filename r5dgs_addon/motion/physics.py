@@ -53,6 +53,7 @@ def remember(
         state.learned = json.dumps(
             {
                 "model": group.own_model.to_dict(),
+                "smooth": None if group.smooth is None else group.smooth.to_dict(),
                 "stop_time": None if group.joint is None else group.joint.stop_time,
                 "history": history_json.to_json(group.history),
                 "follow_matrix": None if group.follow_matrix is None else np.asarray(group.follow_matrix).tolist(),
@@ -220,6 +221,13 @@ def model(anchor: bpy.types.Object) -> MotionModel:
         return confidence.with_exact_fields(replace(base, **values), changed)
     except ValueError as error:
         raise errors.ConfigError(f"{anchor.name}: {error}") from error
+
+
+def smooth(anchor: bpy.types.Object) -> MotionModel:
+    """Current motion of an anchor, without the contacts of a learned trajectory. Raises ConfigError as `model`."""
+    state, current = anchor.r5dgs_motion, model(anchor)
+    kept = _parsed(state.learned).get("smooth") if state.learned and not state.taken else None
+    return current if current.knots is None or kept is None else MotionModel.from_dict(kept)
 
 
 def inertia(anchor: bpy.types.Object) -> np.ndarray:

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from r5dgs_core.motion import knots
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.scene import scene_file
 from tests.support import motions, scenes
@@ -12,9 +13,8 @@ from tests.support import motions, scenes
 KINDS = ("objects", "meshes", "collections", "actions")
 
 
-@pytest.fixture(scope="module")
-def thrown_scene(tmp_path_factory):
-    """A thrown and a sliding object."""
+def make_thrown(path, contact=False):
+    """Write a scene with a thrown and a sliding object; with contact, the thrown one stops in the air."""
     scene = scenes.make_scene(n=400, objects=2, shadows=False)
     thrown = MotionModel(
         "ballistic_spin",
@@ -24,9 +24,18 @@ def thrown_scene(tmp_path_factory):
         offset_displacement=[0.002, 0, 0.001],
         radius=0.3,
     )
-    groups = (scene.groups[0], dataclasses.replace(scene.groups[1], model=thrown), *scene.groups[2:])
-    path = tmp_path_factory.mktemp("thrown") / "thrown.r5dgs"
+    group = dataclasses.replace(scene.groups[1], model=thrown)
+    if contact:
+        none = np.zeros((1, 3))
+        rest = knots.pack(np.zeros(1), (np.array([[1.0, 0, 0, 0]]), none), (none, none), (none, none))
+        group = dataclasses.replace(group, model=MotionModel("trajectory", knots=rest, radius=0.3), smooth=thrown)
+    groups = (scene.groups[0], group, *scene.groups[2:])
     return scene_file.write(dataclasses.replace(scene, groups=groups), path)
+
+
+@pytest.fixture(scope="module")
+def thrown_scene(tmp_path_factory):
+    return make_thrown(tmp_path_factory.mktemp("thrown") / "thrown.r5dgs")
 
 
 @pytest.fixture
@@ -159,3 +168,68 @@ def test_shadows_follow_baked_objects(blender, loaded):
     follow = np.diag([1.0, 1.0, 0.0])
     follow[0, 2] = 0.3
     np.testing.assert_allclose(moved[:, 1] - moved[0, 1], (moved[:, 0] - moved[0, 0]) @ follow.T, atol=1e-4)
+
+
+def test_bodies_with_contacts_fall_with_the_gravity_of_their_smooth_motion(blender, tmp_path):
+    bpy = blender
+    motions.load_again(bpy, make_thrown(tmp_path / "contact.r5dgs", contact=True))
+    motions.choose(bpy, bpy.data.objects["mug anchor"])
+    assert bpy.ops.r5dgs.hand_over() == {"FINISHED"}
+    fps = bpy.context.scene.render.fps
+    np.testing.assert_allclose(bpy.context.scene.gravity, np.array([0, 0, -3.0]) * (fps / 60) ** 2, rtol=1e-5)
+
+
+def test_bodies_move_past_the_former_end_of_the_cache_and_its_range_is_restored(blender, thrown):
+    bpy, scene, frame = blender, blender.context.scene, release(thrown)
+    bpy.ops.rigidbody.world_add()
+    cache = scene.rigidbody_world.point_cache
+    cache.frame_start, cache.frame_end = frame, frame + 3
+    scene.frame_end = frame + 4
+    bpy.ops.r5dgs.hand_over()
+    scene.frame_end = frame + 20
+    bpy.ops.r5dgs.bake_back()
+    late = play(bpy, ["mug anchor"], frame + 10, frame + 20)[:, 0, :2, 3]
+    assert np.linalg.norm(np.diff(late, axis=0), axis=1).min() > 0.1 / thrown.r5dgs.frames_per_unit
+    assert (cache.frame_start, cache.frame_end) == (frame, frame + 3)
+
+
+def test_proxies_of_another_blender_scene_are_left_alone(blender, thrown):
+    bpy, frame = blender, release(thrown)
+    apple, target = bpy.data.objects["red apple anchor"], bpy.data.objects.new("pose", None)
+    other, proxies = bpy.data.scenes.new("other"), bpy.data.collections.new("proxies")
+    other.collection.children.link(proxies)
+    proxies.objects.link(target)
+    hand_over = motions.addon("motion.hand_over")
+    proxies[hand_over.FRAME] = frame
+    constraint = apple.constraints.new("COPY_TRANSFORMS")
+    constraint.name, constraint.target, constraint.influence = hand_over.NAME, target, 0.0
+    keys = motions.keys(apple)
+    with pytest.raises(RuntimeError, match="red apple anchor: it is a rigid body in another Blender scene"):
+        bpy.ops.r5dgs.hand_over()
+    motions.choose(bpy, bpy.data.objects["mug anchor"])
+    bpy.context.scene.frame_end = frame + 3
+    bpy.ops.r5dgs.hand_over()
+    bpy.ops.r5dgs.bake_back()
+    assert not bpy.data.objects["mug anchor"].constraints
+    assert apple.constraints[hand_over.NAME].target == target and motions.keys(apple) == keys
+
+
+@pytest.mark.parametrize("with_objects", [True, False])
+def test_what_a_deleted_hand_over_has_left_is_removed_by_the_next(blender, thrown, with_objects):
+    bpy, scene = blender, blender.context.scene
+    former, gravity = counts(bpy), tuple(scene.gravity)
+    scene.frame_end = release(thrown) + 2
+    bpy.ops.r5dgs.hand_over()
+    proxies = motions.addon("motion.hand_over").proxies_of(scene)
+    objects = list(proxies.objects)
+    for obj in objects:
+        scene.collection.objects.link(obj)
+    bpy.data.batch_remove([proxies, *(objects if with_objects else ())])
+    motions.choose(bpy, bpy.data.objects["mug anchor"])
+    bpy.ops.r5dgs.hand_over()
+    assert "R5DGS Rigid Bodies" not in bpy.data.objects["red apple anchor"].constraints
+    bpy.ops.r5dgs.bake_back()
+    assert tuple(scene.gravity) == gravity and scene.rigidbody_world is None
+    left = counts(bpy)
+    kinds = ("objects", "collections") if with_objects else KINDS  # meshes of objects that the user deleted
+    assert [left[kind] for kind in kinds] == [former[kind] for kind in kinds]
