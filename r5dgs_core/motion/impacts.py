@@ -30,7 +30,7 @@ def keys(times: np.ndarray, values: np.ndarray, jumps: Sequence[float]) -> Keys:
     slopes = cubic_curves.slopes(times, values)
     found = Keys(times, values, slopes, slopes.copy())
     kept: list[float] = []
-    for jump in sorted(jumps):
+    for jump in sorted(jumps) if len(times) > 2 else ():
         sharp = _split(times, values, [*kept, jump])
         if sharp is not None and _meets(sharp, found, times, values, jump):
             kept.append(jump)

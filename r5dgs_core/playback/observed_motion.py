@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..motion import impacts
-from ..motion.cubic_curves import Curves
+from ..motion.cubic_curves import Curves, Keys
 from ..scene.scene import MotionGroup, Scene
 
 JUMPS = ("start", "stop", "impact")  # kinds of events at which the velocity may jump
@@ -29,4 +29,10 @@ def curves(scene: Scene, group: MotionGroup, quats: np.ndarray, displacements: n
         displacements: Its displacements. [S, 3]
     """
     times, found = np.asarray(scene.tracks.times, np.float64), jumps(scene, group)
-    return Curves(impacts.keys(times, displacements, found), impacts.keys(times, quats, found))
+    return Curves(impacts.keys(times, displacements, found), _unit(impacts.keys(times, quats, found), times))
+
+
+def _unit(keys: Keys, times: np.ndarray) -> Keys:
+    """Keys whose quaternions between the observed times have length 1, as glTF prescribes, with the same spins."""
+    norms = np.where(np.isin(keys.times, times), 1.0, np.linalg.norm(keys.values, axis=1))[:, None]
+    return Keys(keys.times, keys.values / norms, keys.left_slopes / norms, keys.right_slopes / norms)

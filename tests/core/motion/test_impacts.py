@@ -72,3 +72,8 @@ def test_noise_around_an_impact_is_not_amplified():
                 np.abs(cubic_curves.evaluate(impacts.keys(TIMES, values, jumps), at) - bounce(at)[0]).max()
             )
     assert np.median(worst["sharp"]) < 0.5 * np.median(worst["smooth"])
+
+
+def test_one_knot_is_a_rest():
+    found = impacts.keys(np.zeros(1), np.ones((1, 3)), [0.5])
+    assert found.values.tolist() == [[1, 1, 1]] and not found.left_slopes.any()

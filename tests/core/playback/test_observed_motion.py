@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from r5dgs_core.formats import glb, glb_reader, registry
-from r5dgs_core.motion import cubic_curves
+from r5dgs_core.motion import cubic_curves, rotations
 from r5dgs_core.motion.history import Event, History
-from r5dgs_core.playback import group_curves
+from r5dgs_core.playback import group_curves, observed_motion
 from r5dgs_core.playback.scene_player import Player
 from tests.support import arms, scenes
 
@@ -52,6 +52,16 @@ def test_keys_are_the_playback(scene):
         np.testing.assert_allclose(
             cubic_curves.evaluate(keys.location, np.array(t)), shown.group_poses(t)[1][1], atol=1e-12
         )
+
+
+def test_rotations_at_jumps_have_unit_length(scene):
+    times, angles = scene.tracks.times, np.abs(scene.tracks.times - HIT) * 12.0
+    quats = rotations.rotvecs_to_quats(angles[:, None] * [0.0, 0, 1])
+    found = observed_motion.curves(scene, scene.groups[1], quats, scene.tracks.poses[1, :, 4:]).rotation
+    assert len(found.times) == len(times) + 1
+    np.testing.assert_allclose(np.linalg.norm(found.values, axis=1), 1, atol=1e-12)
+    turned = cubic_curves.evaluate(found, np.array([HIT - 1e-7, HIT + 1e-7]), unit=True)
+    np.testing.assert_allclose(turned[0], turned[1], atol=1e-5)
 
 
 def test_a_change_of_the_law_stays_smooth():
