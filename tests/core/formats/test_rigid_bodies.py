@@ -64,7 +64,7 @@ def extremes(points):
 
 @pytest.mark.parametrize("t", [0.2, scenes.T_MAX, 1.1])
 def test_trimesh_reads_the_hulls_at_a_time_in_metres(tmp_path, t):
-    trimesh = pytest.importorskip("trimesh")
+    trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed; it comes with the extra 'test'")
     scene = dataclasses.replace(scenes.make_scene(n=900), units=Units(meters_per_unit=2.0))
     scene = dataclasses.replace(scene, hulls=object_hulls.of(scene))
     (path,) = hulls.export(scene, tmp_path / "a.glb", registry.Options((t,)))
@@ -82,7 +82,7 @@ def test_trimesh_reads_the_hulls_at_a_time_in_metres(tmp_path, t):
 @pytest.mark.parametrize("world", ["blender", "colmap"])
 @pytest.mark.parametrize("units", [Units(), Units(seconds_per_unit=2.0, meters_per_unit=0.5)])
 def test_mujoco_continues_the_flight_as_playback_does(thrown, tmp_path, world, units):
-    mujoco = pytest.importorskip("mujoco")
+    mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
     scene = dataclasses.replace(turned(thrown, world), units=units)
     (path,) = mjcf.export(scene, tmp_path / "a.xml", OPTIONS)
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -128,7 +128,7 @@ def test_a_body_off_the_centre_has_the_velocity_of_its_centre_of_mass(tmp_path):
 
 
 def test_mujoco_reads_urdf_with_the_same_bodies(thrown, tmp_path):
-    mujoco = pytest.importorskip("mujoco")
+    mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
     scene = dataclasses.replace(scenes.make_scene(n=900), units=Units(meters_per_unit=2.0))
     options = registry.Options((0.3,))
     bodies = rigid_bodies.of(scene, 0.3, options)
