@@ -1,7 +1,6 @@
 """Bake Back to Keys operator: write the simulated motion of rigid bodies to the keys of their objects."""
 
 import bpy
-from bpy.props import FloatProperty
 
 from ..r5dgs_addon.motion import bake_back, hand_over, simplify
 from ..r5dgs_addon.ui import plural
@@ -15,14 +14,7 @@ class R5DGS_OT_bake_back(bpy.types.Operator):
     bl_label = "Bake Back to Keys"
     bl_options = {"REGISTER", "UNDO"}
 
-    tolerance: FloatProperty(
-        name="Tolerance",
-        description="Maximum displacement of any point as a fraction of the object's size",
-        default=1e-3,
-        min=1e-6,
-        max=0.5,
-        precision=5,
-    )
+    tolerance: simplify.TOLERANCE
 
     @classmethod
     def poll(cls, context):

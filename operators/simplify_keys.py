@@ -1,7 +1,6 @@
 """Simplify Keys operator: reduce keys within a tolerance, for manual editing."""
 
 import bpy
-from bpy.props import FloatProperty
 
 from ..r5dgs_addon.motion import duplicate_delete, simplify
 from ..r5dgs_addon.ui import plural
@@ -15,14 +14,7 @@ class R5DGS_OT_simplify_keys(bpy.types.Operator):
     bl_label = "Simplify Keys"
     bl_options = {"REGISTER", "UNDO"}
 
-    tolerance: FloatProperty(
-        name="Tolerance",
-        description="Maximum displacement of any point as a fraction of the object's size",
-        default=1e-3,
-        min=1e-6,
-        max=0.5,
-        precision=5,
-    )
+    tolerance: simplify.TOLERANCE
 
     @classmethod
     def poll(cls, context):

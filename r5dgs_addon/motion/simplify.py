@@ -2,6 +2,7 @@
 
 import bpy
 import numpy as np
+from bpy.props import FloatProperty
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import bezier, cubic_curves, rotations
@@ -14,6 +15,15 @@ _FRAMES = reduction.FrameTimes(0.0, 1.0)  # the curves' times are frames
 # Slopes before and after a key form no kink if they differ by less than this share of the allowed error, divided by the
 # duration of the shorter segment.
 _SLOPE_TOLERANCE = 0.01
+# Setting of operators that reduce keys.
+TOLERANCE = FloatProperty(
+    name="Tolerance",
+    description="Maximum displacement of any point as a fraction of the object's size",
+    default=1e-3,
+    min=1e-6,
+    max=0.5,
+    precision=5,
+)
 
 
 def simplify(anchors: list[bpy.types.Object], share: float) -> tuple[int, int]:
