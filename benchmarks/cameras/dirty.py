@@ -22,13 +22,11 @@ import argparse
 import dataclasses
 import json
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from r5dgs_core.bake import bake
 from r5dgs_core.cli.commands import prepare
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
@@ -36,10 +34,10 @@ from r5dgs_core.evaluation import evaluate
 from r5dgs_core.prepare.plan import Plan
 from r5dgs_core.render import warm_up
 from r5dgs_core.scene import camera_correction
-from r5dgs_core.train import run
 from r5dgs_core.train.refinement.refinement import PARTS
 
 from ..futures import rendered_scenes
+from ..training import timed_training
 from . import disturbed, rendered_recordings
 from .rendered_recordings import Recording, Truth
 
@@ -67,11 +65,7 @@ def measure(truth: Truth, recording: Recording, plan: Plan, settings: config.Con
     """Train a prepared data set, and measure the scene, its cameras and clocks."""
     data = Path(plan.request.out)
     dataset = datasets.read(data)
-    with tempfile.TemporaryDirectory() as folder:
-        began = time.process_time()
-        trained = run.train(data, Path(folder) / "run", settings)
-        seconds = time.process_time() - began
-        scene = bake.bake(trained)
+    scene, seconds = timed_training.train(data, settings)
     found = evaluate.evaluate(scene, dataset, splits=("val",), align=True)["splits"]["val"]["rigid"]
     record = scene.provenance.get("cameras", {})
     corrections = {n: camera_correction.from_dict(c) for n, c in record.get("corrections", {}).items()}

@@ -19,13 +19,11 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from r5dgs_core.bake import bake
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data.dataset import Dataset
@@ -35,8 +33,8 @@ from r5dgs_core.evaluation.ground_truth_poses import Body
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import warm_up
 from r5dgs_core.scene.scene import Scene
-from r5dgs_core.train import run
 
+from ..training import timed_training
 from . import rendered_scenes, scoring
 
 SETTINGS = (  # small images need few Gaussians
@@ -122,11 +120,7 @@ def scene_row(scene: Scene, dataset: Dataset) -> dict[str, float]:
 def measure(data: Path, settings: config.Config) -> dict[str, Any]:
     """Train a data set, and measure the scene."""
     dataset = datasets.read(data)
-    with tempfile.TemporaryDirectory() as folder:
-        began = time.process_time()
-        trained = run.train(data, Path(folder) / "run", settings)
-        seconds = time.process_time() - began
-        scene = bake.bake(trained)
+    scene, seconds = timed_training.train(data, settings)
     return {**scene_row(scene, dataset), "seconds": seconds, "objects": object_rows(scene, dataset)}
 
 

@@ -16,20 +16,19 @@ import json
 import math
 import shutil
 import tempfile
-import time
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from r5dgs_core.bake import bake
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.evaluation import evaluate
 from r5dgs_core.render import warm_up
 from r5dgs_core.scene.scene import Scene
-from r5dgs_core.train import run
+
+from . import timed_training
 
 
 def held_out(times: Sequence[float], every: int, offset: int, sparse: bool = False) -> list[float]:
@@ -74,15 +73,6 @@ def measure(scene: Scene, dataset: datasets.Dataset, removed: Collection[float])
     return rows
 
 
-def train(data: Path, settings: config.Config) -> tuple[Scene, float]:
-    """Train a scene on a data set. Returns it and the processor seconds of training."""
-    with tempfile.TemporaryDirectory() as folder:
-        began = time.process_time()
-        trained = run.train(data, Path(folder) / "run", settings)
-        seconds = time.process_time() - began
-        return bake.bake(trained), seconds
-
-
 def _among(t: float, times: Collection[float]) -> bool:
     return bool(np.isclose(list(times), t, rtol=0, atol=1e-6).any()) if times else False
 
@@ -112,7 +102,7 @@ def main() -> None:
         print(f"{len(removed)} times held out: {', '.join(f'{t:g}' for t in removed)}")
         print(f"{'trained':>12} {'cameras':>8} {'times':>8} {'images':>6} {'dB':>6} {'objects':>7} {'SSIM':>6}")
         for name, data in runs.items():
-            scene, seconds[name] = train(data, settings)
+            scene, seconds[name] = timed_training.train(data, settings)
             for row in measure(scene, dataset, removed):
                 rows.append({"trained": name, **row})
                 psnr, objects, ssim = (math.nan if row[k] is None else row[k] for k in ("psnr", "psnr_objects", "ssim"))
