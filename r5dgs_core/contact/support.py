@@ -5,12 +5,10 @@ Centres of background Gaussians lie below the surface, so depths are rendered.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from ..playback import scene_player
-from ..render import posed_scene, scene_renderer
+from ..render import posed_scene, scene_renderer, viewpoints
 from ..scene import sampling
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
@@ -75,7 +73,7 @@ def _surface(scene: Scene) -> np.ndarray:
     posed = posed_scene.rows_of(posed_scene.pose_frame(scene, player.frame(scene.t_max)), rows)
     found = []
     for camera in cameras:
-        small = _smaller(camera)
+        small = viewpoints.resized(camera, min(PIXELS, max(camera.width, camera.height)))
         shown = scene_renderer.render_frame(scene, posed, small, background=None)
         y, x = np.nonzero(np.asarray(shown.alpha) > _SOLID)
         rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(small.intrinsics).T
@@ -87,11 +85,3 @@ def _surface(scene: Scene) -> np.ndarray:
 def _distinct(cameras: tuple[Camera, ...]) -> list[Camera]:
     """One camera for each place."""
     return list({tuple(camera.center.round(6)): camera for camera in cameras}.values())
-
-
-def _smaller(camera: Camera) -> Camera:
-    """Camera with at most `PIXELS` along the longer side."""
-    factor = min(1.0, PIXELS / max(camera.width, camera.height))
-    width, height = (max(1, round(factor * side)) for side in (camera.width, camera.height))
-    scale = np.diag([width / camera.width, height / camera.height, 1.0])
-    return dataclasses.replace(camera, width=width, height=height, intrinsics=scale @ camera.intrinsics)
