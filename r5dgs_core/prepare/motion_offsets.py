@@ -140,16 +140,15 @@ class _Scan:
         span = reach * step
         self._trials = np.arange(-2 * span, 2 * span + resolution / 2, resolution)
         self._grid = np.arange(-span, span + resolution / 2, resolution)
-        self._distances = [_distances(pair, start[pair.b] - start[pair.a] + self._trials, step) for pair in pairs]
+        self._curves = [_curve(_distances(pair, start[pair.b] - start[pair.a] + self._trials, step)) for pair in pairs]
 
     def lowest(self) -> np.ndarray:
         """Minimise the loss by one camera at a time. [C]"""
-        curves = [_curve(distances) for distances in self._distances]
         moved = np.zeros(len(self._start))
         for _ in range(_ROUNDS):
             before = moved.copy()
             for camera in range(min(pair.a for pair in self._pairs) + 1, len(moved)):
-                total = self._total(camera, curves, moved)
+                total = self._total(camera, moved)
                 if total.any():
                     moved[camera] = _lowest(self._grid, total)
             if np.abs(moved - before).max() < 0.1 * self._resolution:
@@ -158,14 +157,13 @@ class _Scan:
 
     def distinct(self, camera: int) -> bool:
         """True if the loss of a camera at both ends of the scan is clearly larger than at the given offsets."""
-        curves = [_curve(distances) for distances in self._distances]
-        total = self._total(camera, curves, np.zeros(len(self._start)))
+        total = self._total(camera, np.zeros(len(self._start)))
         return bool(min(total[0], total[-1]) > DISTINCT * total[len(total) // 2])
 
-    def _total(self, camera: int, curves: Sequence[np.ndarray], moved: np.ndarray) -> np.ndarray:
+    def _total(self, camera: int, moved: np.ndarray) -> np.ndarray:
         """Return the loss of a camera's pairs at each change of its offset, the others moved. [G]"""
         total = np.zeros(len(self._grid))
-        for pair, curve in zip(self._pairs, curves, strict=True):
+        for pair, curve in zip(self._pairs, self._curves, strict=True):
             if camera in (pair.a, pair.b):
                 at = self._grid - moved[pair.a] if camera == pair.b else moved[pair.b] - self._grid
                 total += np.interp(at, self._trials, np.where(np.isfinite(curve), curve, 1e3))
