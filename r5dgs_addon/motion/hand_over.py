@@ -15,6 +15,7 @@ from mathutils import Matrix, Vector
 from ...r5dgs_core import errors
 from ...r5dgs_core.formats import rigid_bodies
 from ...r5dgs_core.motion import models, rotations
+from ...r5dgs_core.scene import gravity
 from ...r5dgs_core.shapes import solid
 from .. import compat
 from ..scene import hull_meshes, loaded_scenes, timeline
@@ -249,9 +250,10 @@ def _set_gravity(scene: bpy.types.Scene, anchor: bpy.types.Object) -> None:
     movers = [one for one in loaded_scenes.members(collection, "ANCHOR") if physics.has_motion(one)]
     free = [one for one in movers if physics.follow_matrix(one.r5dgs_motion) is None]
     parent = np.eye(4) if anchor.parent is None else np.array(anchor.parent.matrix_world)
-    found = rigid_bodies.gravity_of([physics.smooth(one) for one in free], parent[:3, :3])
+    up = parent[2, :3] / np.linalg.norm(parent[2, :3])
+    found = gravity.of_motions([physics.smooth(one) for one in free], up)
     if found is not None:
-        scene.gravity = found * (scene.render.fps / scene.render.fps_base / times.frames_per_unit) ** 2
+        scene.gravity = parent[:3, :3] @ found * (scene.render.fps / scene.render.fps_base / times.frames_per_unit) ** 2
 
 
 def _proxy(proxies: bpy.types.Collection, body: _Body) -> tuple[bpy.types.Object, np.ndarray]:

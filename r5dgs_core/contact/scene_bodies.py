@@ -1,4 +1,4 @@
-"""Bodies of a scene: shapes from their hulls, observed poses, and gravity."""
+"""Bodies of a scene: shapes from their hulls, and observed poses."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ import numpy as np
 
 from .. import errors
 from ..motion import models, rotations
-from ..scene import world_axes
+from ..scene import gravity, world_axes
 from ..scene.scene import MotionGroup, Scene
 from ..shapes import solid
 from .identify import Track
 
-STANDARD_GRAVITY = 9.81  # m/s^2
-_VERTICAL = 0.35  # largest angle between an acceleration and gravity of a body that falls, rad
 _PLACE_NOISE, _TURN_NOISE = 0.003, 0.004  # of poses without known errors: in sizes, and rad
 _FREE = ("translation", "ballistic_spin", "free_top", "drag", "bounce", "friction")
 
@@ -60,20 +58,6 @@ def of(scene: Scene) -> tuple[list[SceneBody], list[str]]:
     return found, lines
 
 
-def gravity(scene: Scene, bodies: list[SceneBody]) -> np.ndarray | None:
-    """Return the acceleration of falling bodies, or None if it is unknown: no up axis, no fall and no units. [3]"""
-    up = world_axes.UP_AXIS.get(scene.world_convention)
-    if up is None:
-        return None
-    fallen = [float(-body.smooth.acceleration @ up) for body in bodies if _falls(body.smooth, up)]
-    if fallen:
-        return -float(np.median(fallen)) * up
-    seconds, meters = scene.units.seconds_per_unit, scene.units.meters_per_unit
-    if seconds is None or meters is None:
-        return None
-    return -STANDARD_GRAVITY * seconds**2 / meters * up
-
-
 def track(scene: Scene, body: SceneBody, center: np.ndarray | None = None) -> Track:
     """Return the observed poses of a body since it last set off, with their errors.
 
@@ -105,12 +89,6 @@ def predicted(body: SceneBody, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return quats, body.group.pivot + moved + arms
 
 
-def _falls(model: models.MotionModel, up: np.ndarray) -> bool:
-    a, length = model.acceleration, float(np.linalg.norm(model.acceleration))
-    falling = model.kind in ("translation", "ballistic_spin", "free_top", "bounce") and not model.frequency
-    return falling and length > 0 and float(-a @ up) > np.cos(_VERTICAL) * length
-
-
 def _moves(scene: Scene, group: MotionGroup) -> bool:
     still = (group.smooth or group.model).kind == "static" and group.parent is None and group.follows is None
     return bool(group.id and not still and np.any(scene.tracks.poses[group.id, :, 1:] != 0))
@@ -124,7 +102,7 @@ def _reason(scene: Scene, body: SceneBody) -> str:
     if model.kind not in _FREE or model.frequency > 0 or model.angular_acceleration.any() and model.center_offset.any():
         return f"its motion is that of a driven body ({models.KINDS[model.kind].word})"
     free = ("translation", "ballistic_spin", "free_top")
-    if model.kind in free and model.acceleration.any() and up is not None and not _falls(model, up):
+    if model.kind in free and model.acceleration.any() and up is not None and not gravity.falls(model, up):
         return "it accelerates otherwise than by gravity"
     if not len(track(scene, body)):
         return "it was not seen since it set off"

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..motion import history, rotations, se3
-from ..scene import predictability, world_axes
+from ..scene import gravity, predictability, world_axes
 from ..scene.scene import MotionGroup, Scene
 from ..shapes import directions
 from . import futures, path_knots, recording, scene_bodies, scene_world, world
@@ -75,7 +75,7 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     tried = (set(passing) - set(driven)) | pushed
     if not tried:
         return Prediction(scene.groups, depths, {}, tuple(lines))
-    pull = scene_bodies.gravity(scene, bodies)
+    pull = gravity.of(scene)
     if pull is None or up is None:
         reason = "gravity is unknown: no body was seen to fall, and the scene has no up axis or no units"
         return Prediction(scene.groups, depths, {}, (*lines, f"no contacts are predicted: {reason}"))

@@ -11,9 +11,9 @@ import numpy as np
 
 from .. import errors
 from ..motion import rotations
-from ..motion.models import MotionModel
 from ..playback import object_poses
 from ..scene import cameras
+from ..scene import gravity as gravities
 from ..scene.hull import Hull
 from ..scene.scene import MotionGroup, Scene
 from ..shapes import object_hulls, solid
@@ -23,9 +23,6 @@ from . import registry, scene_nodes
 WORLD = "world"  # name that URDF files use, and MuJoCo reserves
 DENSITY = 1000.0  # unknown; masses of bodies are proportional to their volumes
 FRICTION = 0.3
-_EARTH = 9.80665  # m / s^2
-_FLIGHTS = ("translation", "ballistic_spin", "free_top", "bounce")  # kinds whose acceleration may be gravity
-_DOWNWARD = 0.9  # least cosine between gravity and the downward axis of the world
 _NEAR = 0.2  # of the size: distance up to which the centre of rotation in flight replaces the centre of the hull
 
 
@@ -82,7 +79,7 @@ def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
     found = []
     for (hull, body), name in zip(chosen, names, strict=True):
         group = scene.groups[hull.motion_id]
-        center = _center_of_mass(group, body)
+        center = _center_of_mass(group, body, turn[2])
         pose, rates = (one.get((hull.object_id, hull.motion_id)) for one in (start, poses))
         position, quat, velocity, spin = center, rotations.identity(), np.zeros(3), np.zeros(3)
         if pose is not None and rates is not None and hull.motion_id > 0:
@@ -106,31 +103,12 @@ def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
 
 
 def gravity(scene: Scene) -> np.ndarray:
-    """Acceleration of falling bodies in the units of a file, z up: that of thrown bodies, else the earth's, else 0. [3]
-
-    The earth's needs units of length and time in the scene.
-    """
+    """Gravity in the units of a file, z up; 0 if it is unknown. [3]"""
+    found = gravities.of(scene)
+    if found is None:
+        return np.zeros(3)
     turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
-    found = gravity_of([group.smooth or group.model for group in scene.groups if group.role == "body"], turn)
-    if found is not None:
-        return found * (scene.units.meters_per_unit or 1.0) / _time_unit(scene) ** 2
-    known = scene.units.meters_per_unit is not None and scene.units.seconds_per_unit is not None
-    return np.array([0.0, 0.0, -_EARTH if known else 0.0])
-
-
-def gravity_of(models: Iterable[MotionModel], turn: np.ndarray) -> np.ndarray | None:
-    """Return the median acceleration of the thrown bodies among some motions, z up, or None. [3]
-
-    Args:
-        models: Motions past t_max without contacts.
-        turn: Rotation from their world to one with z up. [3, 3]
-    """
-    found = np.array([turn @ model.acceleration for model in models if model.kind in _FLIGHTS]).reshape(-1, 3)
-    norms = np.linalg.norm(found, axis=1)
-    found = found[
-        (-found[:, 2] > _DOWNWARD * norms) & (norms > norms.max(initial=0.0) / 2)
-    ]  # others do not fall freely
-    return np.median(found, axis=0) if len(found) else None
+    return turn @ found * (scene.units.meters_per_unit or 1.0) / _time_unit(scene) ** 2
 
 
 def time_step(scene: Scene) -> float:
@@ -181,13 +159,13 @@ def _without_offset(group: MotionGroup) -> MotionGroup:
     return dataclasses.replace(group, model=model)
 
 
-def _center_of_mass(group: MotionGroup, body: Solid) -> np.ndarray:
+def _center_of_mass(group: MotionGroup, body: Solid, up: np.ndarray) -> np.ndarray:
     """Centre of the hull; of a body in flight, the point about which it spins, which the motion determines better. [3]
 
     Motions with contacts were simulated about the centre of the hull.
     """
     point = group.pivot + group.model.center_offset
-    flies = group.model.kind in _FLIGHTS and group.model.acceleration.any()
+    flies = gravities.falls(group.model, up)
     return point if flies and np.linalg.norm(point - body.center) < _NEAR * body.size else body.center
 
 

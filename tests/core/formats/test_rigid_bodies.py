@@ -9,7 +9,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.formats import hulls, mjcf, registry, rigid_bodies, urdf
-from r5dgs_core.motion import knots, rotations
+from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.playback.scene_player import Player
 from r5dgs_core.scene import cameras
@@ -18,7 +18,7 @@ from r5dgs_core.shapes import object_hulls, solid
 from tests.support import scenes, solid_gaussians
 
 MODEL = MotionModel(
-    "ballistic_spin", velocity=[0.5, 0.2, 1.0], acceleration=[0.1, 0, -3.0], angular_velocity=[0.4, -1.0, 2.0]
+    "ballistic_spin", velocity=[0.5, 0.2, 1.0], acceleration=[0, 0, -3.0], angular_velocity=[0.4, -1.0, 2.0]
 )
 OPTIONS = registry.Options((scenes.T_MAX,))
 
@@ -158,22 +158,14 @@ def test_roll_pitch_and_yaw_are_those_of_urdf(angles):
     assert rotations.angle_between(quat, back) < 1e-6
 
 
-def test_gravity_is_that_of_thrown_bodies_or_of_the_earth_or_unknown(thrown):
-    np.testing.assert_allclose(rigid_bodies.gravity(thrown), MODEL.acceleration)
-    still = np.zeros((1, 3))
-    rest = ((np.array([[1.0, 0, 0, 0]]), still), (still, still), (still, still))
-    contact = MotionModel("trajectory", knots=knots.pack(np.zeros(1), *rest))
-    bounced = (thrown.groups[0], dataclasses.replace(thrown.groups[1], model=contact, smooth=MODEL))
-    np.testing.assert_allclose(rigid_bodies.gravity(dataclasses.replace(thrown, groups=bounced)), MODEL.acceleration)
-    sliding = MotionModel("translation", velocity=[1.0, 0, 0], acceleration=[0, 0.01, -0.1])
-    mixed = (*thrown.groups, dataclasses.replace(thrown.groups[1], model=sliding))
-    np.testing.assert_allclose(rigid_bodies.gravity(dataclasses.replace(thrown, groups=mixed)), MODEL.acceleration)
-    groups = tuple(dataclasses.replace(group, model=MotionModel()) for group in thrown.groups)
-    still = dataclasses.replace(thrown, groups=groups)
+def test_gravity_has_the_units_and_axes_of_the_file_and_is_zero_if_unknown(thrown):
+    scene = dataclasses.replace(turned(thrown, "colmap"), units=Units(seconds_per_unit=2.0, meters_per_unit=0.5))
+    np.testing.assert_allclose(rigid_bodies.gravity(scene), MODEL.acceleration * 0.5 / 2.0**2, atol=1e-9)
+    still = dataclasses.replace(
+        thrown, groups=tuple(dataclasses.replace(one, model=MotionModel()) for one in thrown.groups)
+    )
     assert not rigid_bodies.gravity(still).any()
     assert any("gravity is unknown" in line for line in mjcf.FORMAT.losses(still))
-    known = dataclasses.replace(still, units=Units(1.0, 1.0))
-    np.testing.assert_allclose(rigid_bodies.gravity(known), [0, 0, -9.80665])
 
 
 def test_objects_without_a_hull_are_named_and_refused_if_no_other_is_left():
