@@ -10,7 +10,7 @@ from ..motion import rotations
 from .identify import PARAMETERS, Estimate, Fitter
 from .world import Material, State
 
-WIDENED = 2.0  # factor on the standard deviations of a fit, read off tosses of a cube
+WIDENED = 2.0  # factor on the standard deviations of a fit to poses, read off tosses of a cube
 _FACE = np.pi / 4  # angle to the most central future beyond which a body lies on another face
 
 
@@ -44,8 +44,10 @@ class Futures:
 
 
 def draw(fitter: Fitter, estimate: Estimate, rng: np.random.Generator) -> tuple[State, Material]:
-    """State and material drawn from an estimate, whose standard deviations are multiplied by `WIDENED`."""
-    x = WIDENED * np.linalg.cholesky(estimate.covariance) @ rng.normal(size=PARAMETERS)
+    """State and material drawn from an estimate; what poses tell counts `WIDENED` times less sure, a prior does not."""
+    assumed = np.diag(estimate.assumed)
+    told = np.linalg.inv(estimate.covariance) - assumed
+    x = np.linalg.cholesky(np.linalg.inv(told / WIDENED**2 + assumed)) @ rng.normal(size=PARAMETERS)
     return fitter.moved(estimate.state, estimate.material, x)
 
 

@@ -6,6 +6,7 @@ the body and times in sqrt(size / g), then the logarithm of the friction and the
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -79,6 +80,7 @@ class Estimate:
         time: Time of the first pose that was fitted.
         material: Friction and restitution.
         covariance: Of the parameters of the module's notation. [14, 14]
+        assumed: Precision of the parameters that comes from the prior and not from poses. [14]
         cost: Weighted sum of squared residuals, with the prior.
         misfit: Mean squared residual in units of the noise.
     """
@@ -87,6 +89,7 @@ class Estimate:
     time: float
     material: Material
     covariance: np.ndarray
+    assumed: np.ndarray
     cost: float
     misfit: float
 
@@ -115,7 +118,8 @@ class Fitter:
         narrow = Prior(first.material, min(0.1, prior.friction), min(0.5, prior.restitution))
         if not self._touched():  # nothing was learned about the material
             return first
-        return self.fit(start, first.material, self.track.rows(rows), narrow, _FULL)
+        last = self.fit(start, first.material, self.track.rows(rows), narrow, _FULL)
+        return dataclasses.replace(last, assumed=np.zeros(PARAMETERS))  # its prior comes from poses
 
     def _touched(self) -> bool:
         return self._flight() < len(self.track)
@@ -155,7 +159,7 @@ class Fitter:
         ridge = np.diag(1e-9 * np.maximum(np.diag(found.normal), 1e-9))
         covariance = np.linalg.inv(found.normal + ridge)
         misfit = float((found.residuals**2).mean())
-        return Estimate(moved, float(track.times[0]), learned, covariance, float(found.cost), misfit)
+        return Estimate(moved, float(track.times[0]), learned, covariance, precision**2, float(found.cost), misfit)
 
     def moved(self, state: State, material: Material, x: np.ndarray) -> tuple[State, Material]:
         """State and material with deviations [14] in the module's notation."""

@@ -57,6 +57,9 @@ def test_a_flight_tells_nothing_about_the_material():
     estimate = fitter.run()
     assert len(fitter.track) >= 3
     np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance))[12:], [0.6, 1.0], rtol=0.2)
+    rng = np.random.default_rng(2)
+    drawn = [np.log(futures.draw(fitter, estimate, rng)[1].friction) for _ in range(400)]
+    assert np.std(drawn) == pytest.approx(0.6, rel=0.15)  # a prior is not widened
     first, again = (
         futures.sample(fitter, estimate, times[[3, -1]], 24, np.random.default_rng(1)).radii(places[[3, -1]], 0.9)
         for _ in range(2)
@@ -67,7 +70,8 @@ def test_a_flight_tells_nothing_about_the_material():
 def test_the_state_between_two_steps_is_that_of_the_poses_there():
     fitter, _, _ = observed(0.11, height=0.22)
     start = fitter.ballistic(fitter.track)
-    estimate = identify.Estimate(start, 0.0, world.Material(0.3, 0.3), np.eye(identify.PARAMETERS), 0.0, 0.0)
+    known = np.eye(identify.PARAMETERS), np.zeros(identify.PARAMETERS)
+    estimate = identify.Estimate(start, 0.0, world.Material(0.3, 0.3), *known, 0.0, 0.0)
     late = 20.9 * fitter.simulation.stepping.step
     quats, places = fitter.poses(start, estimate.material, np.array([late]))
     found = fitter.at(estimate, late)
