@@ -66,7 +66,7 @@ ALLOWED = {
     "protocol": {"scene", "search"},
     "model": {"motion", "scene"},
     "render": {"motion", "scene", "raster", "playback"},
-    "contact": {"motion", "scene", "shapes", "playback", "render"},
+    "contact": {"motion", "motion_fit", "scene", "shapes", "playback", "render"},
     "importing": {"motion", "scene", "data", "formats", "model"},
     "evaluation": {"motion", "terminal", "scene", "data", "playback", "render"},
     "film": {"motion", "scene", "data", "color", "formats", "raster", "playback", "render"},

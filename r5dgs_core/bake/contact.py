@@ -7,7 +7,7 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
-from ..contact import scene_future
+from ..contact import held_out, scene_future
 from ..contact.scene_future import Prediction
 from ..errors import BackendError, Interrupted, R5dgsError
 from ..scene.scene import MotionGroup
@@ -58,8 +58,10 @@ def _smoothed(group: MotionGroup) -> MotionGroup:
 def _rows(found: Prediction) -> list[dict[str, Any]]:
     rows = []
     for name, material in found.taken.items():
-        depth = found.penetrations.get(name, 0.0)
-        reason = "without contacts, it passes into others, in sizes" if depth else "is pushed or hit by another body"
-        row = Need(NAME, depth, scene_future.PENETRATION, True, f"{reason}; {material}").row()
-        rows.append({"object": name, **row})
+        value, threshold = found.penetrations.get(name, 0.0), scene_future.PENETRATION
+        reason = "without contacts, it passes into others, in sizes" if value else "is pushed or hit by another body"
+        if (compared := found.compared.get(name)) is not None:
+            value, threshold = compared.smooth - compared.contact, held_out.BETTER
+            reason = f"no smooth law explains its last motion; {compared.text()}"
+        rows.append({"object": name, **Need(NAME, value, threshold, True, f"{reason}; {material}").row()})
     return rows

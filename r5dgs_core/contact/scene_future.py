@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,7 +12,8 @@ from ..motion import history, rotations, se3
 from ..scene import gravity, predictability, world_axes
 from ..scene.scene import MotionGroup, Scene
 from ..shapes import directions
-from . import futures, path_knots, recording, scene_bodies, scene_world, world
+from . import futures, held_out, path_knots, recording, scene_bodies, scene_world, world
+from .held_out import Comparison
 from .recording import Recording
 from .scene_bodies import SceneBody
 from .scene_world import Wishes
@@ -35,6 +36,7 @@ class Prediction:
         groups: The scene's groups, those of bodies in contact with new motions.
         penetrations: Penetration of the smooth motion, in sizes, of each body that would pass through something.
         taken: Names of the bodies that got a motion with contacts, with their material in words.
+        compared: Test by held-out poses of those among them that were in doubt.
         lines: Reasons why others did not, one sentence each.
         world: The simulated bodies.
         materials: Their materials.
@@ -45,6 +47,7 @@ class Prediction:
     penetrations: Mapping[str, float]
     taken: Mapping[str, str]
     lines: tuple[str, ...]
+    compared: Mapping[str, Comparison] = field(default_factory=dict)
     world: scene_world.SceneWorld | None = None
     materials: tuple[world.Material, ...] = ()
     recording: Recording | None = None
@@ -70,16 +73,17 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     passing = _passing(scene, bodies, end, up)
     depths = {bodies[number].name: depth for number, depth in passing.items()}
     pushed = {number for number, body in enumerate(bodies) if body.group.id in wishes.pushes}
-    driven = [n for n in passing if bodies[n].reason and n not in pushed]
+    doubtful = _doubtful(scene, bodies, passing, end, up) - pushed
+    driven = [n for n in passing if bodies[n].reason and n not in pushed | doubtful]
     lines += [f"{bodies[n].name}: moves on without contacts: {bodies[n].reason}" for n in driven]
-    tried = (set(passing) - set(driven)) | pushed
+    tried = (set(passing) - set(driven)) | pushed | doubtful
     if not tried:
         return Prediction(scene.groups, depths, {}, tuple(lines))
     pull = gravity.of(scene)
     if pull is None or up is None:
         reason = "gravity is unknown: no body was seen to fall, and the scene has no up axis or no units"
         return Prediction(scene.groups, depths, {}, (*lines, f"no contacts are predicted: {reason}"))
-    made = scene_world.make(scene, bodies, tried, pushed, pull, end)
+    made = scene_world.make(scene, bodies, tried, pushed, doubtful, pull, end)
     return _simulated(scene, made, wishes, end, depths, [*lines, *made.lines])
 
 
@@ -116,7 +120,8 @@ def _simulated(
         group = made.bodies[number].group
         groups[group.id] = _with_contact(group, made, number, found, sampled.get(number), scene.t_max)
     taken = {made.bodies[n].name: made.text(n, materials[n]) for n in sorted(changed)}
-    return Prediction(tuple(groups), depths, taken, tuple(lines), made, tuple(materials), found)
+    compared = {made.bodies[n].name: made.comparisons[n] for n in sorted(changed & made.comparisons.keys())}
+    return Prediction(tuple(groups), depths, taken, tuple(lines), compared, made, tuple(materials), found)
 
 
 def _changed(made: scene_world.SceneWorld, found: Recording, pushed: set[int]) -> set[int]:
@@ -180,6 +185,21 @@ def _passing(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray |
         )
     sizes = {number: bodies[number].solid.size for number in found}
     return {number: depth / sizes[number] for number, depth in found.items() if depth > PENETRATION * sizes[number]}
+
+
+def _doubtful(
+    scene: Scene, bodies: list[SceneBody], passing: Mapping[int, float], end: float, up: np.ndarray | None
+) -> set[int]:
+    """Numbers of bodies in contact whose last poses no smooth law explains, unless their need for contacts is sure.
+
+    If its law is that of a driven body, the body is in doubt too: a law that fits nothing proves no hand or motor.
+    """
+    asked = [n for n, body in enumerate(bodies) if n not in passing or body.reason]
+    found = [n for n in asked if held_out.is_unexplained(scene, bodies[n])]
+    if not found or up is None:
+        return set()
+    plane = scene_world.plane(scene, bodies, end, up)
+    return {n for n in found if held_out.in_contact(scene, bodies[n], plane)}
 
 
 def _sinks(scene: Scene, body: SceneBody, path: se3.Pose, up: np.ndarray) -> bool:

@@ -11,7 +11,8 @@ import numpy as np
 from ..motion import models
 from ..scene.scene import Scene
 from ..shapes import solid
-from . import futures, restitution, scene_bodies, stepping, support, world
+from . import futures, held_out, restitution, scene_bodies, stepping, support, world
+from .held_out import Comparison
 from .identify import Estimate, Fitter
 from .scene_bodies import SceneBody
 from .simulation import Simulation
@@ -64,12 +65,14 @@ class SceneWorld:
         world: They, with shapes and materials, and the supporting plane.
         fits: Fitter and result by number, of the bodies that contacts were tried for.
         lines: Reasons why others were not fitted.
+        comparisons: Test by held-out poses of the fitted bodies in doubt, by number.
     """
 
     bodies: tuple[SceneBody, ...]
     world: World
     fits: Mapping[int, tuple[Fitter, Estimate]]
     lines: tuple[str, ...]
+    comparisons: Mapping[int, Comparison]
 
     def start(self, t_max: float) -> State:
         """Most likely state at t_max."""
@@ -139,7 +142,13 @@ def plane(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray) -> 
 
 
 def make(
-    scene: Scene, bodies: list[SceneBody], tried: set[int], pushed: set[int], gravity: np.ndarray, end: float
+    scene: Scene,
+    bodies: list[SceneBody],
+    tried: set[int],
+    pushed: set[int],
+    doubtful: set[int],
+    gravity: np.ndarray,
+    end: float,
 ) -> SceneWorld:
     """Build the world of the bodies whose motion may be simulated.
 
@@ -148,6 +157,7 @@ def make(
         bodies: Its bodies.
         tried: Numbers of those to fit. Without a fit, they are left out, as driven bodies are.
         pushed: Numbers of those among them that the user pushes; they are kept and not fixed.
+        doubtful: Numbers of those among them that held-out poses decide about.
         gravity: Acceleration of a falling body. [3]
         end: Scene time up to which to simulate.
     """
@@ -157,14 +167,18 @@ def make(
     kept = [n for n, body in enumerate(bodies) if not (body.moves and body.reason) or n in tried]
     shapes = tuple(_body(scene, bodies[n], below, n in pushed) for n in kept)
     made = _apart(World(shapes, below, gravity))
-    chosen, own, fits = [], [], {}
+    chosen, own, fits, comparisons = [], [], {}, {}
     for number, shape in zip(kept, made.bodies, strict=True):
         body = bodies[number]
         if number in tried and body.moves:
             fitter, estimate = _fit(scene, body, shape, below, gravity, end)
-            reason = _misfit(estimate)
+            reason, compared = _misfit(estimate), None
+            if not reason and number in doubtful:
+                compared = held_out.compare(fitter, up)
+                reason = "" if compared.better else f"contacts are not clearly better: {compared.text()}"
             if estimate is not None and not reason:
                 fits[len(chosen)] = fitter, estimate
+                comparisons |= {} if compared is None else {len(chosen): compared}
                 shape = dataclasses.replace(shape, material=estimate.material)
             elif number in pushed:
                 lines.append(f"{body.name}: is pushed out of its smooth motion: {reason}")
@@ -173,7 +187,7 @@ def make(
                 continue
         chosen.append(body)
         own.append(shape)
-    return SceneWorld(tuple(chosen), World(tuple(own), below, gravity), fits, tuple(lines))
+    return SceneWorld(tuple(chosen), World(tuple(own), below, gravity), fits, tuple(lines), comparisons)
 
 
 def _misfit(estimate: Estimate | None) -> str:
