@@ -14,13 +14,13 @@ import numpy as np
 from ...config.config import Config
 from ...config.sections.training import InitSection
 from ...model.gaussians import Gaussians
-from ...scene.sampling import spread
 from ..representations.representation import TRACKS, Representation
 from ..train_views import TrainView, by_camera, nearest_knot
 from . import (
     background_images,
     color_balance,
     evidence,
+    knots,
     place_gaussians,
     plane_sweep,
     scatter,
@@ -32,7 +32,6 @@ from . import (
 log = logging.getLogger(__name__)
 
 MASKS = "Remedy: object_mask/train/IMAGE.png files"
-SAME_TIME = 0.1  # share of the cameras' median time step within which times are equal
 MIN_CAMERAS = 3  # minimum number of cameras to place a scene from the images of one time
 SEEN_AT_ALL = 1e-3  # score of a time at which the object has a position, but no view shows all of it
 
@@ -87,28 +86,6 @@ class InitialState:
     colors: color_balance.ColorBalance | None = None
 
 
-def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
-    """Return the knots of the tracks: the distinct observed times.
-
-    Times of slightly unsynchronised cameras, within a tenth of the cameras' median time step, share one knot. If more
-    than ``limit`` knots remain, they are sampled evenly by index, so that knots are as dense as the images. The first
-    and the last observed time are always knots.
-    """
-    of_camera = [{round(view.t, 9) for view in group} for group in by_camera(views)]
-    steps = [np.diff(sorted(found)) for found in of_camera if len(found) > 1]
-    times = np.unique([t for found in of_camera for t in found])
-    if steps:
-        together = SAME_TIME * float(np.median(np.concatenate(steps)))
-        starts = [0]
-        for k, t in enumerate(times):
-            if t - times[starts[-1]] > together:
-                starts.append(k)
-        parts = np.split(times, starts[1:])
-        inner = [part[0] if len(part) == 1 else part.mean() for part in parts]
-        times = np.array([times[0], *inner[1:-1], times[-1]]) if len(parts) > 1 else times[-1:]
-    return np.array(spread(list(times), limit))
-
-
 def start(
     views: Sequence[TrainView],
     config: Config,
@@ -131,7 +108,7 @@ def start(
         The initial state.
     """
     init = config.init
-    times = observed_times(views)
+    times = knots.of(views)
     if not motion.moves and len(times) > 1:
         log.info("nothing moves in any view: training a static scene")
         times = times[-1:]

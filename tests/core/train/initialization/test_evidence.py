@@ -7,7 +7,7 @@ import pytest
 
 from r5dgs_core.scene import cameras
 from r5dgs_core.train import train_views
-from r5dgs_core.train.initialization import evidence, initialize, triangulation
+from r5dgs_core.train.initialization import evidence, triangulation
 from tests.support import scenes
 
 TIMES = np.linspace(0.0, 1.0, 5)
@@ -110,30 +110,3 @@ def test_an_object_behind_another_or_out_of_the_frame_is_not_absent():
             places.centers[row, :2, 2] = 9.0
         assert not places.measured[row, :2].any()
         assert not evidence.absent(seen, places, TIMES)[row].any()
-
-
-def at(camera, t):
-    return train_views.TrainView("v", camera, float(t), np.zeros((4, 4, 3), np.uint8), None, None)
-
-
-def test_knots_are_the_observed_times():
-    seen = [at(c, t) for t in (0.0, 0.1, 0.5, 0.7) for c in ring()]
-    assert initialize.observed_times(seen).tolist() == [0.0, 0.1, 0.5, 0.7]
-    assert initialize.observed_times(seen[:1]).tolist() == [0.0]
-    alone = [at(c, t) for c, t in zip(ring(), (0.0, 0.01, 0.011, 0.5), strict=True)]  # each camera one time
-    assert initialize.observed_times(alone).tolist() == [0.0, 0.01, 0.011, 0.5]
-
-
-def test_cameras_with_slightly_different_times_share_their_knots():
-    shifts = [0.0, 0.001, -0.002, 0.003]
-    seen = [at(c, 0.1 * k + shift) for k in range(1, 9) for c, shift in zip(ring(), shifts, strict=True)]
-    knots = initialize.observed_times(seen)
-    assert len(knots) == 8 and knots[0] == seen[2].t and knots[-1] == seen[-1].t
-    np.testing.assert_allclose(knots[1:-1], 0.1 * np.arange(2, 8) + 0.0005, atol=1e-9)
-
-
-def test_too_many_times_are_thinned_to_knots_among_them():
-    times = np.concatenate([np.linspace(0, 0.2, 300), np.linspace(0.3, 1, 100)])
-    knots = initialize.observed_times([at(ring()[0], t) for t in times], limit=40)
-    assert len(knots) == 40 and np.isin(knots, np.round(times, 9)).all() and (np.diff(knots) > 0).all()
-    assert knots[0] == 0 and knots[-1] == 1 and (knots < 0.25).sum() == pytest.approx(30, abs=1)
