@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import numpy as np
 
 LEVELS = 65535
 MARGIN = 1.25  # factor on both ends of the depth range, so that moving Gaussians stay inside it
-WORTHWHILE = 0.3  # minimum share of unmoved Gaussians for which their order is reused
+WORTHWHILE = 0.5  # minimum share of unmoved Gaussians for which reusing their order is faster than sorting all
 
 
 @dataclass(frozen=True)
@@ -65,12 +66,26 @@ class DepthKeys:
 
 @dataclass(frozen=True)
 class _Sorted:
-    """Sorted Gaussians of some groups: the groups, their conversion, keys and rows, from far to near."""
+    """Sorted Gaussians of some groups.
+
+    Attributes:
+        groups: The groups.
+        conversion: Conversion of their depths.
+        keys: Keys in the order of the groups. [n] uint16
+        order: Indices that sort the keys, from far to near. [n] int64
+        rows: Rows in that order. [n] int64
+    """
 
     groups: frozenset[int]
-    keys: DepthKeys
-    sorted_keys: np.ndarray
+    conversion: DepthKeys
+    keys: np.ndarray
+    order: np.ndarray
     rows: np.ndarray
+
+    @functools.cached_property
+    def sorted_keys(self) -> np.ndarray:
+        """Ascending keys. [n] uint16"""
+        return self.keys[self.order]
 
 
 class DepthOrder:
@@ -109,10 +124,10 @@ class DepthOrder:
         moved = now.keys() - unmoved
         if not moved and self._still is not None and self._still.groups == now.keys():
             return self._still.rows
+        least = max(WORTHWHILE * self._count(now), 1)
         if self._still is None or not self._still.groups <= unmoved:
-            self._still = self._sort(planes, unmoved, near, parallel) if self._count(unmoved) else None
-        total = self._count(now)
-        if self._still is not None and self._count(self._still.groups) >= WORTHWHILE * total:
+            self._still = self._sort(planes, unmoved, near, parallel) if self._count(unmoved) >= least else None
+        if self._still is not None and self._count(self._still.groups) >= least:
             merged = self._merge(planes, self._still)
             if merged is not None:
                 return merged
@@ -123,34 +138,43 @@ class DepthOrder:
     def _count(self, groups) -> int:
         return sum(self._starts[group + 1] - self._starts[group] for group in groups)
 
-    def _depths(self, planes: dict[int, np.ndarray], groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Depths and rows of the Gaussians of groups. [n] float32, [n] int64"""
+    def _depths(self, planes: dict[int, np.ndarray], groups: Sequence[int]) -> np.ndarray:
+        """Depths of the Gaussians of groups. [n] float32"""
         depths, filled = np.empty(self._count(groups), np.float32), 0
-        spans = [(self._starts[group], self._starts[group + 1]) for group in groups]
-        for group, (start, stop) in zip(groups, spans, strict=True):
+        for group in groups:
+            start, stop = self._starts[group], self._starts[group + 1]
             part, plane = depths[filled : filled + stop - start], planes[group]
             np.dot(self._positions[start:stop], plane[:3].astype(np.float32), out=part)
             part += np.float32(plane[3])
             filled += stop - start
-        rows = np.concatenate([np.empty(0, np.int64), *(np.arange(*span) for span in spans)])
-        return depths, rows
+        return depths
+
+    def _rows(self, groups: Sequence[int], order: np.ndarray) -> np.ndarray:
+        """Rows of the Gaussians of ascending groups, in an order. [n] int64"""
+        if len(order) == self._starts[-1]:  # of all groups
+            return order
+        spans = [np.arange(self._starts[group], self._starts[group + 1]) for group in groups]
+        return np.concatenate(spans)[order] if spans else order
 
     def _sort(self, planes: dict[int, np.ndarray], groups: frozenset[int], near: float, parallel: bool) -> _Sorted:
-        depths, rows = self._depths(planes, sorted(groups))
-        if not len(rows):
-            return _Sorted(groups, DepthKeys(near, near, near, False), np.empty(0, np.uint16), rows)
+        depths = self._depths(planes, sorted(groups))
+        if not len(depths):
+            return _Sorted(groups, DepthKeys(near, near, near, False), *[np.empty(0, np.int64)] * 3)
         conversion = DepthKeys.of(depths, near, parallel)
         keys = conversion(depths)
         order = np.argsort(keys, kind="stable")
-        return _Sorted(groups, conversion, keys[order], rows[order])
+        return _Sorted(groups, conversion, keys, order, self._rows(sorted(groups), order))
 
     def _merge(self, planes: dict[int, np.ndarray], still: _Sorted) -> np.ndarray | None:
         """Merge the other groups into a sorted set, or return None if they leave its range of depths."""
-        depths, rows = self._depths(planes, sorted(planes.keys() - still.groups))
-        if not len(rows):
+        moved = sorted(planes.keys() - still.groups)
+        depths = self._depths(planes, moved)
+        if not len(depths):
             return still.rows
-        if not still.keys.hold(depths):
+        if not still.conversion.hold(depths):
             return None
-        keys = still.keys(depths)
+        keys = still.conversion(depths)
         order = np.argsort(keys, kind="stable")
-        return np.insert(still.rows, np.searchsorted(still.sorted_keys, keys[order], side="right"), rows[order])
+        runs = np.concatenate([still.sorted_keys, keys[order]], dtype=np.int32)
+        # numpy sorts int32 stably by merging ascending runs, which is faster than its radix sort of uint16.
+        return np.concatenate([still.rows, self._rows(moved, order)])[np.argsort(runs, kind="stable")]
