@@ -27,6 +27,7 @@ _KEYS_BY_UNIT = {
     """,
     "share of the image": "init.min_mask_pixels",
     "share of the images": "data.min_registered",
+    "GB": "data.memory",
     "share of the image width": "densify.prune_width",
     "share of the cameras' extent": "densify_default.percent_dense densify_default.prune_extent",
     "opacity, 0 to 1": """

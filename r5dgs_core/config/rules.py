@@ -86,6 +86,7 @@ _INSIDE: tuple[Callable[[Any], bool], str] = (lambda value: 0 < value < 1, "betw
 # Constraints beyond the type; `check_key` ensures that all numbers are finite and not negative.
 RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "data.min_registered": _SHARE,
+    "data.memory": _POSITIVE,
     "train.iterations": _AT_LEAST_1,
     "train.seed": (lambda value: value < 2**63 - 1, "less than 2^63 - 1"),
     "train.device": (lambda value: re.fullmatch(DEVICES, value) is not None, "auto, cpu, cuda or cuda:N"),

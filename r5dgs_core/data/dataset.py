@@ -18,7 +18,7 @@ import numpy as np
 from .. import errors, findings
 from ..scene import cameras, units
 from ..scene.units import Units
-from . import images, masks, transforms, view_masks
+from . import frame_rate, images, masks, view_masks
 from . import origin as origins
 from .annotations import OBJECTS, GroundTruth, read_ground_truth, read_objects
 from .layouts import registry
@@ -29,7 +29,6 @@ from .splits import SPLITS
 from .view_masks import MASKS
 from .views import View, make_views
 
-FRAMES_PER_UNIT = 60.0
 _log = logging.getLogger(__name__)
 
 
@@ -173,9 +172,11 @@ def read(
     with guard():
         _check_convention(root, raw.header)
     ground_truth = None if own_ids else _true_poses(root, origin, names, guard)  # these use the data set's own ids
-    frames_per_unit = FRAMES_PER_UNIT
+    frames_per_unit = frame_rate.DEFAULT
     with guard():
-        frames_per_unit = _frames_per_unit(root, raw.header, [e for split in SPLITS for e in raw.entries[split]])
+        frames_per_unit = frame_rate.frames_per_unit(
+            root, raw.header, [e for split in SPLITS for e in raw.entries[split]]
+        )
     return Dataset(
         root=root,
         name=root.resolve().name,
@@ -263,7 +264,11 @@ def _check_convention(root: Path, header: dict[str, Any]) -> None:
 
 def load_rgba(view: View) -> np.ndarray:
     """Load the image of a view, straight alpha, 1 if the file has none. [H, W, 4] float32"""
-    pixels = images.to_rgba(images.read(view.image_path))
+    return _of_camera(view, images.to_rgba(images.read(view.image_path)))
+
+
+def _of_camera(view: View, pixels: np.ndarray) -> np.ndarray:
+    """Return pixels of the size that the view's image had when the data set was read."""
     if pixels.shape[:2] != (view.camera.height, view.camera.width):
         raise errors.DatasetError(
             f"{view.image_path}: the image changed: {pixels.shape[1]}x{pixels.shape[0]} now, "
@@ -281,6 +286,16 @@ def load_image(view: View, background: np.ndarray | None = None) -> np.ndarray:
     return image if view.correction is None else view.correction.unseen(image)
 
 
+def load_image_8bit(view: View, background: np.ndarray | None = None) -> np.ndarray:
+    """Load `load_image` rounded to 8 bits; opaque colours of 8 bits are not converted. [H, W, 3] uint8"""
+    stored = images.read_raw(view.image_path) if view.correction is None else None
+    if stored is not None and stored.dtype == np.uint8:
+        channels = stored.shape[2]
+        if channels == 3 or (channels == 4 and (stored[..., 3] == 255).all()):
+            return np.ascontiguousarray(_of_camera(view, stored)[..., :3])
+    return np.round(load_image(view, background) * 255).astype(np.uint8)
+
+
 def load_mask(view: View) -> np.ndarray | None:
     """Load the object ids of a view, at the size of its image; returns None without a mask.
 
@@ -291,31 +306,6 @@ def load_mask(view: View) -> np.ndarray | None:
         return None
     ids = masks.read(view.mask_path, view.mask_colors, view.mask_unknown)
     return masks.resize(ids, view.camera.width, view.camera.height, str(view.mask_path))
-
-
-def _frames_per_unit(root: Path, header: dict[str, Any], entries: list[transforms.Entry]) -> float:
-    """Blender frames per unit of time: from the file, from frame numbers, from duration and rate, or 60."""
-    hints = {}
-    for key in ("frames_per_unit", "fps", "duration"):
-        if header.get(key) is not None:
-            value = header[key]
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < float("inf"):
-                raise errors.DatasetError(f"{root}: '{key}' must be a positive number, found {value!r}", code="D23")
-            hints[key] = float(value)
-    if "frames_per_unit" in hints:
-        return hints["frames_per_unit"]
-    numbered = [(entry.t, entry.frame) for entry in entries if entry.frame is not None]
-    if len(numbered) == len(entries):
-        t, frame = np.array(numbered).T
-        if np.ptp(t) > 0 and np.ptp(frame) > 0:
-            slope = float(np.polyfit(t, frame, 1)[0])
-            if slope > 0:
-                return slope
-    if "fps" in hints and "duration" in hints:
-        return hints["fps"] * hints["duration"]
-    if "fps" in hints and max(entry.t for entry in entries) > 1.0:
-        return hints["fps"]  # times are in seconds
-    return FRAMES_PER_UNIT
 
 
 def _has_alpha(views: tuple[View, ...], guard: findings.Guard) -> bool:

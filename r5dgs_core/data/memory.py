@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
 from .. import errors
 from .dataset import Dataset
 
-_BYTES_PER_PIXEL = 3  # of an image in memory; masks are not counted
+_BYTES_PER_PIXEL = 4  # of an image with its mask
+_AT_ONCE = 32  # images that training needs at the same time, such as those of a camera for its background
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-_UNKNOWN = 8 * 2.0**30  # assumed on systems that do not report it
+GB = 2.0**30
+_UNKNOWN = 8 * GB  # assumed on systems that do not report it
 
 
 def total() -> float:
@@ -31,20 +34,48 @@ def available() -> float | None:
         return None
 
 
+def for_images(limit: float) -> float:
+    """Return the memory that training may use for pixels, bytes: ``limit`` [GB], or half of the available memory."""
+    free = available()
+    return limit * GB if free is None else min(limit * GB, free / 2)
+
+
 def of_images(dataset: Dataset) -> int:
-    """Return the memory of the training images, bytes."""
+    """Return the memory of the pixels of all training images and masks, bytes."""
     return sum(_BYTES_PER_PIXEL * view.camera.width * view.camera.height for view in dataset.train)
 
 
+def at_once(dataset: Dataset) -> int:
+    """Return the memory of the pixels that training needs at the same time, bytes."""
+    sizes = sorted((view.camera.width * view.camera.height for view in dataset.train), reverse=True)
+    return _BYTES_PER_PIXEL * sum(sizes[:_AT_ONCE])
+
+
 def check_images(dataset: Dataset) -> None:
-    """Raise `DatasetError` if the training images alone do not fit into the available memory."""
-    needed, free = of_images(dataset), available()
+    """Raise `DatasetError` if the images that training needs at the same time do not fit into the available memory."""
+    needed, free = at_once(dataset), available()
     if free is not None and needed > free:
         raise errors.DatasetError(
-            f"{dataset.root}: its {len(dataset.train)} training images need {needed / 2**30:.1f} GB of memory, "
-            f"{free / 2**30:.1f} GB are available. Remedy: prepare the data with a smaller --size or with --every N, "
-            "scale the images down, or stop other programs"
+            f"{dataset.root}: training needs {needed / GB:.1f} GB of memory for {min(_AT_ONCE, len(dataset.train))} "
+            f"images at the same time, {free / GB:.1f} GB are available. Remedy: prepare the data with a smaller "
+            "--size, scale the images down, or stop other programs"
         )
+
+
+def note(dataset: Dataset, limit: float) -> str:
+    """Return a remark for the user if images are read again while training, else an empty string.
+
+    Args:
+        dataset: The data set.
+        limit: Maximum memory for pixels, GB (``data.memory``).
+    """
+    needed, used = of_images(dataset), for_images(limit)
+    if needed <= used:
+        return ""
+    return (
+        f" ({len(dataset.train)} images of {needed / GB:.1f} GB are read again while training, because they may use "
+        f"{used / GB:.1f} GB of memory; data.memory={math.ceil(needed / GB)} keeps all of them)"
+    )
 
 
 def _number(path: Path) -> float | None:

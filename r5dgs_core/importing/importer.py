@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import __version__
 from ..data import dataset as datasets
+from ..data import frame_rate
 from ..data import origin as origins
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
@@ -34,7 +35,7 @@ class Options:
         iteration: Iteration to read; None for the last.
         data: Data set that the run was trained on; gives cameras, times and world axes.
         knots: Number of times at which the deformation is sampled; None for the data set's times, or
-            `data.dataset.FRAMES_PER_UNIT` per unit of time.
+            `data.frame_rate.DEFAULT` per unit of time.
         t_max: Last time of the deformation; None for that of the run, else of the data set, else 1.
         world: Axes of the world, a key of `cameras.WORLD_TO_BLENDER`.
         still: Motion that is dropped, as a share of the scene's extent.
@@ -98,7 +99,7 @@ def import_run(folder: Path, options: Options = Options(), progress: assembly.Pr
         motion,
         times,
         name=run.folder.resolve().name,
-        frames_per_unit=datasets.FRAMES_PER_UNIT if dataset is None else dataset.frames_per_unit,
+        frames_per_unit=frame_rate.DEFAULT if dataset is None else dataset.frames_per_unit,
         world_convention=_world(run, foreign, dataset, options),
         cameras=cameras_json.read(run.folder / "cameras.json") if dataset is None else dataset.cameras,
         background_sh=spherical_harmonics.rgb_to_dc(np.full((1, 3), float(white))).astype(np.float32),
@@ -146,7 +147,7 @@ def _times(run: RunFolder, foreign: ForeignRun, dataset: Dataset | None, options
     if options.knots is not None:
         return np.linspace(0.0, t_max, options.knots)
     if dataset is None:
-        knots = max(2, round(datasets.FRAMES_PER_UNIT * t_max) + 1)
+        knots = max(2, round(frame_rate.DEFAULT * t_max) + 1)
         if knots > MAX_KNOTS:
             raise CheckpointError(
                 f"{run.folder}: the last time {t_max:g} requires more than {MAX_KNOTS} knots; give their number "

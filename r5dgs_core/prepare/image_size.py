@@ -11,6 +11,7 @@ MOST_LINES = 960
 LEAST_LINES = 64
 _BASE = 1.0e9  # bytes of a process with 60,000 Gaussians and small images
 _CACHE = 1 << 30  # training caches images as floats up to this size
+PIXELS = 2 * memory.GB  # default of data.memory
 _PER_CAMERA_PIXEL = 64  # bytes: background images and the plane sweep
 _STEP = 8  # lines
 
@@ -58,9 +59,10 @@ def scaled(size: tuple[int, int], lines: int) -> tuple[int, int]:
 def training_memory(sizes: Sequence[tuple[int, int]], counts: Sequence[int], lines: int) -> float:
     """Return an estimate of the memory of training, bytes.
 
-    Images take three bytes per pixel, masks one or two, and a cache four times the images as long as it fits.
+    Images take three bytes per pixel, masks one or two, and a cache four times the images as long as it fits; all of
+    them at most `PIXELS`.
     """
     pixels = [width * height for width, height in (scaled(size, lines) for size in sizes)]
     images = 3 * sum(count * area for count, area in zip(counts, pixels, strict=True))
     cache = 4 * images if 4 * images <= _CACHE else 0
-    return _BASE + images * 4 / 3 + cache + _PER_CAMERA_PIXEL * sum(pixels)
+    return _BASE + min(images * 4 / 3 + cache, PIXELS) + _PER_CAMERA_PIXEL * sum(pixels)

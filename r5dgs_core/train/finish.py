@@ -28,7 +28,7 @@ def identity_steps(trainer: Trainer) -> int:
     """Return the number of steps for identity encodings after the run; each costs about as much as a training step."""
     if trainer.config.identity.training != "after":
         return 0
-    masked = any(view.mask is not None for view in trainer.given_views)
+    masked = any(view.has_mask for view in trainer.given_views)
     return trainer.config.identity.iterations if masked and len(trainer.object_ids) > 1 else 0
 
 
@@ -39,7 +39,7 @@ def final_tensors(trainer: Trainer, progress: Progress) -> dict[str, torch.Tenso
     device = trainer.gaussians.motion_ids.device
     fallback = torch.from_numpy(group_classes)[trainer.gaussians.motion_ids.cpu()]
     extra: dict[str, torch.Tensor] = {"labels": fallback}
-    if any(v.mask is not None for v in trainer.given_views):
+    if any(v.has_mask for v in trainer.given_views):
 
         @torch.no_grad()
         def pose(view: TrainView) -> PosedSplats:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from ..raster import rasterize_splats
 from ..raster.arrays import to_host
 from ..scene import visibility
 from ..scene.sampling import spread
-from . import motion_clusters
+from . import motion_clusters, train_views
 from .identity import packed_masks
 from .representations import gating
 from .representations.field import FieldRepresentation
@@ -43,7 +43,7 @@ MAX_GAUSSIANS = 12000  # maximum number of Gaussians in the short run
 
 def find_masks(
     dataset: Dataset, config: Config, progress: Callable[[dict[str, Any]], None] | None = None
-) -> list[np.ndarray] | None:
+) -> Sequence[np.ndarray] | None:
     """Find masks of the moving objects in the training views.
 
     Args:
@@ -64,6 +64,7 @@ def find_masks(
     progress({"event": "prepare", "text": "no masks: looking for moving objects"})
     trainer = Trainer(dataset, _short(config, max(view.t for view in dataset.train)))
     if not trainer.motion.moves:
+        train_views.forget(trainer.given_views)
         return None
     while not trainer.done:
         trainer.step()
@@ -73,7 +74,9 @@ def find_masks(
     labels = find_parts(trainer, config)
     count = int(labels.max(initial=-1)) + 1
     progress({"event": "prepare", "text": f"no masks: {count} moving part{'s' * (count != 1)} found"})
-    return draw_masks(trainer, labels) if count > 0 else None
+    masks = draw_masks(trainer, labels) if count > 0 else None
+    train_views.forget(trainer.given_views)  # the run that follows reads them into a cache of its own
+    return masks
 
 
 def _short(config: Config, last: float) -> Config:
@@ -214,11 +217,11 @@ def _drawn(trainer: Trainer, view: TrainView, splats: PosedSplats, parts_of: Ten
 
 
 @torch.no_grad()
-def draw_masks(trainer: Trainer, labels: np.ndarray) -> list[np.ndarray]:
+def draw_masks(trainer: Trainer, labels: np.ndarray) -> packed_masks.CompressedMasks:
     """Render the masks of the training views: k + 1 for part k, 0 for the background. [H, W]"""
     kind = np.uint8 if labels.max() < 255 else np.uint16
-    result, parts_of = [], torch.from_numpy(labels).to(trainer.gaussians.motion_ids)
-    for view in trainer.views:
+    result, parts_of = packed_masks.CompressedMasks(), torch.from_numpy(labels).to(trainer.gaussians.motion_ids)
+    for view in train_views.in_turn(trainer.views, train_views.IMAGE):
         _, ids = _drawn(trainer, view, trainer.splats(view.camera, view.t), parts_of)
         result.append(_without_specks((to_host(ids) + 1).clip(min=0).astype(kind)))
     return result

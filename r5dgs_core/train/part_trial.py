@@ -98,9 +98,10 @@ def error_of(trainer: Trainer, object_id: int, views: Sequence[int]) -> float:
     total = 0.0
     for index in views:
         view = trainer.views[index]
-        if view.mask is None or not (view.mask == object_id).any():
+        mask = view.mask
+        if mask is None or not (mask == object_id).any():
             continue
-        region = np.asarray(ndimage.binary_dilation(view.mask == object_id, iterations=registration.MARGIN), bool)
+        region = np.asarray(ndimage.binary_dilation(mask == object_id, iterations=registration.MARGIN), bool)
         truth = torch.from_numpy(view.image).float() / 255
         squares = ((trainer.render(view.camera, view.t).cpu() - truth) ** 2).sum(-1).numpy().astype(np.float64)
         total += float(squares[region].sum())
@@ -211,8 +212,9 @@ class _Growth:
         colors = self._colors(rows)
         for index in self._used:
             view, s = self._trainer.views[index], self._knots[index]
-            if view.mask is None or not first <= s <= final:
+            if not first <= s <= final or (mask := view.mask) is None:
                 continue
+            image = view.image
             for k, part in enumerate(self._parts):
                 moved = centers[part] + rotations.rotate(quats[part, s][None], points - centers[part]) + moves[part, s]
                 pixels, depth = cameras.project(view.camera, moved)
@@ -221,8 +223,8 @@ class _Growth:
                     .clip(0, [view.camera.width - 1, view.camera.height - 1])
                     .T.astype(int)
                 )
-                away = ((view.image[y, x] / 255.0 - colors) ** 2).sum(1)
-                inside = (view.mask[y, x] == self._object_id) & (depth > 0)
+                away = ((image[y, x] / 255.0 - colors) ** 2).sum(1)
+                inside = (mask[y, x] == self._object_id) & (depth > 0)
                 found[:, k] += np.where(inside, np.minimum(away, OUTSIDE), OUTSIDE)
         return found
 

@@ -43,7 +43,7 @@ MAX_REGISTRATIONS_PER_KNOT = 2  # maximum registrations of a body in a round, re
 
 def applies(trainer: Trainer) -> bool:
     """Return True if bodies have tracks of four or more knots, and masks show them."""
-    masked = any(view.mask is not None for view in trainer.given_views)
+    masked = any(view.has_mask for view in trainer.given_views)
     tracked = isinstance(trainer.motion, TracksRepresentation)
     return trainer.config.train.repair and tracked and masked and len(trainer.times) > 3
 

@@ -164,7 +164,7 @@ class BodyRegistration:
 
 def views_at(trainer: Trainer, knot: int) -> list[train_views.TrainView]:
     """Return the views with masks at a knot."""
-    return [v for v in trainer.views if v.mask is not None and train_views.nearest_knot(trainer.times, v.t) == knot]
+    return [v for v in trainer.views if v.has_mask and train_views.nearest_knot(trainer.times, v.t) == knot]
 
 
 def grown(mask: np.ndarray) -> np.ndarray:
@@ -178,9 +178,9 @@ def errors(trainer: Trainer, knot: int, most: int) -> np.ndarray:
     ids = [int(i) for i in trainer.object_ids[1:]]
     sums, pixels = np.zeros(len(ids)), np.zeros(len(ids))
     for view in sampling.spread(views_at(trainer, knot), most):
-        squares = (to_host(trainer.render(view.camera, view.t)) - view.image / 255.0) ** 2
+        squares, mask = (to_host(trainer.render(view.camera, view.t)) - view.image / 255.0) ** 2, view.mask
         for row, object_id in enumerate(ids):
-            mine = view.mask == object_id
+            mine = mask == object_id
             if mine.sum() >= MIN_PIXELS:
                 sums[row] += squares[grown(mine)].sum()
                 pixels[row] += 3 * grown(mine).sum()

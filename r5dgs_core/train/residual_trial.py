@@ -177,11 +177,12 @@ def _gains(trainer: Trainer, field: ResidualField, held: Sequence[int]) -> tuple
     errors, pixels = np.zeros((2, len(ids))), np.zeros(len(ids))
     for index in held:
         view = trainer.views[index]
-        assert view.mask is not None
+        mask = view.mask
+        assert mask is not None
         truth = torch.from_numpy(view.image).float() / 255
         whole = _squares(trainer, field, index, truth)
         for body in field.bodies:
-            region = view.mask == ids[body - 1]
+            region = mask == ids[body - 1]
             if not region.any():
                 continue
             region = np.asarray(ndimage.binary_dilation(region, iterations=MARGIN), bool)

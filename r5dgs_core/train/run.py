@@ -7,7 +7,7 @@ import dataclasses
 import logging
 import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -159,7 +159,8 @@ def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]
         else:
             progress({"event": "prepare", "text": f"training on {devices.title(device)}"})
         found = _found_masks(dataset, run.config, state, progress)
-        progress({"event": "prepare", "text": "images, objects, background"})
+        note = memory.note(dataset, run.config.data.memory)
+        progress({"event": "prepare", "text": f"images, objects, background{note}"})
         trainer = Trainer(dataset, run.config, found)
         held_out = _held_out_psnr(trainer)
     if replaces:
@@ -224,7 +225,7 @@ def _open(request: _Request, dataset: datasets.Dataset) -> tuple[run_folder.Run,
 
 def _found_masks(
     dataset: datasets.Dataset, config: Config, state: checkpoint.Checkpoint | None, progress: TimedProgress
-) -> list[np.ndarray] | None:
+) -> Sequence[np.ndarray] | None:
     """Return masks of moving objects for data without masks: those of the checkpoint, or newly discovered ones."""
     if state is None:
         if not training_needs.discovery(dataset, config):

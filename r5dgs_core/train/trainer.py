@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..config import training_needs
 from ..config.config import Config
+from ..data import memory
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, TrainingError
 from ..model.gaussians import Gaussians
@@ -35,8 +36,8 @@ from .refinement.refinement import RefinedViews, Refinement
 from .representations import fused_posing, registry, still
 from .running_loss import CHECK_EVERY, RunningLoss, require_finite_state, require_finite_step
 from .step_graphs import StepInputs
+from .targets import Targets
 
-TARGET_BYTES = 1 << 30  # maximum size of the cache of training images as floats
 MAX_CAMERAS = 256  # maximum number of cameras in tests of visibility
 FREEZE_EVERY = 100  # steps between updates of the frozen Gaussians
 
@@ -65,7 +66,8 @@ class Trainer:
         self.config = config = training_needs.resolve(config)
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         self.behind = train_views.behind(dataset, config)
-        self.given_views = train_views.load(dataset, self.normalization, self.behind)
+        self._memory = memory.for_images(config.data.memory)
+        self.given_views = train_views.load(dataset, self.normalization, self.behind, self._memory)
         self.discovered_masks, shown = None, self.given_views
         if discovered_masks is not None:
             self.discovered_masks = packed_masks.pack(discovered_masks)
@@ -94,7 +96,6 @@ class Trainer:
         view_times = np.array([train_views.nearest_knot(self.times, v.t) for v in self.given_views])
         self.curriculum = curriculum.Curriculum(config, view_times, len(self.times), self.first_time)
         self.distinct_cameras = [group[0].camera for group in train_views.by_camera(self.given_views, MAX_CAMERAS)]
-        self._targets: dict[int, Tensor] = {}
         self.refinement = Refinement(rig.of(self.given_views), spacing(self.times), config.train.iterations)
         if start.colors is not None:
             self.refinement.begin_colors(start.colors)
@@ -108,6 +109,7 @@ class Trainer:
     def _begin_on(self, device: torch.device) -> None:
         """Move all tensors to a device, and begin optimisation and densification there."""
         self.device = device
+        self.targets = Targets(self.given_views, device, self._memory)
         self.gaussians = self.gaussians.to(device)
         self.motion = self.motion.to(device)
         self.background = self.background.to(device)
@@ -157,6 +159,7 @@ class Trainer:
         for knot, towards, entered in self.curriculum.grow(self.iteration):
             self.motion.enter(knot, towards, entered)
         index = self.curriculum.draw(self.iteration, self.generator)
+        self.targets.expect(self.curriculum.queue, masks=self.identity is not None)
         view = self.views[index]
         place = f"step {self.iteration}, view {view.name}"
         for group in self.optimizer.param_groups:
@@ -164,7 +167,7 @@ class Trainer:
         if self.iteration % FREEZE_EVERY == 0 or len(self.frozen) != len(self.gaussians):
             # The depth of background that only one camera sees is not determined.
             self.frozen = densifier.seen_by_one_camera(self.gaussians, self.distinct_cameras)
-        inputs = StepInputs(index, view, self.motion.path(view.t, self.generator), self._target(index))
+        inputs = StepInputs(index, view, self.motion.path(view.t, self.generator), self.targets.of(index))
         loss = self._graphs.step(inputs) if self._graphs.take(inputs) else self.update(inputs, RasterStats(), place)
         if self.device.type != devices.CPU and self.iteration % CHECK_EVERY == 0:
             require_finite_state(loss, self.params, place)
@@ -244,15 +247,6 @@ class Trainer:
     def _classes_of(self, groups: Tensor) -> Tensor:
         classes = torch.from_numpy(self.motion.group_classes(self.motion.tensors()))
         return classes.to(self.device)[groups]
-
-    def _target(self, index: int) -> Tensor:
-        """Return a view's image in [0, 1]. Cached if all views fit into `TARGET_BYTES`, else converted on each call."""
-        if index in self._targets:
-            return self._targets[index]
-        target = torch.from_numpy(self.given_views[index].image).to(self.device, non_blocking=True).float() / 255
-        if sum(v.image.size for v in self.given_views) * 4 <= TARGET_BYTES:
-            self._targets[index] = target
-        return target
 
     def _hide_harmonics(self) -> None:
         """Keep untrained degrees of the harmonics at zero by zeroing their gradients, and so Adam's moments."""

@@ -51,12 +51,13 @@ def shared_starts():
     start, made = initialize.start, {}
 
     def shared(views, config, motion, find_sky, rng, cloud=None):
-        if any(view.mask is None for view in views) or len({view.t for view in views}) == 1:
+        if not all(view.has_mask for view in views) or len({view.t for view in views}) == 1:
             return start(views, config, motion, find_sky, rng, cloud)
         train = config.train
         shown = (train.sh_degree, train.shadows, train.shading, train.representation, config.needs.camera_colours)
         settings = (config.init, config.curriculum, shown, motion.name)
-        given = (views, settings, find_sky, rng.bit_generator.state, cloud)
+        pixels = [(view.name, view.camera, view.t, view.image, view.mask, view.alpha) for view in views]
+        given = (pixels, settings, find_sky, rng.bit_generator.state, cloud)
         key = hashlib.sha1(pickle.dumps(given)).digest()
         if key not in made:
             made[key] = start(views, config, motion, find_sky, rng, cloud), rng.bit_generator.state

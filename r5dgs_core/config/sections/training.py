@@ -64,10 +64,13 @@ class DataSection:
     Attributes:
         masks: Folder with the masks of the training views, inside the data set or elsewhere. ``none`` ignores masks.
         min_registered: Minimum share of the images that a COLMAP reconstruction must have registered.
+        memory: Maximum memory for the pixels of the training images and masks, GB. If they need more, they are read
+            again while training. At most half of the available memory is used. It does not affect results.
     """
 
     masks: str = "object_mask"
     min_registered: float = 0.5
+    memory: float = 2.0
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ...config.config import Config
 from ...raster import DRAFT, rasterize_splats
 from ...scene.scene import IDENTITY_DIM
 from ..representations.fused_posing import PosedSplats
-from ..train_views import TrainView
+from ..train_views import MASK, TrainView, expect
 from . import identity_losses
 from .label_votes import class_map
 
@@ -56,7 +56,7 @@ def train_encodings(
     section = config.identity
     agreement = Agreement(config)
     neighbourhood = identity_losses.Neighbourhood(means) if agreement.counts else None
-    masked = [v for v in views if v.mask is not None]
+    masked = [v for v in views if v.has_mask]
     count = max(classes.values()) + 1
     weight, bias = (tensor.to(labels.device) for tensor in distinct_classes(count, generator))
     encodings = weight[labels].clone().requires_grad_(True)
@@ -68,6 +68,7 @@ def train_encodings(
     for step in range(section.iterations):
         queue = queue or torch.randperm(len(masked), generator=generator).tolist()
         view = masked[queue.pop()]
+        expect([masked[k] for k in queue[-1:]], MASK)
         target = class_map(view, classes, encodings.device)
         with torch.no_grad():
             splats = pose(view)

@@ -32,7 +32,7 @@ def joint(views: Sequence[TrainView], classes: dict[int, int], config: Config) -
         config: The run's configuration.
     """
     asked = config.identity.training in ("joint", "detached") and config.identity.iterations > 0
-    if not asked or max(classes.values(), default=0) == 0 or all(view.mask is None for view in views):
+    if not asked or max(classes.values(), default=0) == 0 or not any(view.has_mask for view in views):
         return None
     # A separate generator, so that identities do not change the other random numbers of a run.
     return JointIdentity(classes, config, torch.Generator().manual_seed(config.train.seed + 1))
@@ -130,7 +130,7 @@ class JointIdentity:
         section = self._section
         weight, bias = self.params["classifier.weight"], self.params["classifier.bias"]
         terms = []
-        if view.mask is not None and section.weight > 0:
+        if view.has_mask and section.weight > 0:
             if not self.with_geometry and iteration % section.every == 0:
                 features = identity_training.rasterize(splats, gaussians.identities, view)
             if features is not None:

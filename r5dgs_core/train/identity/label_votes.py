@@ -14,7 +14,7 @@ from torch import Tensor
 from ...render.segment_weights import segment_weights
 from ...scene.sampling import spread
 from ..representations.fused_posing import PosedSplats
-from ..train_views import TrainView
+from ..train_views import MASK, TrainView, in_turn
 
 VOTE_VIEWS = 80
 
@@ -35,7 +35,7 @@ def votes(
     """
     kinds = max(classes.values(), default=0) + 1
     weights = torch.zeros(count, kinds)
-    for view in spread([v for v in views if v.mask is not None], VOTE_VIEWS):
+    for view in in_turn(spread([v for v in views if v.has_mask], VOTE_VIEWS), MASK):
         with torch.no_grad():
             splats = pose(view)
         target = class_map(view, classes, splats.means.device)
@@ -51,7 +51,8 @@ def elect(weights: Tensor, fallback: Tensor) -> Tensor:
 
 def class_map(view: TrainView, classes: dict[int, int], device: torch.device | str = "cpu") -> Tensor:
     """Return the class of each pixel, -1 for ids without a class. [H, W] int64"""
-    assert view.mask is not None
-    table = np.full(max(int(view.mask.max(initial=0)), *classes) + 1, -1, np.int64)
+    mask = view.mask
+    assert mask is not None
+    table = np.full(max(int(mask.max(initial=0)), *classes) + 1, -1, np.int64)
     table[list(classes)] = list(classes.values())
-    return torch.from_numpy(table[view.mask]).to(device, non_blocking=True)
+    return torch.from_numpy(table[mask]).to(device, non_blocking=True)

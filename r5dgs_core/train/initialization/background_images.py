@@ -11,7 +11,7 @@ from scipy import ndimage
 from ...data import masks
 from ...scene import cameras
 from ...scene.sampling import spread
-from ..train_views import TrainView, by_camera
+from ..train_views import IMAGE, MASK, TrainView, by_camera, in_turn
 
 MAX_CAMERAS = 24
 MAX_FRAMES = 31  # frames per camera for the median
@@ -33,7 +33,7 @@ def compute(views: Sequence[TrainView]) -> list[BackgroundImage]:
     for group in by_camera(views, MAX_CAMERAS):
         frames = spread(group, MAX_FRAMES)
         free = _free(frames)
-        image = _median([v.image for v in frames], free)
+        image = _median([v.image for v in in_turn(frames, IMAGE)], free)
         result.append(BackgroundImage(group[0].camera, image, np.asarray(free.any(0))))
     return result
 
@@ -71,12 +71,13 @@ def _free(frames: Sequence[TrainView]) -> np.ndarray:
 
     Pixels that are unknown in all masks of the camera count as background.
     """
-    free = np.ones((len(frames), *frames[0].image.shape[:2]), bool)
+    free = np.ones((len(frames), frames[0].camera.height, frames[0].camera.width), bool)
     told = np.zeros(free.shape[1:], bool)
-    for k, view in enumerate(frames):
-        if view.mask is not None:
-            free[k] = np.logical_not(ndimage.binary_dilation(view.mask > 0))
-            told |= view.mask != masks.UNKNOWN
+    for k, view in enumerate(in_turn(frames, MASK)):
+        mask = view.mask
+        if mask is not None:
+            free[k] = np.logical_not(ndimage.binary_dilation(mask > 0))
+            told |= mask != masks.UNKNOWN
         else:
             told[:] = True
     free |= ~told

@@ -10,6 +10,7 @@ Notation: C cameras (background images), P points.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import math
 from collections.abc import Sequence
@@ -56,13 +57,12 @@ class ColorBalance:
         return np.clip((image - self.offsets[row]) / self.gains[row], 0, 1).astype(np.float32)
 
     def views(self, views: Sequence[TrainView]) -> list[TrainView]:
-        """Return views with corrected images."""
-        return [
-            dataclasses.replace(
-                view, image=np.round(255 * self.corrected(view.image / np.float32(255), view.camera.name)).astype("u1")
-            )
-            for view in views
-        ]
+        """Return views with corrected images, which are corrected when they are used."""
+
+        def in_bytes(name: str, image: np.ndarray) -> np.ndarray:
+            return np.round(255 * self.corrected(image / np.float32(255), name)).astype("u1")
+
+        return [view.with_image_function("balanced", functools.partial(in_bytes, view.camera.name)) for view in views]
 
     def backgrounds(self, images: Sequence[BackgroundImage]) -> list[BackgroundImage]:
         """Return background images with corrected colours."""

@@ -18,7 +18,7 @@ from scipy import ndimage
 from ...data import masks
 from ...scene import cameras
 from ...scene.sampling import spread
-from ..train_views import TrainView, by_camera, nearest_knot
+from ..train_views import IMAGE, MASK, MAX_SAMPLE, TrainView, by_camera, in_turn, nearest_knot
 from .triangulation import ObjectPositions
 
 TEXTURE = 0.1  # change of colour per radian (root mean square) that makes rotation observable
@@ -78,15 +78,14 @@ def turn_stiffness(views: Sequence[TrainView], places: ObjectPositions, times: n
     m, count = places.measured.shape
     change = np.zeros((m, count, 3, 3))
     pixels = np.zeros((m, count))
-    for view in views:
-        if view.mask is None:
-            continue
-        s = nearest_knot(times, view.t)
-        known = np.where(view.mask == masks.UNKNOWN, 0, view.mask).astype(np.int32)
+    for view in in_turn([view for view in views if view.has_mask], IMAGE, MASK):
+        s, image, mask = nearest_knot(times, view.t), view.image, view.mask
+        assert mask is not None
+        known = np.where(mask == masks.UNKNOWN, 0, mask).astype(np.int32)
         boxes = ndimage.find_objects(known)
         for row, object_id in enumerate(places.object_ids):
             box = boxes[object_id - 1] if object_id <= len(boxes) else None
-            found = None if box is None else _change_per_turn(view.image[box], view.mask[box] == object_id)
+            found = None if box is None else _change_per_turn(image[box], mask[box] == object_id)
             if found is not None:
                 axes = view.camera.T_cam_world[:3, :3]
                 change[row, s] += axes.T @ found[0] @ axes
@@ -138,7 +137,7 @@ def absent(views: Sequence[TrainView], places: ObjectPositions, times: np.ndarra
     votes = np.zeros(places.measured.shape)
     asked = np.zeros(places.measured.shape)
     colors = _usual_colors(views, places)
-    for group in by_camera([view for view in views if view.mask is not None]):
+    for group in by_camera([view for view in views if view.has_mask]):
         frames = [(nearest_knot(times, view.t), view) for view in group]
         for s, view in frames:
             for row in np.flatnonzero(places.evidence[:, s] == 0):
@@ -177,19 +176,20 @@ def _without(frames: Sequence[TrainView], rows: np.ndarray, columns: np.ndarray)
 
 
 def _ids(view: TrainView, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    assert view.mask is not None
-    return view.mask[rows, columns]
+    mask = view.mask
+    assert mask is not None
+    return mask[rows, columns]
 
 
 def _usual_colors(views: Sequence[TrainView], places: ObjectPositions) -> np.ndarray:
-    """Return the mean colour of each object over all masks. [M, 3]"""
+    """Return the mean colour of each object over all masks, or over `MAX_SAMPLE` of them. [M, 3]"""
     total, count = np.zeros((len(places.object_ids), 3)), np.zeros(len(places.object_ids))
-    for view in views:
-        if view.mask is not None:
-            for row, object_id in enumerate(places.object_ids):
-                here = view.mask == object_id
-                total[row] += view.image[here].sum(0) / 255
-                count[row] += here.sum()
+    for view in in_turn(spread([view for view in views if view.has_mask], MAX_SAMPLE), IMAGE, MASK):
+        image, mask = view.image, view.mask
+        for row, object_id in enumerate(places.object_ids):
+            here = mask == object_id
+            total[row] += image[here].sum(0) / 255
+            count[row] += here.sum()
     return total / np.maximum(count, 1)[:, None]
 
 
@@ -199,8 +199,9 @@ def _disc(view: TrainView, center: np.ndarray, radius: float) -> tuple[np.ndarra
     if not depth[0] > radius:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     reach = max(DISC * radius * view.camera.intrinsics[0, 0] / depth[0], 0.7)
-    y, x = np.mgrid[: view.image.shape[0], : view.image.shape[1]] + 0.5
+    height, width = view.camera.height, view.camera.width
+    y, x = np.mgrid[:height, :width] + 0.5
     rows, columns = np.nonzero((x - pixels[0, 0]) ** 2 + (y - pixels[0, 1]) ** 2 <= reach**2)
     u, v = pixels[0]
-    whole = reach <= u <= view.image.shape[1] - reach and reach <= v <= view.image.shape[0] - reach
+    whole = reach <= u <= width - reach and reach <= v <= height - reach
     return (columns, rows) if whole else (columns[:0], rows[:0])

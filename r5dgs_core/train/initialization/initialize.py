@@ -114,7 +114,7 @@ def start(
         times = times[-1:]
     places = triangulation.locate(views, times, init.min_mask_pixels)
     _warn(views, motion)
-    by_motion = motion.sorts_by_motion and all(v.mask is None for v in views)
+    by_motion = motion.sorts_by_motion and not any(v.has_mask for v in views)
     first = 0 if config.curriculum.start == "first" else _first_time(places, len(times))
     if by_motion and config.curriculum.start != "first":
         first = (len(times) - 1) // 2
@@ -176,7 +176,7 @@ def _balanced(
 
 def _warn(views: Sequence[TrainView], motion: type[Representation]) -> None:
     """Warn if objects or motion cannot be learned from the views."""
-    if motion.moves and all(v.mask is None for v in views):
+    if motion.moves and not any(v.has_mask for v in views):
         if motion.sorts_by_motion:
             log.warning("no masks: the field moves all Gaussians, and objects are found by their motion. %s", MASKS)
         else:
@@ -210,7 +210,7 @@ def _bodies(
         reference = _reference_time(places.visibility[row], places.measured[row], first)
         centers[row + 1] = places.centers[row, reference]
         translations[row + 1] = places.centers[row] - centers[row + 1]
-        then = [v for v in views if v.mask is not None and nearest_knot(times, v.t) == reference]
+        then = [v for v in views if v.has_mask and nearest_knot(times, v.t) == reference]
         carved = visual_hull.carve(then, int(object_id), centers[row + 1], places.radii[row], count, rng)
         clouds.append((*carved, row + 1))
     return centers, translations, clouds

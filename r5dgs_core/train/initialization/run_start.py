@@ -12,13 +12,16 @@ from ...config.config import Config
 from ...data.dataset import Dataset
 from ...errors import DatasetError
 from ...scene import spherical_harmonics
+from ...scene.sampling import spread
 from .. import background as backgrounds
 from .. import train_views
 from ..normalization import Normalization
 from ..representations.representation import Representation
-from . import initialize, place_gaussians, sky
+from . import background_images, initialize, place_gaussians, sky
 
 log = logging.getLogger(__name__)
+
+SWEEP_BYTES_PER_PIXEL = 64  # of the background images
 
 
 def initial_state(
@@ -44,7 +47,8 @@ def initial_state(
     """
     rng = np.random.default_rng(config.train.seed)
     find_sky = train_views.behind(dataset, config) is None
-    start = initialize.start(views, config, motion, find_sky, rng, _cloud(dataset, normalization))
+    with train_views.lent(views, _sweep_bytes(views)):
+        start = initialize.start(views, config, motion, find_sky, rng, _cloud(dataset, normalization))
     if len(start.gaussians) == 0:
         raise DatasetError(
             f"{dataset.root}: no Gaussian can be placed: no mask shows an object, and the background is all sky "
@@ -75,6 +79,12 @@ def background(
     return backgrounds.learned(found if found is not None else _median_color(views), degree)
 
 
+def _sweep_bytes(views: Sequence[train_views.TrainView]) -> int:
+    """Return the memory of the background images and their sweep, bytes."""
+    some = [group[0].camera for group in train_views.by_camera(views, background_images.MAX_CAMERAS)]
+    return SWEEP_BYTES_PER_PIXEL * sum(camera.width * camera.height for camera in some)
+
+
 def _cloud(dataset: Dataset, normalization: Normalization) -> tuple[np.ndarray, np.ndarray] | None:
     """Return points (normalised coordinates) and colours of the data set's reconstruction; None if it has none."""
     points, colors = dataset.points, dataset.point_colors
@@ -84,6 +94,10 @@ def _cloud(dataset: Dataset, normalization: Normalization) -> tuple[np.ndarray, 
 
 
 def _median_color(views: Sequence[train_views.TrainView]) -> np.ndarray:
-    """Return coefficients of the median colour of all pixels, for scenes in which no sky was found. [1, 3]"""
-    color = np.median([np.median(view.image.reshape(-1, 3), axis=0) for view in views], axis=0) / 255
+    """Return coefficients of the median colour of all pixels, for scenes in which no sky was found. [1, 3]
+
+    At most `train_views.MAX_SAMPLE` views are used, spread evenly.
+    """
+    shown = train_views.in_turn(spread(views, train_views.MAX_SAMPLE), train_views.IMAGE)
+    color = np.median([np.median(view.image.reshape(-1, 3), axis=0) for view in shown], axis=0) / 255
     return spherical_harmonics.rgb_to_dc(color)[None]

@@ -9,7 +9,7 @@ import numpy as np
 from ...data import masks
 from ...scene import cameras
 from ..normalization import TARGET_DISTANCE
-from ..train_views import TrainView
+from ..train_views import MASK, TrainView, in_turn
 from .background_images import BackgroundImage
 from .visual_hull import pixel_indices
 
@@ -65,11 +65,11 @@ def behind_objects(
         each
     """
     shown, covered = np.zeros(len(points)), np.zeros(len(points))
-    for view in views:
-        if view.mask is None:
-            continue
+    for view in in_turn([view for view in views if view.has_mask], MASK):
         columns, rows, valid = pixel_indices(view, points)
-        ids = view.mask[rows, columns]
+        mask = view.mask
+        assert mask is not None
+        ids = mask[rows, columns]
         valid &= ids != masks.UNKNOWN
         shown += valid
         covered += valid & (ids > 0)

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from ..train_views import TrainView, camera_key, nearest_knot
+from ...scene.sampling import spread
+from ..train_views import IMAGE, MASK, MAX_SAMPLE, TrainView, camera_key, in_turn, nearest_knot
 from .background_images import BackgroundImage
 from .plane_sweep import plane_axes
 from .triangulation import ObjectPositions
@@ -46,7 +47,7 @@ def find_light(
     """Estimate the direction of the light.
 
     Args:
-        views: Training views.
+        views: Training views; at most `MAX_SAMPLE` are used, spread evenly.
         backgrounds: Background image of each camera.
         places: Positions of the objects at each time.
         times: The observed times. [S]
@@ -62,10 +63,9 @@ def find_light(
     count = np.zeros(len(directions))
     background_of = {camera_key(b.camera): b for b in backgrounds}
     offsets = _disc(normal, rng)
-    for view in views:
-        background = background_of.get(camera_key(view.camera))
-        if background is None:
-            continue
+    shown = [view for view in spread(views, MAX_SAMPLE) if camera_key(view.camera) in background_of]
+    for view in in_turn(shown, IMAGE, MASK):
+        background = background_of[camera_key(view.camera)]
         darkening, known = _darkening(view, background)
         s = nearest_knot(times, view.t)
         for row in np.flatnonzero(places.measured[:, s]):
@@ -123,6 +123,7 @@ def _darkening(view: TrainView, background: BackgroundImage) -> tuple[np.ndarray
     usual = background.image.mean(-1)
     now = view.image.mean(-1) / 255
     known = background.known & (usual > 0.02)
-    if view.mask is not None:
-        known &= np.logical_not(ndimage.binary_dilation(view.mask > 0))
+    mask = view.mask
+    if mask is not None:
+        known &= np.logical_not(ndimage.binary_dilation(mask > 0))
     return np.where(known, 1 - now / np.maximum(usual, 0.02), 0.0), known

@@ -17,7 +17,8 @@ import numpy as np
 from scipy import ndimage
 
 from ...data import masks
-from ..train_views import TrainView, nearest_knot
+from ...scene.cameras import Camera
+from ..train_views import MASK, TrainView, in_turn, nearest_knot
 
 log = logging.getLogger(__name__)
 
@@ -115,13 +116,13 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> O
 def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> dict[int, list[_Sighting]]:
     """Return the sightings of each object that more than one mask shows."""
     found: dict[int, list[_Sighting]] = {}
-    masked = [v for v in views if v.mask is not None]
-    for view in masked:
-        s = nearest_knot(times, view.t)
-        assert view.mask is not None
-        for object_id in np.unique(view.mask):
+    masked = [v for v in views if v.has_mask]
+    for view in in_turn(masked, MASK):
+        s, mask = nearest_knot(times, view.t), view.mask
+        assert mask is not None
+        for object_id in np.unique(mask):
             if object_id > 0 and object_id != masks.UNKNOWN:
-                sighting = _sight(view, s, int(object_id), min_share)
+                sighting = _sight(view.camera, mask, s, int(object_id), min_share)
                 if sighting is not None:
                     found.setdefault(int(object_id), []).append(sighting)
     for object_id in [i for i, seen in found.items() if len(seen) == 1 and len(masked) > 1]:
@@ -134,23 +135,22 @@ def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) 
     return found
 
 
-def _sight(view: TrainView, knot: int, object_id: int, min_share: float) -> _Sighting | None:
-    assert view.mask is not None
-    mask = view.mask == object_id
+def _sight(camera: Camera, ids: np.ndarray, knot: int, object_id: int, min_share: float) -> _Sighting | None:
+    mask = ids == object_id
     area = int(mask.sum())
     if area < max(6, min_share * mask.size):
         return None
     rows, cols = np.nonzero(mask)
     height, width = mask.shape
     whole = rows.min() > 0 and cols.min() > 0 and rows.max() < height - 1 and cols.max() < width - 1
-    k = view.camera.intrinsics
+    k = camera.intrinsics
     u = (cols.mean() + 0.5 - k[0, 2]) / k[0, 0]
     v = (rows.mean() + 0.5 - k[1, 2]) / k[1, 1]
-    ray = np.array([u, v, 1.0]) @ view.camera.T_cam_world[:3, :3]
+    ray = np.array([u, v, 1.0]) @ camera.T_cam_world[:3, :3]
     reach = np.hypot((cols - cols.mean()) / k[0, 0], (rows - rows.mean()) / k[1, 1]).max() + 0.5 / k[0, 0]
     norm = np.linalg.norm(ray)
-    weight = float(np.sqrt(area) * (1 - _touching(view.mask, object_id, rows, cols)) ** 2)
-    return _Sighting(knot, view.camera.center, ray / norm, area, weight, float(reach / norm), bool(whole))
+    weight = float(np.sqrt(area) * (1 - _touching(ids, object_id, rows, cols)) ** 2)
+    return _Sighting(knot, camera.center, ray / norm, area, weight, float(reach / norm), bool(whole))
 
 
 def _touching(mask: np.ndarray, object_id: int, rows: np.ndarray, cols: np.ndarray) -> float:

@@ -73,17 +73,19 @@ def carve(
     usual, pixels = np.zeros(3), 0
     outlines: list[Outline | None] = []
     for number, view in enumerate(views):
-        if view.mask is None or not (marked := view.mask == object_id).any():
+        mask = view.mask
+        if mask is None or not (marked := mask == object_id).any():
             outlines.append(None)
             continue
-        usual += view.image[marked].sum(0) / 255
+        image = view.image
+        usual += image[marked].sum(0) / 255
         pixels += int(marked.sum())
         columns, rows, valid = pixel_indices(view, points)
-        ids = np.where(valid, view.mask[rows, columns].astype(np.int64), -1)
+        ids = np.where(valid, mask[rows, columns].astype(np.int64), -1)
         inside[number] = ids == object_id
         outside[number] = ids == 0
         seen[number] = valid & (ids != masks.UNKNOWN)
-        colors += inside[number][:, None] * (view.image[rows, columns] / 255.0)
+        colors += inside[number][:, None] * (image[rows, columns] / 255.0)
         outlines.append(_outline(marked, rows, columns))
     good, hiding = _chosen(inside, outside, seen, outlines, min(50, count))
     if hiding:
@@ -160,7 +162,7 @@ def _chosen(
 def pixel_indices(view: TrainView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return columns, rows and validity of the pixels of points [P, 3]; invalid indices are set to 0."""
     pixels, _ = cameras.project(view.camera, points)
-    height, width = view.image.shape[:2]
+    height, width = view.camera.height, view.camera.width
     with np.errstate(invalid="ignore"):
         valid = (pixels[:, 0] >= 0) & (pixels[:, 0] < width) & (pixels[:, 1] >= 0) & (pixels[:, 1] < height)
     columns = np.where(valid, np.nan_to_num(pixels[:, 0]), 0).astype(np.int64)

@@ -19,7 +19,7 @@ from ...scene import spherical_harmonics
 from ...scene.cameras import Camera
 from ..initialization import initialize
 from ..observed_motion import GroupTrack, ObservedMotion
-from ..train_views import TrainView, by_camera
+from ..train_views import IMAGE, TrainView, by_camera, in_turn
 from . import fused_posing
 from .representation import STILL, Representation
 
@@ -103,7 +103,7 @@ def nothing_moves(views: Sequence[TrainView]) -> bool:
         return False
     for first, *others in cameras:
         blocks = _blocks(first.image)
-        if any(_changes(blocks, _blocks(view.image)) for view in others):
+        if any(_changes(blocks, _blocks(view.image)) for view in in_turn(others, IMAGE)):
             return False
     return True
 

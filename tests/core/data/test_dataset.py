@@ -325,19 +325,28 @@ def test_impossible_units_are_refused(tmp_path, value):
         dataset.read(tmp_path)
 
 
-def test_images_that_exceed_the_available_memory_are_refused_with_the_remedy(flat, monkeypatch):
+def test_a_machine_without_memory_for_a_few_images_is_refused_with_the_remedy(flat, monkeypatch):
     found = dataset.read(flat)
-    needed = memory.of_images(found)
-    assert needed == sum(3 * view.camera.width * view.camera.height for view in found.train)
+    needed = memory.at_once(found)
+    assert needed == sum(4 * view.camera.width * view.camera.height for view in found.train)
     monkeypatch.setattr(memory, "available", lambda: needed - 1)
-    with pytest.raises(
-        errors.DatasetError, match="training images need .* GB of memory.*smaller --size or with --every"
-    ):
+    with pytest.raises(errors.DatasetError, match="GB of memory for . images at the same time.*smaller --size"):
         memory.check_images(found)
     for free in (needed, None):
         monkeypatch.setattr(memory, "available", lambda free=free: free)
         memory.check_images(found)
     assert 1e6 < memory.total() < 1e15
+
+
+def test_many_images_need_no_more_memory_than_allowed(flat, monkeypatch):
+    found = dataset.read(flat)
+    monkeypatch.setattr(memory, "available", lambda: 10 * memory.GB)
+    assert (memory.for_images(2.0), memory.for_images(8.0)) == (2 * memory.GB, 5 * memory.GB)
+    many = dataclasses.replace(found, train=1000 * found.train)
+    assert memory.at_once(many) <= 32 * memory.of_images(found)
+    assert "images of 0.0 GB are read again while training" in memory.note(many, 1e-4)
+    assert "data.memory=1 keeps all of them" in memory.note(many, 1e-4)
+    assert memory.note(found, 1.0) == ""
 
 
 def test_the_digest_changes_with_cameras_and_images_only(flat):

@@ -47,7 +47,7 @@ def pose(tiny):
 
 def marked(view, where, value):
     """The view with another value in some pixels of its mask."""
-    return dataclasses.replace(view, mask=np.where(where, np.uint16(value), view.mask))
+    return view.with_arrays(mask=np.where(where, np.uint16(value), view.mask))
 
 
 def unknown(view):
@@ -55,7 +55,7 @@ def unknown(view):
 
 
 def unmasked(view):
-    return dataclasses.replace(view, mask=None)
+    return dataclasses.replace(view, load_mask=None)
 
 
 def joint(training: str):
@@ -147,7 +147,7 @@ def test_pixels_known_in_some_masks_use_only_those_masks(seen):
     cover = np.zeros(same[0].mask.shape, bool)
     cover[5:15, 5:15] = True
     clean = marked(same[0], True, 0)
-    dirty = dataclasses.replace(unknown(same[1]), image=np.full_like(same[1].image, 255))
+    dirty = unknown(same[1]).with_arrays(np.full_like(same[1].image, 255))
     hidden = marked(clean, cover, 1)
     (background,) = background_images.compute([hidden, dirty, dirty])
     assert not background.known[6:14, 6:14].any()  # an object there; the others may show the same one

@@ -14,6 +14,7 @@ from r5dgs_core.capture.calibration import undistort
 from r5dgs_core.capture.calibration.calibration import CalibratedCamera, CalibratedFrame, Calibration
 from r5dgs_core.capture.calibration.formats import r5dgs_json
 from r5dgs_core.cli.commands import prepare as command
+from r5dgs_core.config.sections.training import DataSection
 from r5dgs_core.data import dataset, images, masks
 from r5dgs_core.prepare import camera_source, image_size, prepare, rectify
 from tests.support import recordings
@@ -286,9 +287,15 @@ def test_frames_that_cannot_be_decoded_are_left_out_and_listed(capture, tmp_path
     assert [camera["undecodable"] for camera in record["cameras"]] == [[], [2], []]
 
 
+def test_the_estimate_counts_no_more_pixels_than_training_keeps():
+    assert DataSection().memory * 2**30 == image_size.PIXELS
+    few, many = (image_size.training_memory([(1920, 1080)], [count], 1080) for count in (10_000, 20_000))
+    assert few == many
+
+
 def test_the_size_is_the_largest_whose_training_fits_half_of_the_memory(monkeypatch):
     monkeypatch.setattr(image_size.memory, "total", lambda: 8e9)
-    sizes, counts = [(3840, 2160)] * 4, [300] * 4
+    sizes, counts = [(3840, 2160)] * 24, [300] * 24
     size = image_size.choose(sizes, counts, None)
     memory = [image_size.training_memory(sizes, counts, lines) for lines in (size.lines, size.lines + 8)]
     assert memory[0] <= 4e9 < memory[1] and size.training_bytes == memory[0]

@@ -36,7 +36,7 @@ def run(data, overrides, device):
     with torch.no_grad():
         for k in chosen:  # fills the caches
             view = trainer.views[k]
-            losses.photometric(trainer.render(view.camera, view.t), trainer._target(k), 0.2)
+            losses.photometric(trainer.render(view.camera, view.t), trainer.targets.of(k), 0.2)
     waits = []
     for _ in range(STEPS):
         with pretended_device.record() as found:

@@ -227,7 +227,7 @@ def test_objects_of_a_single_mask_or_pixel_become_background_with_a_warning(data
 
 def spoil_image(trainer):
     for index in range(len(trainer.views)):
-        trainer._target(index)[3, 4, 1] = float("nan")
+        trainer.targets.of(index)[3, 4, 1] = float("nan")
 
 
 def spoil_camera(trainer):

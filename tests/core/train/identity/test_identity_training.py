@@ -13,9 +13,9 @@ from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.raster import rasterize_splats
 from r5dgs_core.scene import scene
 from r5dgs_core.scene.cameras import Camera
+from r5dgs_core.train import train_views
 from r5dgs_core.train.identity import identity_losses, identity_training, joint_identity, label_votes
 from r5dgs_core.train.representations.fused_posing import PosedSplats
-from r5dgs_core.train.train_views import TrainView
 
 
 def row_of_blobs(opacities=(0.9, 0.9, 0.9)):
@@ -29,7 +29,7 @@ def row_of_blobs(opacities=(0.9, 0.9, 0.9)):
         torch.zeros(3, 3),
     )
     mask = np.repeat(np.repeat([[0, 5, 3]], 10, 1), 12, 0).astype(np.int32)
-    return TrainView("v", camera, 0.0, np.zeros((12, 30, 3), np.uint8), mask, None), splats
+    return train_views.of_arrays("v", camera, 0.0, np.zeros((12, 30, 3), np.uint8), mask), splats
 
 
 CLASSES = {0: 0, 3: 1, 5: 2}
@@ -288,9 +288,9 @@ def test_losses_come_at_their_intervals():
 def test_views_without_masks_have_no_pixel_loss_and_unknown_ids_do_not_count():
     view, gaussians = wall()
     identities = make_joint(view, gaussians, "detached")
-    blind = dataclasses.replace(view, mask=None)
+    blind = dataclasses.replace(view, load_mask=None)
     assert identities.loss(gaussians, posed(gaussians), blind, 0) is None
-    unknown = dataclasses.replace(view, mask=np.full_like(view.mask, 77))
+    unknown = view.with_arrays(mask=np.full_like(view.mask, 77))
     assert float(identities.loss(gaussians, posed(gaussians), unknown, 0).detach()) == 0
 
 
@@ -319,7 +319,7 @@ def test_joint_identities_need_masks_of_objects():
     assert joint_identity.joint([view], CLASSES, config.Config()) is None
     assert joint_identity.joint([view], CLASSES, asked.replace(**{"identity.iterations": 0})) is None
     assert joint_identity.joint([view], {0: 0}, asked) is None
-    assert joint_identity.joint([dataclasses.replace(view, mask=None)], CLASSES, asked) is None
+    assert joint_identity.joint([dataclasses.replace(view, load_mask=None)], CLASSES, asked) is None
     assert joint_identity.joint([view], CLASSES, asked) is not None
 
 

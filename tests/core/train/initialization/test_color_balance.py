@@ -26,7 +26,7 @@ def named(views):
 def recolored(views, gains, offsets):
     """The views in other colours. Gains and offsets [C, 3]"""
     return [
-        dataclasses.replace(view, image=np.rint(np.clip(255 * (view.image / 255 * g + o), 0, 255)).astype(np.uint8))
+        view.with_arrays(np.rint(np.clip(255 * (view.image / 255 * g + o), 0, 255)).astype(np.uint8))
         for view, g, o in zip(views, gains, offsets, strict=True)
     ]
 
@@ -73,5 +73,5 @@ def test_the_means_of_gains_and_offsets_stay_if_colours_are_forced():
 
 def test_cameras_without_common_points_are_not_compared():
     views = named(floor_views())
-    dark = [dataclasses.replace(view, image=np.zeros_like(view.image)) for view in views]
+    dark = [view.with_arrays(np.zeros_like(view.image)) for view in views]
     assert found(dark) is None

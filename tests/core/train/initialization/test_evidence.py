@@ -1,7 +1,5 @@
 """Evidence of a body in images: rotation from texture, visibility from masks, presence from background images."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -27,7 +25,7 @@ def ball_view(camera, t, center, paint, light=None, marked=True, shown=True, wal
     shade = 1.0 if light is None else np.clip(0.7 + 0.3 * normals @ np.asarray(light), 0, 1)[:, None]
     image[hit] = paint(normals) * shade
     mask = np.where(hit & marked, BALL, 0).astype(np.uint16)
-    return train_views.TrainView(
+    return train_views.of_arrays(
         "v", camera, float(t), np.round(255 * np.clip(image, 0, 1)).astype(np.uint8), mask, None
     )
 
@@ -101,7 +99,7 @@ def test_an_object_behind_another_or_out_of_the_frame_is_not_absent():
         for camera in ring():
             view = ball_view(camera, t, [0, 0, 0.3], checkered, marked=t > 0.3)
             cover = np.where(t > 0.3, view.mask, 7).astype(np.uint16)  # something else fills the picture
-            hidden.append(dataclasses.replace(view, mask=cover))
+            hidden.append(view.with_arrays(mask=cover))
             outside.append(ball_view(camera, t, [0, 0, 0.3 if t > 0.3 else 9.0], checkered))
     for seen in (hidden, outside):
         places = triangulation.locate(seen, TIMES, 5e-4)

@@ -17,7 +17,7 @@ def recorded(*cameras):
     places = [scenes.orbit_camera(2 * np.pi * k / len(cameras)) for k in range(len(cameras))]
     image = np.zeros((4, 4, 3), np.uint8)
     return [
-        train_views.TrainView("v", dataclasses.replace(camera, name=name), float(t), image, None, None)
+        train_views.of_arrays("v", dataclasses.replace(camera, name=name), float(t), image)
         for (name, times), camera in zip(cameras, places, strict=True)
         for t in times
     ]

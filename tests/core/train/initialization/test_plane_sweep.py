@@ -36,7 +36,7 @@ def floor_views(count=5, seed=0):
             [ndimage.map_coordinates(texture[..., c], np.moveaxis(at, -1, 0), order=1) for c in range(3)], -1
         )
         pixels = np.rint(image * 255).astype(np.uint8)
-        seen.append(train_views.TrainView(f"v{k}", camera, 0.0, pixels, None, None))
+        seen.append(train_views.of_arrays(f"v{k}", camera, 0.0, pixels))
     return seen
 
 
@@ -54,9 +54,7 @@ def floor():
 def constant_views():
     """Cameras on an arc that see only one colour."""
     image = np.tile(np.array([120, 160, 220], np.uint8), (36, 48, 1))
-    return [
-        train_views.TrainView(f"v{k}", scenes.orbit_camera(0.4 * k, 48, 36), 0.0, image, None, None) for k in range(5)
-    ]
+    return [train_views.of_arrays(f"v{k}", scenes.orbit_camera(0.4 * k, 48, 36), 0.0, image) for k in range(5)]
 
 
 def depth_step(depths):
@@ -132,7 +130,7 @@ def test_a_background_image_shows_what_lies_behind_the_objects(floor):
         mask = np.zeros(view.image.shape[:2], np.int32)
         mask[5 : 5 + 20, 10 * k : 10 * k + 12] = 1
         image = np.where(mask[..., None] > 0, rng.integers(0, 255, view.image.shape), view.image).astype(np.uint8)
-        seen.append(dataclasses.replace(view, image=image, mask=mask, t=0.1 * k))
+        seen.append(dataclasses.replace(view, t=0.1 * k).with_arrays(image, mask))
     (background,) = background_images.compute(seen)
     assert background.known.all()
     np.testing.assert_allclose(background.image, view.image / 255, atol=1e-6)
@@ -144,7 +142,7 @@ def test_pixels_that_objects_always_cover_or_that_are_transparent_are_unknown(fl
     mask[10:20, 10:20] = 2
     alpha = np.full(mask.shape, 255, np.uint8)
     alpha[30:, :] = 0
-    (background,) = background_images.compute([dataclasses.replace(view, mask=mask, alpha=alpha)] * 2)
+    (background,) = background_images.compute([view.with_arrays(mask=mask, alpha=alpha)] * 2)
     assert not background.known[10:20, 10:20].any() and not background.known[30:].any()
     assert background.known[:8].all() and np.isfinite(background.image).all()
 
@@ -201,7 +199,7 @@ def test_depths_do_not_depend_on_the_number_of_bands(floor, monkeypatch):
 
 def test_images_of_another_size_have_their_own_background_image(floor):
     view = floor[0]
-    cut = dataclasses.replace(view, camera=dataclasses.replace(view.camera, height=20), image=view.image[:20])
+    cut = dataclasses.replace(view, camera=dataclasses.replace(view.camera, height=20)).with_arrays(view.image[:20])
     found = background_images.compute([view, cut, view])
     assert [b.image.shape[:2] for b in found] == [(48, 64), (20, 64)]
     np.testing.assert_array_equal(found[1].image, found[0].image[:20])

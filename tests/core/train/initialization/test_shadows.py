@@ -26,7 +26,7 @@ def shadowed_views(light, darkness=0.4, radius=0.25):
             inside = np.linalg.norm(np.nan_to_num(hits - fallen, nan=99.0), axis=-1) < radius
             image = np.where(inside[..., None], 180 * (1 - darkness), 180) * np.ones(3)
             mask = np.zeros(image.shape[:2], np.uint16)
-            seen.append(train_views.TrainView(f"v{k}_{s}", camera, float(t), image.astype(np.uint8), mask, None))
+            seen.append(train_views.of_arrays(f"v{k}_{s}", camera, float(t), image.astype(np.uint8), mask))
     ones = np.ones((1, 7))
     places = triangulation.ObjectPositions(
         np.array([1]), path[None], ones > 0, ones, np.array([radius]), ones, ones > 0

@@ -1,7 +1,5 @@
 """Positions of objects from the rays of their masks."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -25,7 +23,7 @@ def disc_view(camera, t, balls):
         along = rays @ arm
         inside = (arm @ arm - along**2 < radius**2) & (along < nearest)
         mask[inside], nearest[inside] = object_id, along[inside]
-    return train_views.TrainView("v", camera, t, np.zeros((*mask.shape, 3), np.uint8), mask, None)
+    return train_views.of_arrays("v", camera, t, np.zeros((*mask.shape, 3), np.uint8), mask)
 
 
 def ring(count=5):
@@ -62,7 +60,7 @@ def test_a_partly_hidden_mask_is_outvoted():
     hidden = seen[0].mask.copy()
     columns = np.nonzero(hidden)[1]
     hidden[:, : int(np.median(columns))] = 0
-    seen[0] = dataclasses.replace(seen[0], mask=hidden)
+    seen[0] = seen[0].with_arrays(mask=hidden)
     places = triangulation.locate(seen, TIMES[:1], 5e-4)
     assert np.linalg.norm(places.centers[0, 0] - center) < 0.01 * 4
 
@@ -86,7 +84,7 @@ def test_an_object_that_the_border_cuts_is_shown_if_two_cameras_see_most_of_it(s
         if k < len(seen) - 6 + count:
             cut = int(np.quantile(columns, 1 - share))
             mask[:, : mask.shape[1] - cut] = view.mask[:, cut:]
-        seen[k] = dataclasses.replace(view, mask=mask)
+        seen[k] = view.with_arrays(mask=mask)
     places = triangulation.locate(seen, TIMES, 5e-4)
     assert places.measured.tolist() == [[True, True, False]]
     assert places.shown.tolist() == [[True, True, shown]]
@@ -110,7 +108,7 @@ def test_an_id_that_one_mask_shows_is_left_out_and_named(caplog):
     seen = [disc_view(c, 0.0, [(1, [0, 0, 0.3], 0.3)]) for c in ring()]
     stray = seen[2].mask.copy()
     stray[2:20, 3:20] = 9
-    seen[2] = dataclasses.replace(seen[2], mask=stray)
+    seen[2] = seen[2].with_arrays(mask=stray)
     assert triangulation.locate(seen, TIMES[:1], 5e-4).object_ids.tolist() == [1]
     assert "object 9 is shown by one mask only" in caplog.text
     assert triangulation.locate(seen[2:3], TIMES[:1], 5e-4).object_ids.tolist() == [1, 9]  # there is no other mask
@@ -194,7 +192,7 @@ def test_masks_with_ragged_borders_leave_the_centre_where_it_is(pixels):
             change = ndimage.binary_dilation if pixels > 0 else ndimage.binary_erosion
             mask = change(view.mask == 1, iterations=abs(pixels))
             ragged = ndimage.binary_dilation(mask) & ~ndimage.binary_erosion(mask) & (rng.random(mask.shape) < 0.5)
-            seen.append(dataclasses.replace(view, mask=np.where(mask ^ ragged, 1, 0)))
+            seen.append(view.with_arrays(mask=np.where(mask ^ ragged, 1, 0)))
     places = triangulation.locate(seen, times, 5e-4)
     assert places.measured.all() and largest_error(places, throw(times)) < 0.02
 
@@ -207,7 +205,7 @@ def test_equal_cameras_give_no_depth_and_no_error():
 
 @pytest.mark.parametrize("mask", [None, np.zeros((72, 96), np.int32), np.full((72, 96), -1, np.int32)])
 def test_without_masked_objects_there_are_no_positions(mask):
-    seen = [dataclasses.replace(disc_view(c, 0.0, []), mask=mask) for c in ring()]
+    seen = [disc_view(c, 0.0, []).with_arrays(mask=mask) for c in ring()]
     places = triangulation.locate(seen, TIMES[:1], 5e-4)
     assert places.centers.shape == (0, 1, 3) and places.visibility.shape == (0, 1) and len(places.radii) == 0
 
@@ -217,6 +215,6 @@ def test_specks_do_not_vote():
     seen = [disc_view(c, 0.0, [(1, center, 0.4)]) for c in ring(4)]
     speck = np.zeros_like(seen[0].mask)
     speck[2:4, 2:4] = 1
-    seen.append(dataclasses.replace(disc_view(ring(7)[1], 0.0, []), mask=speck))
+    seen.append(disc_view(ring(7)[1], 0.0, []).with_arrays(mask=speck))
     places = triangulation.locate(seen, TIMES[:1], 5e-4)
     assert np.linalg.norm(places.centers[0, 0] - center) < 0.003 * 4

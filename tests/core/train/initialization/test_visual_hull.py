@@ -40,10 +40,7 @@ def test_carved_points_fall_on_the_object_wherever_it_is_not_hidden(tiny, posed,
 
 def test_carved_points_have_the_colours_of_the_object(tiny, posed):
     seen, t, norm = posed
-    painted = [
-        dataclasses.replace(v, image=np.where((v.mask == 1)[..., None], [200, 30, 30], 60).astype(np.uint8))
-        for v in seen
-    ]
+    painted = [v.with_arrays(np.where((v.mask == 1)[..., None], [200, 30, 30], 60).astype(np.uint8)) for v in seen]
     center = (tiny.center(1, t) - norm.origin) / norm.scale
     _, colors = carve(painted, 1, center)
     np.testing.assert_allclose(colors, np.tile([200, 30, 30], (200, 1)) / 255, atol=1e-6)
@@ -52,7 +49,7 @@ def test_carved_points_have_the_colours_of_the_object(tiny, posed):
 def test_one_wrong_mask_does_not_empty_the_hull(tiny, posed):
     seen, t, norm = posed
     center = (tiny.center(1, t) - norm.origin) / norm.scale
-    wrong = [dataclasses.replace(seen[0], mask=np.zeros_like(seen[0].mask)), *seen[1:]]
+    wrong = [seen[0].with_arrays(mask=np.zeros_like(seen[0].mask)), *seen[1:]]
     points, _ = carve(wrong, 1, center)
     for view in seen[1:]:
         columns, rows, _ = visual_hull.pixel_indices(view, points)
@@ -62,7 +59,7 @@ def test_one_wrong_mask_does_not_empty_the_hull(tiny, posed):
 def test_views_that_lack_the_objects_id_do_not_outvote_those_that_have_it(tiny, posed):
     seen, t, norm = posed
     center = (tiny.center(1, t) - norm.origin) / norm.scale
-    unmarked = [dataclasses.replace(v, mask=np.where(v.mask == 1, 0, v.mask)) for v in seen[2:]]
+    unmarked = [v.with_arrays(mask=np.where(v.mask == 1, 0, v.mask)) for v in seen[2:]]
     points, colors = carve([*seen[:2], *unmarked], 1, center)
     for view in seen[:2]:
         columns, rows, _ = visual_hull.pixel_indices(view, points)
@@ -72,10 +69,7 @@ def test_views_that_lack_the_objects_id_do_not_outvote_those_that_have_it(tiny, 
 
 def test_a_fallback_ball_has_the_mean_colour_of_the_object(posed):
     seen, _, _ = posed
-    painted = [
-        dataclasses.replace(v, image=np.full_like(v.image, [90, 150, 30]), mask=np.where(v.mask == 1, 5, 0))
-        for v in seen
-    ]
+    painted = [v.with_arrays(np.full_like(v.image, [90, 150, 30]), np.where(v.mask == 1, 5, 0)) for v in seen]
     _, colors = carve(painted, 5, np.array([0.0, 0.0, 50.0]), count=40)
     np.testing.assert_allclose(colors, np.tile([90, 150, 30], (40, 1)) / 255, atol=1e-6)
 
@@ -90,7 +84,7 @@ def test_without_any_agreement_the_object_starts_as_a_small_ball(posed):
 def test_views_without_mask_and_points_behind_a_camera_do_not_vote(tiny, posed):
     seen, t, norm = posed
     center = (tiny.center(2, t) - norm.origin) / norm.scale
-    blind = [*seen, dataclasses.replace(seen[0], mask=None)]
+    blind = [*seen, dataclasses.replace(seen[0], load_mask=None)]
     np.testing.assert_array_equal(carve(blind, 2, center)[0], carve(seen, 2, center)[0])
     _, _, valid = visual_hull.pixel_indices(seen[0], (seen[0].camera.center - 2 * seen[0].camera.forward)[None])
     assert not valid.any()
@@ -104,7 +98,7 @@ def test_something_without_an_id_before_the_object_does_not_cut_it_in_other_view
     mask = seen[hidden].mask.copy()
     middle = np.nonzero(mask == ball)[1].mean()
     mask[(mask == ball) & (np.arange(mask.shape[1]) > middle)] = 0
-    screened = [dataclasses.replace(v, mask=mask) if i == hidden else v for i, v in enumerate(seen)]
+    screened = [v.with_arrays(mask=mask) if i == hidden else v for i, v in enumerate(seen)]
 
     def reached(views):
         points, _ = carve(views, ball, center, count=2000)

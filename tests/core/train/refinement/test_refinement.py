@@ -38,7 +38,7 @@ def train(dataset, *overrides, gains=None, stop=None):
     if gains is not None:
         for index, view in enumerate(trainer.given_views):
             image = np.clip(np.round(view.image * gains[view.camera.name]), 0, 255).astype(np.uint8)
-            trainer.given_views[index] = dataclasses.replace(view, image=image)
+            trainer.given_views[index] = view.with_arrays(image)
     while not trainer.done and trainer.iteration != stop:
         run.take_step(trainer, None, lambda event: None)
     return trainer
@@ -130,9 +130,7 @@ def test_colours_are_corrected_before_gaussians_are_placed(tiny, monkeypatch):
 
     def recolored(*arguments):
         return [
-            dataclasses.replace(
-                view, image=np.clip(np.round(view.image * gains[view.camera.name]), 0, 255).astype(np.uint8)
-            )
+            view.with_arrays(np.clip(np.round(view.image * gains[view.camera.name]), 0, 255).astype(np.uint8))
             for view in load(*arguments)
         ]
 

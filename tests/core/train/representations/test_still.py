@@ -87,12 +87,12 @@ def test_small_motion_is_detected(still, tiny):
 
     def noisy(view, sigma):
         grain = draw.normal(0, sigma, view.image.shape)
-        return dataclasses.replace(view, image=np.clip(view.image + grain, 0, 255).astype(np.uint8))
+        return view.with_arrays(np.clip(view.image + grain, 0, 255).astype(np.uint8))
 
     assert representation.nothing_moves([noisy(view, 4.0) for view in at_rest])
     changed = at_rest[-1].image.copy()
     changed[8:16, 8:16] = 255 - changed[8:16, 8:16]
-    assert not representation.nothing_moves([*at_rest[:-1], dataclasses.replace(at_rest[-1], image=changed)])
+    assert not representation.nothing_moves([*at_rest[:-1], at_rest[-1].with_arrays(changed)])
 
 
 def test_cameras_that_show_one_time_each_leave_motion_undecided(still):
