@@ -4,7 +4,7 @@ from . import panels, preferences
 from .clean_up import criteria, overlay
 from .engine import engine, live_preview, mesh_merge, render_notes, render_stats
 from .language import prompt_state
-from .motion import event_markers, exact_mode, extrapolate, motion_fields, pivot
+from .motion import contact_fields, event_markers, exact_mode, extrapolate, motion_fields, pivot
 from .scene import (
     captured_images,
     click_select,
@@ -27,6 +27,7 @@ MODULES = (
     captured_images,
     prompt_state,
     motion_fields,
+    contact_fields,
     extrapolate,
     pivot,
     exact_mode,

@@ -73,7 +73,7 @@ ALLOWED = {
     "language": {"scene", "data", "search", "playback", "render"},
     "train": {"motion", "motion_fit", "scene", "data", "raster", "config", "model", "render"},
     "masks": {"data", "language"},
-    "worker": {"scene", "raster", "playback", "formats", "editing", "protocol", "render", "language"},
+    "worker": {"scene", "raster", "playback", "formats", "editing", "protocol", "render", "language", "contact"},
     "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train", "shapes", "contact"},
     "prepare": {"color", "motion", "scene", "data", "capture", "masks"},
     "check": {"motion", "terminal", "scene", "color", "data", "formats", "config", "train", "prepare"},
@@ -205,7 +205,7 @@ LIGHT = GROUND | {
     "user_settings",
 }
 # The extension holds these rooms only: those of Blender itself, and those of the worker.
-PICTURE = LIGHT | {"data", "raster", "render", "language", "worker"}
+PICTURE = LIGHT | {"data", "raster", "render", "language", "worker", "contact", "motion_fit"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}
 HEAVY = {
     *("torch", "numba", "scipy", "OpenImageIO", "trimesh", "matplotlib", "rich", "gsplat", "transformers"),

@@ -28,6 +28,11 @@ def names(scene: bpy.types.Scene) -> list[str]:
     return [obj.name for obj in found if obj.r5dgs.role == "NONE"]
 
 
+def corners(evaluated: bpy.types.Object) -> np.ndarray:
+    """Vertices of an evaluated surface, in its own frame. [V, 3]"""
+    return _triangles(evaluated)[0].astype(np.float64)
+
+
 def _hides(instance: bpy.types.DepsgraphObjectInstance, depsgraph: bpy.types.Depsgraph) -> bool:
     obj = instance.object.original
     maker = instance.parent.original if instance.is_instance and instance.parent is not None else obj

@@ -6,7 +6,7 @@ axes of the anchor's parent, like its location.
 
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, PointerProperty, StringProperty
@@ -29,6 +29,16 @@ def write_at_once(state: bpy.types.PropertyGroup, _) -> None:
     if state.at_once and _re_extrapolate is not None:
         with contextlib.suppress(errors.R5dgsError):  # shown in the panel
             _re_extrapolate([state.id_data])
+
+
+@contextlib.contextmanager
+def not_at_once(state: bpy.types.PropertyGroup) -> Iterator[None]:
+    """Suspend *Write at Once* while several fields are set."""
+    at_once, state.at_once = state.at_once, False
+    try:
+        yield
+    finally:
+        state.at_once = at_once
 
 
 def call_on_change(re_extrapolate: Callable[[list[bpy.types.Object]], object] | None) -> None:

@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import capture, clean_up, export, motion, objects, observed_motion, preview, prompt, render, scene
+from . import capture, clean_up, contact, export, motion, objects, observed_motion, preview, prompt, render, scene
 
-MODULES = (scene, objects, prompt, motion, observed_motion, clean_up, preview, export, capture, render)
+MODULES = (scene, objects, prompt, motion, contact, observed_motion, clean_up, preview, export, capture, render)
 
 
 def register():

@@ -195,6 +195,12 @@ def formats() -> frozenset[str] | None:
     return None if known is None else frozenset(known)
 
 
+def simulates() -> bool | None:
+    """True if the running worker can simulate contacts, or None if none has answered yet."""
+    running = _worker
+    return running.hello.get("contact") if running is not None and running.alive else None
+
+
 def busy(key: str | None = None) -> bool:
     """True if any job with this key, or any job at all if None, has not ended."""
     return any(not job.done and (key is None or job.key == key) for job in list(_jobs))

@@ -10,7 +10,6 @@ from typing import Any
 from ..contact import held_out, scene_future
 from ..contact.scene_future import Prediction
 from ..errors import BackendError, Interrupted, R5dgsError
-from ..scene.scene import MotionGroup
 from .draft import Context, Draft, Need
 
 NAME = "contact"
@@ -39,20 +38,9 @@ def apply(draft: Draft, context: Context) -> Draft:
     return dataclasses.replace(draft, scene=scene, parts=(*draft.parts, *_rows(found)))
 
 
-def without(groups: Sequence[MotionGroup]) -> tuple[MotionGroup, ...]:
-    """Return the groups with their smooth motions. The band of a motion with contacts is left out."""
-    return tuple(group if group.smooth is None else _smoothed(group) for group in groups)
-
-
 def needs(rows: Sequence[dict[str, Any]], found: Prediction) -> tuple[dict[str, Any], ...]:
     """Return the rows of a needs table with those of a new prediction."""
     return (*(row for row in rows if row.get("name") != NAME), *_rows(found))
-
-
-def _smoothed(group: MotionGroup) -> MotionGroup:
-    assert group.smooth is not None
-    history = dataclasses.replace(group.history, band=None)
-    return dataclasses.replace(group, model=group.smooth, smooth=None, history=history)
 
 
 def _rows(found: Prediction) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ..scene import predictability
 from ..scene.scene import Scene
-from . import recording, scene_future, world
+from . import recording, scene_bodies, scene_future, world
 from .recording import Recording
 from .scene_world import SceneWorld, Wishes
 
@@ -43,10 +43,8 @@ def of(scene: Scene, count: int, seed: int = 0) -> list[Odds]:
         BackendError: Contacts are needed and MuJoCo is not installed.
     """
     wishes = Wishes(samples=count, seed=seed)
-    smooth = tuple(
-        group if group.smooth is None else dataclasses.replace(group, model=group.smooth) for group in scene.groups
-    )
-    found = scene_future.predict(dataclasses.replace(scene, groups=smooth), dataclasses.replace(wishes, samples=1))
+    smooth = scene_bodies.without_contacts(scene)
+    found = scene_future.predict(smooth, dataclasses.replace(wishes, samples=1))
     made, duration = found.world, predictability.horizon(scene) - scene.t_max
     if made is None or duration <= 0:
         return []

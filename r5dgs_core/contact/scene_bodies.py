@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +57,29 @@ def of(scene: Scene) -> tuple[list[SceneBody], list[str]]:
         body = SceneBody(group, name, shape, _moves(scene, group), "")
         found.append(dataclasses.replace(body, reason=_reason(scene, body) if body.moves else ""))
     return found, lines
+
+
+def without_contacts(scene: Scene) -> Scene:
+    """Return the scene with its smooth motions. The band of a motion with contacts is left out."""
+    return dataclasses.replace(scene, groups=tuple(_smoothed(group) for group in scene.groups))
+
+
+def _smoothed(group: MotionGroup) -> MotionGroup:
+    if group.smooth is None:
+        return group
+    history = dataclasses.replace(group.history, band=None)
+    return dataclasses.replace(group, model=group.smooth, smooth=None, history=history)
+
+
+def obstacles(scene: Scene, points: Mapping[str, np.ndarray]) -> list[SceneBody]:
+    """Return fixed bodies by name: the convex hulls of points [V, 3] in the world. Raises ConfigError for flat ones."""
+    found = []
+    for name, corners in points.items():
+        try:
+            found.append(SceneBody(scene.groups[0], name, solid.of(corners), False, ""))
+        except errors.ConfigError as error:
+            raise errors.ConfigError(f"{name}: nothing can collide with it: {error}; give it a thickness") from error
+    return found
 
 
 def track(scene: Scene, body: SceneBody, center: np.ndarray | None = None) -> Track:

@@ -66,9 +66,11 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     wishes = wishes or Wishes()
     bodies, lines = scene_bodies.of(scene)
     bodies = [body for body in bodies if body.group.id not in wishes.ignored]
+    bodies += scene_bodies.obstacles(scene, wishes.obstacles)
     if not any(body.moves for body in bodies) and not wishes.pushes:
         return Prediction(scene.groups, {}, {}, tuple(lines))
     end = predictability.horizon(scene) if wishes.until is None else wishes.until
+    pull = gravity.of(scene) if wishes.gravity is None else wishes.gravity
     up = world_axes.UP_AXIS.get(scene.world_convention)
     passing = _passing(scene, bodies, end, up)
     depths = {bodies[number].name: depth for number, depth in passing.items()}
@@ -79,11 +81,10 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     tried = (set(passing) - set(driven)) | pushed | doubtful
     if not tried:
         return Prediction(scene.groups, depths, {}, tuple(lines))
-    pull = gravity.of(scene)
     if pull is None or up is None:
         reason = "gravity is unknown: no body was seen to fall, and the scene has no up axis or no units"
         return Prediction(scene.groups, depths, {}, (*lines, f"no contacts are predicted: {reason}"))
-    made = scene_world.make(scene, bodies, tried, pushed, doubtful, pull, end)
+    made = scene_world.make(scene, bodies, tried, pushed, doubtful, pull, end).weighted(wishes.masses)
     return _simulated(scene, made, wishes, end, depths, [*lines, *made.lines])
 
 

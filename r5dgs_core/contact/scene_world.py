@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..motion import models
+from ..scene import world_axes
 from ..scene.scene import Scene
 from ..shapes import solid
 from . import futures, held_out, restitution, scene_bodies, stepping, support, world
@@ -35,6 +36,9 @@ class Wishes:
         pushes: Changes of the velocity at t_max by group, world units per unit of time. [3] each
         materials: Friction and restitution by group; None keeps the fitted one.
         ignored: Groups that touch nothing.
+        masses: Factors of the mass by group, which is otherwise proportional to the volume.
+        gravity: Acceleration of a falling body; None for that of the scene. [3]
+        obstacles: Fixed bodies by name: the convex hulls of points [V, 3] in the world.
         until: Scene time up to which to simulate; None for the horizon.
         samples: Number of sampled futures.
         seed: Seed of the samples.
@@ -43,6 +47,9 @@ class Wishes:
     pushes: Mapping[int, np.ndarray] = field(default_factory=dict)
     materials: Mapping[int, tuple[float | None, float | None]] = field(default_factory=dict)
     ignored: frozenset[int] = frozenset()
+    masses: Mapping[int, float] = field(default_factory=dict)
+    gravity: np.ndarray | None = None
+    obstacles: Mapping[str, np.ndarray] = field(default_factory=dict)
     until: float | None = None
     samples: int = SAMPLES
     seed: int = 0
@@ -85,6 +92,12 @@ class SceneWorld:
                 state.spins[number] = spin
                 state.velocities[number] = velocity + np.cross(spin, state.places[number] - body.group.pivot)
         return state
+
+    def weighted(self, factors: Mapping[int, float]) -> SceneWorld:
+        """The same with masses multiplied by factors, by group."""
+        pairs = zip(self.bodies, self.world.bodies, strict=True)
+        changed = (dataclasses.replace(own, density=factors.get(body.group.id, 1.0)) for body, own in pairs)
+        return dataclasses.replace(self, world=dataclasses.replace(self.world, bodies=tuple(changed)))
 
     def stepping(self, state: State, duration: float, draft: bool = False) -> Stepping:
         """Frequency of contacts and time step for a simulation from a state."""
@@ -161,12 +174,12 @@ def make(
         gravity: Acceleration of a falling body. [3]
         end: Scene time up to which to simulate.
     """
-    up = -gravity / max(float(np.linalg.norm(gravity)), 1e-300)
+    up = world_axes.UP_AXIS[scene.world_convention]
     below = plane(scene, bodies, end, up)
     lines = [] if below is not None else ["no plane was found under the bodies"]
     kept = [n for n, body in enumerate(bodies) if not (body.moves and body.reason) or n in tried]
     shapes = tuple(_body(scene, bodies[n], below, n in pushed) for n in kept)
-    made = _apart(World(shapes, below, gravity))
+    made = apart(World(shapes, below, gravity))
     chosen, own, fits, comparisons = [], [], {}, {}
     for number, shape in zip(kept, made.bodies, strict=True):
         body = bodies[number]
@@ -217,7 +230,7 @@ def _body(scene: Scene, body: SceneBody, below: Plane | None, pushed: bool) -> B
     return Body(solid.of(points), floor=floor)
 
 
-def _apart(made: World) -> World:
+def apart(made: World) -> World:
     """Shrink bodies that overlap in the bind state, whose penetration would become speed."""
     runs = Simulation(made, Stepping(100.0, 1e-3))
     for _ in range(_ROUNDS):

@@ -32,6 +32,7 @@ _FIELDS = {
     "query": ("text", "scene", "encoder"),
     "embed": ("texts", "encoder"),
     "export": ("scene", "format", "path", "times", "frames"),
+    "contact": ("scene", "until", "bodies", "gravity", "obstacles"),
     "warm_up": (),
     "check": (),
     "shutdown": (),

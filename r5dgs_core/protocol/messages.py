@@ -16,7 +16,7 @@ from ..scene.instance import Instance, Sky
 from . import fields
 from .meshes import Meshes
 
-VERSION = 5  # of the protocol; the worker reports it in its answer to "hello"
+VERSION = 6  # of the protocol; the worker reports it in its answer to "hello"
 
 
 @dataclass(frozen=True)

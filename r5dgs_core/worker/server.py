@@ -82,6 +82,7 @@ class Server:
             "query": self._query,
             "embed": self._embed,
             "export": self._export,
+            "contact": self._contact,
             "warm_up": self._warm_up,
             "check": self._check,
         }
@@ -103,8 +104,8 @@ class Server:
     def _hello(self, _: dict[str, Any]) -> Answer:
         missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
         python, pid = platform.python_version(), os.getpid()
-        written = formats.usable_names()
-        return {"protocol": messages.VERSION, "python": python, "missing": missing, "pid": pid, "formats": written}, {}
+        able = {"formats": formats.usable_names(), "contact": importlib.util.find_spec("mujoco") is not None}
+        return {"protocol": messages.VERSION, "python": python, "missing": missing, "pid": pid, **able}, {}
 
     def _load(self, request: dict[str, Any]) -> Answer:
         """Load the scene files ``paths`` in this order; keeps those already loaded and drops all others."""
@@ -252,6 +253,13 @@ class Server:
     def _export(self, request: dict[str, Any]) -> Answer:
         """Return the ``files`` that an export writes; see `scene_export.write`. The loaded scenes stay."""
         return {"files": scene_export.write(request)}, {}
+
+    def _contact(self, request: dict[str, Any]) -> Answer:
+        """Predict motions with contacts; see `contact_prediction.predict`. The loaded scenes stay."""
+        from . import contact_prediction
+
+        self._wait_for_kernels()
+        return contact_prediction.predict(request), {}
 
     def _opened(self, request: dict[str, Any]) -> encoder_base.Encoder:
         """Return the requested encoder; the last one stays open."""

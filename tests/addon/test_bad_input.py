@@ -151,9 +151,10 @@ WITHOUT_A_SCENE = {
     "Load an R5DGS scene first": (
         "add_alias", "add_crop_box", "allow_scene_file", "assign_gaussians", "delete_gaussians", "exact_mode",
         "explain_warning", "export_format", "export_masks", "export_ply", "export_scene", "extrapolate_until",
-        "fit_timeline", "isolate", "merge_with_meshes", "preview", "remove_alias", "rename_object", "retime",
-        "select_by_prompt", "select_floaters", "select_gaussians", "select_object", "set_display",
-        "show_captured_images", "show_confidence", "use_captured_camera", "view_as_trained", "viewport_render",
+        "fit_timeline", "isolate", "merge_with_meshes", "predict_contacts", "preview", "remove_alias",
+        "rename_object", "retime", "select_by_prompt", "select_floaters", "select_gaussians", "select_object",
+        "set_display", "show_captured_images", "show_confidence", "switch_contacts", "use_captured_camera",
+        "view_as_trained", "viewport_render",
     ),
     "Select an object of an R5DGS scene first": (
         "delete_object", "duplicate_object", "hand_over", "pivot_to_cursor", "re_extrapolate", "reset_motion",

@@ -26,6 +26,7 @@ OPERATORS = {  # call of each; None if another module tests it
     "load_scene": None,  # scene/test_load_scene.py
     "merge_with_meshes": None,  # engine/test_mesh_merge.py
     "pivot_to_cursor": lambda ops: ops.pivot_to_cursor(),
+    "predict_contacts": None,  # motion/test_contact.py
     "re_extrapolate": lambda ops: ops.re_extrapolate(),
     "recolor": lambda ops: ops.recolor(tint=(0.2, 0.9, 0.1)),
     "remove_alias": lambda ops: ops.remove_alias(word="tankard"),
@@ -44,6 +45,7 @@ OPERATORS = {  # call of each; None if another module tests it
     "show_captured_images": None,  # scene/test_captured_cameras.py
     "simplify_keys": lambda ops: ops.simplify_keys(tolerance=0.05),
     "stop_merging": None,  # engine/test_mesh_merge.py
+    "switch_contacts": None,  # motion/test_contact.py
     "unisolate": lambda ops: ops.unisolate(),
     "use_captured_camera": None,  # scene/test_captured_cameras.py
     "use_engine": lambda ops: ops.use_engine(),

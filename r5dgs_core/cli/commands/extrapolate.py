@@ -94,14 +94,14 @@ def run_extrapolate(
     input_paths.check_scene(path)
     input_paths.check_scene_output(out)
     from ...bake import contact
-    from ...contact import scene_future, scene_world
+    from ...contact import scene_bodies, scene_future, scene_world
     from ...scene import scene_file
 
     options.use_threads(threads)
     scene = scene_file.read(path)
     if until is not None and until <= scene.t_max:
         raise errors.ConfigError(f"--until {until:g}: expected a time after t_max = {scene.t_max:g}")
-    scene = dataclasses.replace(scene, groups=contact.without(scene.groups))
+    scene = scene_bodies.without_contacts(scene)
     named = {"ignore": ignore, "push": velocities, "friction": frictions, "bounce": bounces}
     changes = _by_group(scene, named, _si_factor(scene, path) if si else 1.0)
     wishes = scene_world.Wishes(**changes, until=until, samples=samples, seed=seed)

@@ -149,7 +149,7 @@ def test_bodies_that_overlap_at_t_max_are_shrunk_until_they_do_not():
     scene = contact_scenes.scene(contact_scenes.resting(0.0), contact_scenes.resting(0.38))
     bodies = tuple(world.Body(body.solid) for body in scene_future.scene_bodies.of(scene)[0])
     made = world.World(bodies, world.Plane(np.array([0, 0, 1.0]), 0.0), np.array([0, 0, -4.0]))
-    apart = scene_world._apart(made)
+    apart = scene_world.apart(made)
     assert sum(body.solid.volume for body in apart.bodies) < sum(body.solid.volume for body in bodies)
     runs = simulation.Simulation(apart, simulation.Stepping(100.0, 1e-3))
     assert (0, 1) not in runs.deepest(world.at_rest(apart))
