@@ -77,7 +77,10 @@ ALLOWED = {
     "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train", "shapes", "contact"},
     "prepare": {"color", "motion", "scene", "data", "capture", "masks"},
     "check": {"motion", "terminal", "scene", "color", "data", "formats", "config", "train", "prepare"},
-    "stability": {"motion", "motion_fit", "scene", "data", "raster", "config", "playback", "render", "train"},
+    "stability": {
+        *("motion", "motion_fit", "scene", "data", "raster", "config", "playback", "render", "train", "contact"),
+        "shapes",
+    },
     "association": {"scene", "data", "raster", "playback", "render", "masks"},
     "bench": {"terminal", "progress", "scene", "data", "config", "playback", "render", "evaluation", "train", "bake"},
     "error_vs_time": {

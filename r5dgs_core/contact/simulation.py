@@ -20,7 +20,8 @@ from .stepping import Stepping
 from .world import Body, Material, State, World
 
 log = logging.getLogger(__name__)
-_IMPEDANCE = [0.99, 0.99, 0.001, 0.5, 2]  # constant, so that solref alone determines the restitution
+_SOFT, _STIFF = 0.99, 0.9999  # impedances; MuJoCo has none beyond the latter
+_YIELD = 10.0  # times 1 / (mass ratio): 1 - impedance; under a heavy body, a light one sinks by the product of the two
 _LEAST_FRICTION, _MOST_FRICTION = 1e-5, 1e3
 _TOUCHING = 1e-3  # penetration that stays in the initial state, as a share of a body's size
 
@@ -171,12 +172,13 @@ def _specification(mujoco: Any, world: World, stepping: Stepping, unit: float) -
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.enableflags = int(mujoco.mjtEnableBit.mjENBL_SPECULATIVE)
     geom = spec.default.geom
-    geom.condim, geom.solimp = 3, _IMPEDANCE
-    heaviest = max((body.density * body.solid.volume for body in world.bodies), default=1.0)
+    masses = [body.density * body.solid.volume for body in world.bodies if not body.fixed] or [1.0]
+    heaviest, impedance = max(masses), _impedance(max(masses) / min(masses))
+    geom.condim, geom.solimp = 3, impedance
     for i, body in enumerate(world.bodies):
         _add_body(mujoco, spec, i, body, unit, body.density * unit**3 / heaviest)
         if world.plane is not None and not body.fixed:
-            _add_floor(mujoco, spec, i, body, world, unit)
+            _add_floor(mujoco, spec, i, body, world, unit, impedance)
     return spec
 
 
@@ -194,7 +196,15 @@ def _add_body(mujoco: Any, spec: Any, number: int, body: Body, unit: float, dens
     added.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, density=density)
 
 
-def _add_floor(mujoco: Any, spec: Any, number: int, body: Body, world: World, unit: float) -> None:
+def _impedance(mass_ratio: float) -> list[float]:
+    """MuJoCo's ``solimp`` for a mass ratio >= 1: constant, so that solref alone determines the restitution."""
+    found = min(max(1 - _YIELD / mass_ratio, _SOFT), _STIFF)
+    return [found, found, 0.001, 0.5, 2]
+
+
+def _add_floor(
+    mujoco: Any, spec: Any, number: int, body: Body, world: World, unit: float, impedance: list[float]
+) -> None:
     """Add the plane on which a body rests; it touches that body alone."""
     assert world.plane is not None
     normal, height = world.plane.normal, world.plane.height if body.floor is None else body.floor
@@ -208,4 +218,4 @@ def _add_floor(mujoco: Any, spec: Any, number: int, body: Body, world: World, un
         contype=0,
         conaffinity=0,
     )
-    spec.add_pair(geomname1=f"floor{number}", geomname2=f"body{number}", condim=3, solimp=_IMPEDANCE)
+    spec.add_pair(geomname1=f"floor{number}", geomname2=f"body{number}", condim=3, solimp=impedance)

@@ -20,6 +20,7 @@ from rich.table import Table
 
 from .. import atomic_files, errors
 from . import (
+    contacts,
     extremes,
     float32_playback,
     groups,
@@ -43,6 +44,7 @@ CASES: tuple[Case, ...] = (
     *playback.CASES,
     *predictions.CASES,
     *keys.CASES,
+    *contacts.CASES,
     *loading.CASES,
 )
 _CAPTION = (
