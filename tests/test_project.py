@@ -278,6 +278,7 @@ def test_the_first_five_minutes_in_blender_name_objects_of_the_demo():
     assert all(phrase.removeprefix("the ") in objects for phrase in prompt[1].split(" and "))
 
 
+@pytest.mark.slow
 @pytest.mark.heavy
 def test_quick_leaves_out_long_tests_whatever_markers_are_chosen():
     files = [

@@ -23,6 +23,7 @@ def check(*arguments):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_synthetic_scene_plays_and_previews_like_the_core(tmp_path):
     scene = scenes.make_scene(n=800, objects=5, sh_degree=2, world_convention="opengl")
     done = check(scene_file.write(scene, tmp_path / "scene.r5dgs"))

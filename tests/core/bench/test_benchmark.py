@@ -41,8 +41,16 @@ def contents(folder):
 
 @pytest.fixture(scope="module")
 def made(tiny, tmp_path_factory):
-    """A benchmark that was stopped at its first step and resumed: its plan, the records in between, the result."""
+    """A finished benchmark: its plan, its case and the result."""
     plan = plan_for(tiny, tmp_path_factory.mktemp("bench"))
+    (case,) = cases.make(plan)
+    return plan, case, benchmark.run_bench(plan, progress_kind="none")
+
+
+@pytest.fixture(scope="module")
+def resumed(tiny, tmp_path_factory):
+    """A benchmark that was stopped at its first step and resumed: its case, the records in between, the result."""
+    plan = plan_for(tiny, tmp_path_factory.mktemp("stopped"))
     (case,) = cases.make(plan)
 
     @contextlib.contextmanager
@@ -54,18 +62,20 @@ def made(tiny, tmp_path_factory):
         with pytest.raises(Interrupted, match="same command"):
             benchmark.run_bench(plan)
     between = cases.read_record(case), checkpoint.load(case.run)
-    return plan, case, between, benchmark.run_bench(plan, progress_kind="none")
+    return case, between, benchmark.run_bench(plan, progress_kind="none")
 
 
-def test_a_stopped_benchmark_keeps_the_progress_of_training(made):
-    _, _, (record, state), _ = made
+@pytest.mark.slow
+def test_a_stopped_benchmark_keeps_the_progress_of_training(resumed):
+    _, (record, state), _ = resumed
     assert not state.finished and state.iteration > 0
     assert [sitting["status"] for sitting in record["sittings"]] == [process.STOPPED]
     assert "measured" not in record
 
 
-def test_the_cost_of_a_case_adds_up_over_its_sessions(made):
-    _, case, (between, _), result = made
+@pytest.mark.slow
+def test_the_cost_of_a_case_adds_up_over_its_sessions(resumed):
+    case, (between, _), result = resumed
     first, second = cases.read_record(case)["sittings"]
     assert first == between["sittings"][0] and second["status"] == 0
     (found,) = result["results"]
@@ -74,7 +84,7 @@ def test_the_cost_of_a_case_adds_up_over_its_sessions(made):
 
 
 def test_a_record_holds_the_results_of_evaluation_and_playback(made, tiny):
-    plan, case, _, result = made
+    plan, case, result = made
     (found,) = result["results"]
     assert (found["scene"], found["representation"], found["variant"], found["mode"], found["seed"]) == (
         tiny.root.name,
@@ -95,7 +105,7 @@ def test_a_record_holds_the_results_of_evaluation_and_playback(made, tiny):
 
 
 def test_finished_runs_are_neither_trained_nor_measured_again(made, monkeypatch):
-    plan, case, _, result = made
+    plan, case, result = made
     before = contents(case.run)
     monkeypatch.setattr(process, "train", None)
     monkeypatch.setattr(playback_speed, "measure", None)
@@ -105,7 +115,7 @@ def test_finished_runs_are_neither_trained_nor_measured_again(made, monkeypatch)
 
 @pytest.mark.slow
 def test_remeasure_keeps_the_run_and_measures_it_again(made, tmp_path, monkeypatch):
-    plan, case, _, result = made
+    plan, case, result = made
     torch.save(lpips_weights.tensors("alex"), tmp_path / "alex.pth")
     plan = dataclasses.replace(plan, lpips=(tmp_path / "alex.pth",))
     monkeypatch.setattr(process, "train", None)
@@ -122,7 +132,7 @@ def test_remeasure_keeps_the_run_and_measures_it_again(made, tmp_path, monkeypat
 
 @pytest.mark.slow
 def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path, monkeypatch):
-    plan, _, _, _ = made
+    plan, _, _ = made
     shutil.copytree(plan.out, tmp_path / "out")
     plan = plan_for(tiny, tmp_path / "out", modes=("rigid",))
     plain, before = bake.bake, benchmark.run_bench(plan, remeasure=True, progress_kind="none")["results"]
@@ -145,7 +155,7 @@ def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path
 
 @pytest.mark.slow
 def test_a_case_that_fails_is_reported_and_the_others_continue(made, tiny, capsys):
-    plan, case, _, _ = made
+    plan, case, _ = made
     blocked = case.run.with_name("tracks_seed1")
     blocked.write_text("mine")
     arguments = ["bench", str(tiny.root), "--out", str(plan.out), "--variants", "tracks", "--seeds", "1", "0"]
@@ -166,7 +176,7 @@ def test_a_case_that_fails_is_reported_and_the_others_continue(made, tiny, capsy
 
 
 def test_a_fault_in_one_case_does_not_affect_the_others(tiny, tmp_path, monkeypatch, made):
-    _, _, _, result = made
+    _, _, result = made
 
     def run_case(plan, case, remeasure, progress):
         if case.seed == 0:
@@ -180,7 +190,7 @@ def test_a_fault_in_one_case_does_not_affect_the_others(tiny, tmp_path, monkeypa
 
 
 def test_a_record_stores_the_machines_of_training_and_measurement(made):
-    _, case, _, result = made
+    _, case, result = made
     (found,) = result["results"]
     assert found["machine"] == benchmark.machine() and found["machine"]["cores"] >= 1
     assert found["trained_on"]["torch_threads"] == 1 and found["trained_on"]["versions"] == machine.versions()
@@ -189,14 +199,14 @@ def test_a_record_stores_the_machines_of_training_and_measurement(made):
 
 
 def test_results_measured_elsewhere_keep_their_machine(made, monkeypatch):
-    plan, _, _, result = made
+    plan, _, result = made
     monkeypatch.setattr(benchmark, "machine", lambda: {"processor": "another"})
     (found,) = benchmark.run_bench(plan, progress_kind="none")["results"]
     assert found["machine"] == result["results"][0]["machine"]
 
 
 def test_a_finished_run_of_other_data_is_refused_before_anything_is_done(made, tiny, tmp_path):
-    plan, _, _, _ = made
+    plan, _, _ = made
     root = tmp_path / tiny.root.name
     shutil.copytree(tiny.root, root)
     assert len(cases.make(plan_for(tiny, plan.out, scenes=(root,)))) == 1, "the same data in another place"
@@ -207,7 +217,7 @@ def test_a_finished_run_of_other_data_is_refused_before_anything_is_done(made, t
 
 
 def test_a_run_started_with_other_settings_is_refused_before_anything_is_done(made, tiny):
-    plan, case, _, _ = made
+    plan, case, _ = made
     before = contents(plan.out)
     with pytest.raises(ConfigError, match="train.iterations = 20, expected 30"):
         cases.make(plan_for(tiny, plan.out, overrides=(*OVERRIDES, "train.iterations=30")))

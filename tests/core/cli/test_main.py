@@ -359,7 +359,7 @@ def test_the_demo_may_be_run_twice(small_demo, tmp_path, capsys):
     assert "leave out --preset, --config, --set, --iterations" in line
 
 
-@pytest.mark.default_cases("moment0")
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", [{"event": "step", "iteration": 10}, {"event": "evaluate", "done": 1}])
 def test_a_stopped_demo_prints_the_command_that_continues_it(small_demo, tmp_path, capsys, monkeypatch, moment):
     out = tmp_path / "my demo"

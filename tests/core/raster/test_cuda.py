@@ -9,9 +9,7 @@ own tile lists in plain torch are compared.
 import dataclasses
 import inspect
 import logging
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +20,7 @@ import torch
 
 from r5dgs_core import errors
 from r5dgs_core.raster import RasterSettings, RasterStats, SplatImage, backends, cuda, rasterize_splats
-from tests.support import gsplat_stand_in, splats
+from tests.support import gsplat_stand_in, processes, splats
 from tests.support.gsplat_stand_in import OLD_STAND_IN, STAND_IN
 from tests.support.splats import camera, relative
 
@@ -430,7 +428,9 @@ def test_the_cpu_draws_without_looking_for_a_gpu(tmp_path):
     """gsplat is installed, and its import would raise an error."""
     (tmp_path / "gsplat.py").write_text("raise AssertionError('gsplat was imported')")
     script = (
-        "import sys, torch, r5dgs_core.raster as raster\n"
+        "import sys\n"
+        "sys.path[:0] = sys.argv[1:]\n"
+        "import torch, r5dgs_core.raster as raster\n"
         "from tests.support.splats import camera, splats\n"
         "for backend in ('auto', 'reference'):\n"
         "    raster.rasterize_splats(*[t.float() for t in splats(5, 3)], camera(), backend=backend)\n"
@@ -438,8 +438,5 @@ def test_the_cpu_draws_without_looking_for_a_gpu(tmp_path):
         "assert not torch.cuda.is_initialized()\n"
         "print('drawn')"
     )
-    paths = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", "")])
-    result = subprocess.run(
-        [sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True
-    )
+    result = processes.run(script, tmp_path, ROOT)
     assert result.stdout == "drawn\n", result.stderr

@@ -45,7 +45,7 @@ def run(data, overrides, device):
     return trainer, waits
 
 
-@pytest.mark.default_cases("tracks", "field of all")
+@pytest.mark.default_cases("tracks")
 @pytest.mark.parametrize("name", RUNS)
 def test_a_run_on_a_device_is_that_of_the_cpu_and_does_not_wait(tiny, name):
     with pretended_device.twins():

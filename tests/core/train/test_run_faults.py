@@ -204,6 +204,7 @@ def test_a_camera_file_that_lacks_a_key_is_named_with_frame_and_key(data, tmp_pa
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_objects_of_a_single_mask_or_pixel_become_background_with_a_warning(data, tmp_path, caplog):
     for name in ("r_000.png", "r_010.png"):
         path = data / "object_mask/train" / name

@@ -24,7 +24,7 @@ def test_corners_are_found_without_an_offset(kind):
     assert len(misses) > 50 and np.abs(np.median(misses, axis=0)).max() < 0.1
 
 
-@pytest.mark.default_cases(f"True-{CHARUCO}", f"True-{APRILTAG}", f"False-{CHARUCO}")
+@pytest.mark.default_cases(f"True-{CHARUCO}", f"True-{APRILTAG}")
 @pytest.mark.parametrize("kind", [CHARUCO, APRILTAG])
 @pytest.mark.parametrize("known", [True, False])
 def test_a_carried_board_gives_poses_lenses_and_the_scale(tmp_path, kind, known):

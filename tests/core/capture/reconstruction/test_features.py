@@ -59,6 +59,7 @@ def test_the_same_images_give_the_same_cameras(solved, tmp_path):
         assert np.nanmax(np.abs(pixels[0] - pixels[1])) < 0.01
 
 
+@pytest.mark.slow
 def test_known_lenses_are_kept(tmp_path):
     films, poses = fixed()
     found = features.reconstruct(films, Request(lenses={film.name: LENS for film in films}), tmp_path / "work")

@@ -236,6 +236,7 @@ def test_companions_are_bodies_that_move_and_the_bind_state_is_at_the_last_knot(
     assert moving.tolist() == [False, False, True, True]
 
 
+@pytest.mark.slow
 def test_label_cleanup_reports_its_changes_and_can_be_disabled(tiny, tmp_path):
     steps = ("train.iterations=60", "identity.iterations=5")
     made, states = {}, {}

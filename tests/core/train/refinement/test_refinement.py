@@ -68,11 +68,11 @@ def refined(wrong):
 
 def test_gradients_of_the_camera_are_those_of_the_picture():
     rng = np.random.default_rng(3)
-    camera = tiny_datasets.orbit_camera(0.4, 48, 36)
-    n = 60
+    camera = tiny_datasets.orbit_camera(0.4, 24, 18)
+    n = 30
     means = torch.from_numpy(rng.normal([0, 0, 0.45], 0.4, (n, 3)))
     quats, scales = torch.from_numpy(rng.normal(size=(n, 4))), torch.from_numpy(rng.uniform(0.1, 0.3, (n, 3)))
-    colors, weights = torch.from_numpy(rng.uniform(size=(n, 3))), torch.from_numpy(rng.normal(size=(36, 48, 3)))
+    colors, weights = torch.from_numpy(rng.uniform(size=(n, 3))), torch.from_numpy(rng.normal(size=(18, 24, 3)))
     weights = weights.cumsum(0).cumsum(1) / 100
     opacities = torch.full((n,), 0.5, dtype=torch.float64)
     quats = quats / quats.norm(dim=1, keepdim=True)
@@ -106,13 +106,15 @@ def test_wrong_poses_are_found_and_corrected(tiny, wrong, refined):
 
 def test_right_cameras_are_left_alone_and_the_run_is_the_same(tiny):
     dataset = datasets.read(tiny.root)
-    tried = train(dataset)
+    end = trial.steps(tiny_datasets.settings(*tiny_datasets.EXAMINED, *STEPS))[-1] + 1
+    tried = train(dataset, stop=end)
     assert tried.refinement.gains is not None and not tried.refinement.active
-    plain = train(dataset, *(f"needs.{part}=off" for part in PARTS)).state()
+    plain = train(dataset, *(f"needs.{part}=off" for part in PARTS), stop=end).state()
     for name, tensor in plain.tensors.items():
         assert torch.equal(tensor, tried.state().tensors[name]), name
 
 
+@pytest.mark.slow
 def test_wrong_colours_are_found_and_corrected(tiny):
     dataset, gains = jittered(tiny, {"gain": 0.15})
     trainer = train(dataset, gains=gains)
@@ -207,5 +209,6 @@ def test_cameras_are_never_examined_if_everything_is_switched_off():
 
 
 def test_a_part_set_on_is_refined_without_need(tiny):
-    trainer = train(datasets.read(tiny.root), "needs.time_offsets=on", "needs.camera_poses=off", stop=80)
+    second = trial.steps(tiny_datasets.settings(*tiny_datasets.EXAMINED, *STEPS))[1]
+    trainer = train(datasets.read(tiny.root), "needs.time_offsets=on", "needs.camera_poses=off", stop=second + 1)
     assert "time_offsets" in trainer.refinement.parts
