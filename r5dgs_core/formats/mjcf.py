@@ -37,6 +37,10 @@ def model(scene: Scene, bodies: list[RigidBody]) -> ElementTree.Element:
     defaults = add(root, "default")
     add(defaults, "geom", type="mesh", condim="3", friction=numbers([rigid_bodies.FRICTION, 0.005, 0.0001]))
     assets, world = add(root, "asset"), add(root, "worldbody")
+    height = rigid_bodies.ground_height(scene)
+    if height is not None:
+        place = {"pos": numbers([0, 0, height]), "size": "0 0 1"}
+        add(world, "geom", place, name=rigid_bodies.GROUND, type="plane")
     for body in bodies:
         corners = numbers(body.solid.vertices.ravel())
         add(assets, "mesh", name=body.name, vertex=corners, face=" ".join(map(str, body.solid.triangles.ravel())))
@@ -64,8 +68,8 @@ FORMAT = registry.Format(
     name="mjcf",
     label="MuJoCo Model",
     suffix=".xml",
-    keeps="convex hulls as rigid bodies with mass, inertia, gravity and a keyframe of poses and velocities",
-    loses="Gaussians, colours, learned motion, joints, concave shapes, support, cameras",
+    keeps="convex hulls as rigid bodies with mass, inertia, gravity, ground and a keyframe of poses and velocities",
+    loses="Gaussians, colours, learned motion, joints, concave shapes, shape of the ground, cameras",
     write=export,
     per_frame=True,
     losses=rigid_bodies.simulator_losses,

@@ -18,9 +18,9 @@ from ..scene.hull import Hull
 from ..scene.scene import MotionGroup, Scene
 from ..shapes import object_hulls, solid
 from ..shapes.solid import Solid
-from . import registry, scene_nodes
+from . import ground, registry, scene_nodes
 
-WORLD = "world"  # name that URDF files use, and MuJoCo reserves
+WORLD, GROUND = "world", "ground"  # names that the files use; MuJoCo reserves the former
 DENSITY = 1000.0  # unknown; masses of bodies are proportional to their volumes
 FRICTION = 0.3
 _NEAR = 0.2  # of the size: distance up to which the centre of rotation in flight replaces the centre of the hull
@@ -111,6 +111,12 @@ def gravity(scene: Scene) -> np.ndarray:
     return turn @ found * (scene.units.meters_per_unit or 1.0) / _time_unit(scene) ** 2
 
 
+def ground_height(scene: Scene) -> float | None:
+    """Height of the plane under the bodies in the units of a file, z up, or None; see `ground.height`."""
+    found = ground.height(scene, [hull for hull, _ in _solids(_hulls(scene))])
+    return None if found is None else found * (scene.units.meters_per_unit or 1.0)
+
+
 def time_step(scene: Scene) -> float:
     """Step of a simulation: a thousandth of the observed span, in the unit of time of a file."""
     return _time_unit(scene) * (float(np.ptp(scene.tracks.times)) or 1.0) / 1000
@@ -133,7 +139,7 @@ def losses(scene: Scene) -> list[str]:
 def simulator_losses(scene: Scene) -> list[str]:
     """As `losses`, for formats of simulators."""
     unknown = [] if gravity(scene).any() else ["gravity is unknown and set to 0; set it in the simulator"]
-    return [*losses(scene), *unknown, "the support of resting bodies: add a plane in the simulator"]
+    return [*losses(scene), *unknown, ground.MISSING if ground_height(scene) is None else ground.LOSS]
 
 
 def _hulls(scene: Scene) -> tuple[Hull, ...]:
@@ -170,7 +176,7 @@ def _center_of_mass(group: MotionGroup, body: Solid, up: np.ndarray) -> np.ndarr
 
 
 def _names(scene: Scene, hulls: list[Hull]) -> list[str]:
-    groups, used = scene_nodes.group_names(scene), {WORLD}
+    groups, used = scene_nodes.group_names(scene), {WORLD, GROUND}
     found = []
     for hull in hulls:
         first = name = groups[hull.motion_id] if hull.motion_id else scene.object(hull.object_id).name

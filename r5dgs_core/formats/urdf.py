@@ -19,6 +19,8 @@ from . import registry, rigid_bodies
 from .mjcf import numbers
 from .rigid_bodies import RigidBody
 
+_GROUND_SIDE = 100.0  # of the box that is the ground, over the reach of the bodies
+
 
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
     """Write the meshes, and the bodies at each time. Implements `registry.Format.write`."""
@@ -53,7 +55,7 @@ def _robot(scene: Scene, bodies: list[RigidBody], meshes: list[str]) -> ElementT
     add(extension, "compiler", discardvisual="true", fusestatic="false")
     add(extension, "option", gravity=numbers(rigid_bodies.gravity(scene)), cone="elliptic", integrator="RK4")
     extension[1].set("timestep", numbers([rigid_bodies.time_step(scene)]))
-    add(root, "link", name=rigid_bodies.WORLD)
+    _add_ground(scene, add(root, "link", name=rigid_bodies.WORLD), bodies)
     for body, mesh in zip(bodies, meshes, strict=True):
         link = add(root, "link", name=body.name)
         inertial = add(link, "inertial")
@@ -71,6 +73,19 @@ def _robot(scene: Scene, bodies: list[RigidBody], meshes: list[str]) -> ElementT
         if body.moves:
             add(root, "r5dgs_state", link=body.name, linear=numbers(body.velocity), angular=numbers(body.spin))
     return root
+
+
+def _add_ground(scene: Scene, world: ElementTree.Element, bodies: list[RigidBody]) -> None:
+    """Add a large box whose upper side is the ground, as URDF has no planes."""
+    height = rigid_bodies.ground_height(scene)
+    if height is None:
+        return
+    reach = max(float(np.abs(body.position).max()) + body.solid.size for body in bodies)
+    side = _GROUND_SIDE * (reach + abs(height))
+    collision = ElementTree.SubElement(world, "collision")
+    ElementTree.SubElement(collision, "origin", xyz=numbers([0, 0, height - 0.005 * side]))
+    geometry = ElementTree.SubElement(collision, "geometry")
+    ElementTree.SubElement(geometry, "box", size=numbers([side, side, 0.01 * side]))
 
 
 def _roll_pitch_yaw(quat: np.ndarray) -> np.ndarray:
@@ -92,9 +107,9 @@ FORMAT = registry.Format(
     name="urdf",
     label="URDF",
     suffix=".urdf",
-    keeps="convex hulls as links with mass, inertia and friction; poses, velocities; one file per frame, and "
+    keeps="convex hulls as links with mass, inertia and friction; poses, velocities, ground; one file per frame, and "
     "one OBJ file per hull beside them",
-    loses="Gaussians, colours, learned motion, joints, concave shapes, support, cameras",
+    loses="Gaussians, colours, learned motion, joints, concave shapes, shape of the ground, cameras",
     write=export,
     per_frame=True,
     companions=companions,

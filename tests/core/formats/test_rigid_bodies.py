@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.formats import hulls, mjcf, registry, rigid_bodies, urdf
+from r5dgs_core.formats import ground, hulls, mjcf, registry, rigid_bodies, urdf
 from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.playback.scene_player import Player
 from r5dgs_core.scene import cameras
 from r5dgs_core.scene.units import Units
 from r5dgs_core.shapes import object_hulls, solid
-from tests.support import scenes, solid_gaussians
+from tests.support import contact_scenes, scenes, solid_gaussians
 
 MODEL = MotionModel(
     "ballistic_spin", velocity=[0.5, 0.2, 1.0], acceleration=[0, 0, -3.0], angular_velocity=[0.4, -1.0, 2.0]
@@ -201,3 +201,29 @@ def test_urdf_has_a_file_for_each_frame_and_meshes_for_all(thrown, tmp_path):
     (body,) = rigid_bodies.of(thrown, 0.5, options)
     origin = ElementTree.parse(paths[2]).find("joint/origin")
     np.testing.assert_allclose([float(part) for part in origin.get("xyz").split()], body.position, rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["mjcf", "urdf"])
+def test_a_thrown_box_lands_on_the_ground_under_the_one_that_rests(tmp_path, kind):
+    mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
+    boxes = contact_scenes.scene(contact_scenes.falling(), contact_scenes.resting(2.0))
+    boxes = dataclasses.replace(boxes, units=Units(meters_per_unit=2.0))
+    *_, path = registry.get(kind).write(boxes, tmp_path / f"a{registry.get(kind).suffix}", registry.Options((0.6,)))
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    if kind == "mjcf":
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_step(model, data, int(3 / model.opt.timestep))
+    half = contact_scenes.SIZE  # of 0.4 units of 2 m each
+    height = data.xpos[model.body("box 1").id][2]
+    assert 0.9 * half < height < 1.8 * half and np.abs(data.qvel).max() < 0.05
+    assert ground.LOSS in registry.get(kind).losses(boxes)
+
+
+def test_the_ground_is_below_all_observed_places_and_missing_if_nothing_rests(thrown):
+    resting, flying = contact_scenes.resting(2.0), contact_scenes.falling(height=0.1)
+    scene = contact_scenes.scene(flying, resting)
+    assert ground.height(scene, scene.hulls[1:]) == pytest.approx(0.0, abs=1e-9)
+    lowest = min(float(corners[:, 2].min()) for corners in posed(scene, scene.t_max))
+    assert ground.height(scene, scene.hulls) == pytest.approx(lowest) and lowest < -0.05
+    assert ground.height(thrown, thrown.hulls) is None and ground.MISSING in mjcf.FORMAT.losses(thrown)
