@@ -22,7 +22,21 @@ from r5dgs_core.stability import training
 pytestmark = pytest.mark.heavy
 
 LONG = [case for case in stability.CASES if case.name.endswith("1e7 frames")]  # seconds each; few frames run, too
-SHORT = [case for case in stability.CASES if case not in LONG]
+COSTLY = [  # half a second and more each
+    case
+    for case in stability.CASES
+    if (case.topic, case.name)
+    in {
+        ("loading", "1000 bodies"),
+        ("small angles", "gradients of the exponential at 0, 1e-300 to 1e-4 rad"),
+        ("keying", "an orbit of 1e15 units per unit, 600 frames"),
+        ("breaks", "2 within a time step, 5 poses left"),
+        ("contacts", "coin that spins with 60 rad/s"),
+        ("contacts", "five boxes on each other for 10 s"),
+        ("contacts", "mass ratio 1e+06"),
+    }
+]
+SHORT = [case for case in stability.CASES if case not in LONG + COSTLY]
 COMPARED = {  # rows whose errors of the TRACE integrator are tested; those of others take longer than all else
     ("growth", "one step of 1 rad"),
     ("direction of time", "forward, then backward, 4 steps"),
@@ -56,6 +70,11 @@ def case(measure, tolerance=1.0, trace_rk2=None):
 @pytest.mark.nightly
 def test_every_case_of_millions_of_frames_passes():
     assert LONG and not failed(LONG)
+
+
+@pytest.mark.slow
+def test_every_costly_case_passes():
+    assert len(COSTLY) == 7 and not failed(COSTLY)
 
 
 def test_every_case_passes(rows):
