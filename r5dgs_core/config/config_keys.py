@@ -56,7 +56,7 @@ _KEYS_BY_UNIT = {
         discovery.fewest identity.neighbours identity.samples
     """,
     "count": """
-        field.width train.threads train.probe_views init.sweep_depths curriculum.stages residual.nodes
+        field.width train.batch train.threads train.probe_views init.sweep_depths curriculum.stages residual.nodes
     """,
     "degree": "train.sh_degree",
     "integer": "train.seed",

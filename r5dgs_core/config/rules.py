@@ -88,6 +88,7 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "data.min_registered": _SHARE,
     "data.memory": _POSITIVE,
     "train.iterations": _AT_LEAST_1,
+    "train.batch": _AT_LEAST_1,
     "train.seed": (lambda value: value < 2**63 - 1, "less than 2^63 - 1"),
     "train.device": (lambda value: re.fullmatch(DEVICES, value) is not None, "auto, cpu, cuda or cuda:N"),
     "train.representation": (lambda value: value in REPRESENTATIONS, " or ".join(REPRESENTATIONS)),

@@ -154,7 +154,8 @@ class _Growth:
         pool, new = self._used[(knots >= first) & (knots <= final)], self._used[np.isin(knots, newest)]
         if len(pool) == 0:
             return
-        chosen = [new if len(new) and self._rng.random() < NEWEST else pool for _ in range(steps)]
+        count = steps * self._trainer.config.train.batch
+        chosen = [new if len(new) and self._rng.random() < NEWEST else pool for _ in range(count)]
         self._trainer.curriculum.queue = [int(self._rng.choice(views)) for views in chosen]
         for _ in range(steps):
             self._trainer.step()

@@ -139,7 +139,7 @@ def _try(trainer: Trainer, progress: Progress) -> Trial:
         return nothing
     trainer.restore(dataclasses.replace(state, tensors=state.tensors | residual.tensors_of(field)))
     steps = trial_steps(config)
-    trainer.curriculum.queue = [used[k % len(used)] for k in range(steps)]
+    trainer.curriculum.queue = [used[k % len(used)] for k in range(steps * config.train.batch)]
     try:
         for step in range(1, steps + 1):
             trainer.step()

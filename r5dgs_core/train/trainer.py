@@ -17,14 +17,22 @@ from ..config import training_needs
 from ..config.config import Config
 from ..data import memory
 from ..data.dataset import Dataset
-from ..errors import CheckpointError, TrainingError
+from ..errors import TrainingError
 from ..model.gaussians import Gaussians
 from ..model.remembered import Remembered
 from ..raster import DRAFT, RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from ..scene.sampling import spacing
-from . import background as backgrounds
-from . import checkpoint_content, curriculum, devices, losses, normalization, step_graphs, train_views
+from . import (
+    curriculum,
+    devices,
+    losses,
+    normalization,
+    step_graphs,
+    train_views,
+    trainer_state,
+    view_batch,
+)
 from . import optimizer as optimizers
 from .checkpoint import Checkpoint
 from .densification import densifier
@@ -158,17 +166,21 @@ class Trainer:
             self.optimizer = self.make_optimizer()
         for knot, towards, entered in self.curriculum.grow(self.iteration):
             self.motion.enter(knot, towards, entered)
-        index = self.curriculum.draw(self.iteration, self.generator)
+        drawn = [self.curriculum.draw(self.iteration, self.generator) for _ in range(self.config.train.batch)]
         self.targets.expect(self.curriculum.queue, masks=self.identity is not None)
-        view = self.views[index]
-        place = f"step {self.iteration}, view {view.name}"
+        place = f"step {self.iteration}, view {', '.join(self.given_views[index].name for index in drawn)}"
         for group in self.optimizer.param_groups:
             group["lr"] = self.rates.at(group["name"], self.iteration)
         if self.iteration % FREEZE_EVERY == 0 or len(self.frozen) != len(self.gaussians):
             # The depth of background that only one camera sees is not determined.
             self.frozen = densifier.seen_by_one_camera(self.gaussians, self.distinct_cameras)
-        inputs = StepInputs(index, view, self.motion.path(view.t, self.generator), self.targets.of(index))
-        loss = self._graphs.step(inputs) if self._graphs.take(inputs) else self.update(inputs, RasterStats(), place)
+        batch = [self._inputs(index) for index in drawn]
+        if len(batch) > 1:
+            loss = view_batch.update(self, batch, place)
+        elif self._graphs.take(batch[0]):
+            loss = self._graphs.step(batch[0])
+        else:
+            loss = self.update(batch[0], RasterStats(), place)
         if self.device.type != devices.CPU and self.iteration % CHECK_EVERY == 0:
             require_finite_state(loss, self.params, place)
         self.iteration += 1
@@ -176,8 +188,15 @@ class Trainer:
         self._maintain()
         return loss
 
-    def update(self, inputs: StepInputs, stats: RasterStats, place: str = "") -> Tensor:
-        """Draw a view, update all parameters by the gradients, and return the loss; ``place`` is for messages."""
+    def _inputs(self, index: int) -> StepInputs:
+        """Return the inputs of a view, with the numbers that it draws."""
+        view = self.views[index]
+        return StepInputs(index, view, self.motion.path(view.t, self.generator), self.targets.of(index))
+
+    def compare(
+        self, inputs: StepInputs, stats: RasterStats, place: str
+    ) -> tuple[Tensor, Tensor | None, fused_posing.PosedSplats]:
+        """Draw a view; return its loss, the loss of its identities or None, and its splats."""
         try:
             image, features, splats = self._draw_all(inputs, stats)
         except ValueError as error:
@@ -188,28 +207,41 @@ class Trainer:
             ) from error
         self.refinement.watch(splats)
         image = self.refinement.shade(image, inputs.target, inputs.index)
-        loss = losses.photometric(image, inputs.target, self.config.losses.ssim)
-        penalties = [self.motion.penalty(self.gaussians, self.iteration, self.labels)]
-        penalties.append(self.densifier.penalty(self.gaussians))
+        loss, identity = losses.photometric(image, inputs.target, self.config.losses.ssim), None
         if self.identity is not None:
-            penalties.append(self.identity.loss(self.gaussians, splats, inputs.view, self.iteration, features))
+            identity = self.identity.loss(self.gaussians, splats, inputs.view, self.iteration, features)
+        return loss, identity, splats
+
+    def penalties(self) -> list[Tensor | None]:
+        """Return the terms of a step's loss that do not depend on a view; None if they do not count."""
+        motion = self.motion.penalty(self.gaussians, self.iteration, self.labels)
+        return [motion, self.densifier.penalty(self.gaussians)]
+
+    def update(self, inputs: StepInputs, stats: RasterStats, place: str = "") -> Tensor:
+        """Draw a view, update all parameters by the gradients, and return the loss; ``place`` is for messages."""
+        loss, identity, splats = self.compare(inputs, stats, place)
         total = loss
-        for penalty in penalties:
-            total = total if penalty is None else total + penalty
+        for term in (*self.penalties(), identity):
+            total = total if term is None else total + term
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         loss = loss.detach()
         if self.device.type == devices.CPU:
             require_finite_step(loss, self.optimizer, self.params, place)
         view = inputs.view
-        self.refinement.update(inputs.index, view, splats, self.iteration, lambda t: self.splats(view.camera, t))
+        found = self.refinement.measure(inputs.index, view, splats, lambda t: self.splats(view.camera, t))
+        self.refinement.apply(inputs.index, view.camera.width, found, self.iteration)
+        self.move()
+        self.densifier.observe(stats, view.camera)
+        return loss
+
+    def move(self) -> None:
+        """Move the parameters against their gradients, except for what is not trained."""
         self._hide_harmonics()
         gradient = self.gaussians.params["means"].grad
         if gradient is not None:
             gradient.masked_fill_(self.frozen[:, None], 0.0)
         self.optimizer.step()
-        self.densifier.observe(stats, view.camera)
-        return loss
 
     def _draw_all(
         self, inputs: StepInputs, stats: RasterStats
@@ -267,62 +299,11 @@ class Trainer:
 
     def state(self) -> Checkpoint:
         """Return everything that the next step depends on."""
-        tensors: dict[str, Tensor] = {f"gaussians.{n}": p.detach() for n, p in self.gaussians.params.items()}
-        tensors["gaussians.motion_ids"] = self.gaussians.motion_ids
-        tensors |= self.motion.tensors()
-        if self.identity is not None:
-            tensors |= self.identity.tensors(self.gaussians)
-        if self.discovered_masks is not None:
-            tensors[checkpoint_content.DISCOVERED_MASKS] = self.discovered_masks
-        tensors["background"] = self.background.params["background"].detach()
-        tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
-        tensors["generator"] = self.generator.get_state()
-        if len(self.frozen) == len(self.gaussians):
-            tensors[checkpoint_content.FROZEN] = self.frozen
-        tensors |= self.densifier.tensors() | self.refinement.tensors()
-        tensors |= optimizers.tensors(self.optimizer)
-        x, y, z = (self.dataset.origin + self.normalization.origin).tolist()
-        return Checkpoint(
-            tensors={n: t.detach().to("cpu", copy=True) for n, t in tensors.items()},
-            representation=self.motion.name,
-            iteration=self.iteration,
-            entered=self.curriculum.entered,
-            first_time=self.first_time,
-            queue=tuple(self.curriculum.queue),
-            running_loss=self.running_loss,
-            origin=(x, y, z),
-            scale=float(self.normalization.scale),
-            observed=torch.from_numpy(self.places.shown.copy()),
-        )
+        return trainer_state.of(self)
 
     def restore(self, state: Checkpoint) -> None:
         """Restore a `state` of a trainer with the same data set and configuration."""
-        # Copies, as training modifies them in place.
-        tensors = {name: tensor.to(self.device, copy=True) for name, tensor in state.tensors.items()}
-        g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
-        self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])
-        self.motion = self.motion.restored(state.representation, tensors)
-        if self.identity is not None:
-            self.identity.restore(tensors, self.gaussians)
-        self.background = backgrounds.Background(tensors["background"], self.background.learned)
-        self.object_ids = state.tensors["object_ids"].numpy().copy()
-        try:
-            self.generator.set_state(state.tensors["generator"])
-        except (RuntimeError, TypeError) as error:
-            raise CheckpointError(
-                f"the checkpoint's 'generator' is not a state of torch's generator: {error}"
-            ) from error
-        if any(len(t) != len(self.gaussians) for n, t in tensors.items() if n.startswith("gradients.")):
-            raise CheckpointError(f"the checkpoint's 'gradients.*': expected {len(self.gaussians)} rows each")
-        self.densifier.restore(tensors)
-        self.refinement.restore(state.tensors)
-        self.frozen = tensors.get(checkpoint_content.FROZEN, self.frozen[:0])
-        self.optimizer = self.make_optimizer()
-        optimizers.restore(self.optimizer, tensors)
-        self.iteration = state.iteration
-        self.curriculum.entered = state.entered
-        self.first_time = state.first_time
-        self.curriculum.queue = list(state.queue)
+        trainer_state.restore(self, state)
         self._loss = RunningLoss(state.running_loss)
 
 

@@ -17,7 +17,8 @@ class TrainSection:
     """Representation, length and reporting of the run.
 
     Attributes:
-        iterations: Optimisation steps, one view each.
+        iterations: Optimisation steps.
+        batch: Views of a step, which moves along the mean of their gradients. A step takes as many times longer.
         seed: Seed of all random draws.
         representation: Motion representation: ``tracks`` (one SE(3) track per object) or ``field`` (deformation field
             and TRD, as in the paper).
@@ -40,6 +41,7 @@ class TrainSection:
     """
 
     iterations: int = 6000
+    batch: int = 1
     seed: int = 0
     representation: str = "tracks"
     background: str = "auto"

@@ -193,41 +193,62 @@ class Refinement:
                     tensor.retain_grad()
 
     @torch.no_grad()
-    def update(
-        self, index: int, view: TrainView, splats: PosedSplats, iteration: int, pose: Callable[[float], PosedSplats]
-    ) -> None:
-        """Update the corrections of a view's camera after the backward pass of a step.
+    def measure(
+        self, index: int, view: TrainView, splats: PosedSplats, pose: Callable[[float], PosedSplats]
+    ) -> np.ndarray | None:
+        """Return the gradients by the correction of a view's camera after the backward pass of a step.
 
         Args:
             index: The view.
             view: The view as it was drawn.
             splats: Its splats, with gradients.
-            iteration: The step.
             pose: Returns the splats at another time.
+
+        Returns:
+            Gradients by pose (6), focal length, time, and gains and offsets of the colours (6), which are nan without
+            such gradients. None if no part is trained. [14]
         """
+        leaf, self._color_leaf = self._color_leaf, None
         if not self.active or splats.means.grad is None:
+            return None
+        shift = self._poses.values[int(self.rig.pose_of[index]), 3:]
+        by_pose, by_focal = gradients.camera_gradient(view, splats, shift)
+        by_time, h = 0.0, TIME_STEP * self._spacing
+        if "time_offsets" in self.parts:
+            by_time = gradients.time_gradient(splats, pose(view.t - h), pose(view.t + h)) / (2 * h)
+        by_color = np.full((3, 2), math.nan)
+        if leaf is not None and leaf.grad is not None:
+            by_color = leaf.grad.cpu().numpy().astype(np.float64)
+        return np.concatenate([by_pose, [by_focal, by_time], by_color.ravel()])
+
+    def apply(self, index: int, width: int, measured: np.ndarray | None, iteration: int) -> None:
+        """Update the corrections of a view's camera.
+
+        Args:
+            index: The view.
+            width: Width of its image, px.
+            measured: Result of `measure`.
+            iteration: The step.
+        """
+        if measured is None:
             return
         row, lens = int(self.rig.pose_of[index]), int(self.rig.lens_of[index])
-        by_pose, by_focal = gradients.camera_gradient(view, splats, self._poses.values[row, 3:])
+        by_pose, by_focal, by_time, by_color = measured[:6], measured[6], measured[7], measured[8:].reshape(3, 2)
         if "camera_poses" in self.parts:
             step = self._poses.change(row, self._units[row].T @ by_pose, self._rate(self._poses, iteration))
             self._poses.values[row] += self._units[row] @ step
             self._smooth(row)
         if "focal_lengths" in self.parts:
-            unit = 2 / view.camera.width
+            unit = 2 / width
             step = self._focal.change(lens, np.array([by_focal * unit]), self._rate(self._focal, iteration))
             self._focal.values[lens] += unit * step
         if "time_offsets" in self.parts:
-            unit, h = TIME_UNIT * self._spacing, TIME_STEP * self._spacing
-            by_time = gradients.time_gradient(splats, pose(view.t - h), pose(view.t + h)) / (2 * h)
+            unit = TIME_UNIT * self._spacing
             step = self._time.change(lens, np.array([by_time * unit]), self._rate(self._time, iteration))
             self._time.values[lens] += unit * step
-        if self._color_leaf is not None and self._color_leaf.grad is not None:
-            gradient = self._color_leaf.grad.cpu().numpy().astype(np.float64)
-            self._color.values[lens] += COLOR_UNIT * self._color.change(
-                lens, gradient, self._rate(self._color, iteration)
-            )
-        self._color_leaf = None
+        if np.isfinite(by_color).all():
+            step = self._color.change(lens, by_color, self._rate(self._color, iteration))
+            self._color.values[lens] += COLOR_UNIT * step
         self._fix()
 
     def _rate(self, rows: _Rows, iteration: int) -> float:
