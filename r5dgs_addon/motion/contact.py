@@ -19,11 +19,6 @@ from ..scene import loaded_scenes, timeline
 from . import extrapolate, motion_fields, physics, stored_keys
 
 
-def has_contact(anchor: bpy.types.Object) -> bool:
-    """Return True if the learned motion of an anchor has contacts, on or off."""
-    return physics.has_motion(anchor) and json.loads(anchor.r5dgs_motion.learned).get("smooth") is not None
-
-
 def is_off(anchor: bpy.types.Object) -> bool:
     """Return True if the contacts of an anchor are switched off."""
     return bool(anchor.r5dgs_contact.former) and bool(anchor.r5dgs_motion.taken)
@@ -31,7 +26,7 @@ def is_off(anchor: bpy.types.Object) -> bool:
 
 def bodies(collection: bpy.types.Collection) -> list[bpy.types.Object]:
     """Anchors of a loaded scene whose learned motions have contacts."""
-    return [anchor for anchor in loaded_scenes.members(collection, "ANCHOR") if has_contact(anchor)]
+    return [anchor for anchor in loaded_scenes.members(collection, "ANCHOR") if physics.has_contact(anchor)]
 
 
 def switch_off(collection: bpy.types.Collection) -> list[bpy.types.Object]:
@@ -102,7 +97,7 @@ def apply(collection: bpy.types.Collection, answer: dict[str, Any]) -> list[bpy.
     """
     predicted = {one["group"]: one for one in answer["motions"]}
     anchors = _originals(collection)
-    changed = [one for one in anchors if one.r5dgs.motion_id in predicted or has_contact(one)]
+    changed = [one for one in anchors if one.r5dgs.motion_id in predicted or physics.has_contact(one)]
     extrapolate.check(changed)
     for anchor in changed:
         state, own = anchor.r5dgs_motion, anchor.r5dgs_contact

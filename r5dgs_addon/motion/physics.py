@@ -117,6 +117,11 @@ def has_motion(anchor: bpy.types.Object) -> bool:
     return bool(anchor.r5dgs_motion.learned)
 
 
+def has_contact(anchor: bpy.types.Object) -> bool:
+    """True if the learned motion of an anchor has contacts, even if they are switched off."""
+    return has_motion(anchor) and _parsed(anchor.r5dgs_motion.learned).get("smooth") is not None
+
+
 def set_fields(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
     """Set the fields of an anchor to a motion."""
     state.kind = model.kind
