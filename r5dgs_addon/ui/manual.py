@@ -14,6 +14,7 @@ PAGES = {  # operators described on each page; the others are described on the f
         *("re_extrapolate", "reset_motion", "simplify_keys", "replace_motion", "duplicate_object", "delete_object"),
         *("retime", "extrapolate_until", "show_confidence", "exact_mode", "pivot_to_cursor"),
     ),
+    "contact": ("predict_contacts", "switch_contacts"),
     "clean_up": (
         *("select_floaters", "select_gaussians", "lasso_gaussians", "brush_gaussians", "add_crop_box"),
         *("delete_gaussians", "assign_gaussians"),
@@ -41,6 +42,7 @@ def links() -> tuple[str, tuple[tuple[str, str], ...]]:
     """Return addresses for *Online Manual* in Blender's context menus of buttons."""
     found = [(f"bpy.ops.r5dgs.{name}*", f"{page}.md") for page, names in PAGES.items() for name in names]
     found += [("bpy.types.r5dgs_pg_clean_up*", "clean_up.md"), ("bpy.types.r5dgs_pg_render*", "rendering.md")]
+    found.append(("bpy.types.r5dgs_pg_contact*", "contact.md"))
     found += [(f"bpy.types.r5dgs_pg_{name}*", "motion.md") for name in ("motion", "pivot", "exact")]
     found += [
         ("bpy.types.r5dgs_ap_preferences*", "install.md"),
