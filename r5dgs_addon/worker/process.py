@@ -14,11 +14,13 @@ import collections
 import contextlib
 import json
 import logging
+import math
 import os
 import queue
 import signal
 import subprocess
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -58,6 +60,7 @@ class Worker:
         self.python = python
         self.hello: dict[str, Any] = {}
         self.notice = ""  # reason why renders are delayed, or ""
+        self._heard = -math.inf  # time of the last event, which restarts the wait for an answer
         self._held: set[str] = set()  # keys of the point edits that the worker has cached
         self._number = 0
         self._answers: queue.Queue = queue.Queue()
@@ -128,7 +131,7 @@ class Worker:
 
         Args:
             command: Name of the request.
-            timeout_s: Seconds to wait before the worker is stopped; longer while it compiles kernels.
+            timeout_s: Seconds to wait before the worker is stopped, counted from the end of the compilation of kernels.
             **arguments: JSON-compatible arguments. For the command ``points``, ``points`` is a tuple of
                 `evaluated_points.Edit`; edits that the worker has cached are not sent again.
 
@@ -156,7 +159,8 @@ class Worker:
                 answer = self._answers.get(timeout=timeout_s)
             except queue.Empty:
                 waited += timeout_s
-                if self.notice and waited < COMPILE_PATIENCE * timeout_s:
+                compiles = self.notice or time.monotonic() - self._heard < timeout_s
+                if compiles and waited < COMPILE_PATIENCE * timeout_s:
                     continue
                 self.close()
                 raise errors.BackendError(
@@ -237,6 +241,7 @@ class Worker:
             self._answers.put((header, arrays))
 
     def _hear(self, event: dict[str, Any]) -> None:
+        self._heard = time.monotonic()
         notice = COMPILING if event["event"] in ("compiling", "progress") else ""
         if event["event"] == "progress":
             notice += f", step {event['step']:d} of {event['steps']:d}"

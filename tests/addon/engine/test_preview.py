@@ -462,14 +462,17 @@ def test_waiting_for_kernel_compilation_shows_a_notice(
     worker.stop()
 
 
-@pytest.mark.parametrize("timeouts, outcome", [(10, "answer"), (3, "error")])
-def test_compilation_extends_the_timeout_and_not_forever(blender, monkeypatch, tmp_path, timeouts, outcome):
+@pytest.mark.parametrize("timeouts, done, outcome", [(10, False, "answer"), (10, True, "answer"), (3, False, "error")])
+def test_compilation_extends_the_timeout_and_not_forever(blender, monkeypatch, tmp_path, timeouts, done, outcome):
     process = importlib.import_module("r5dgs.r5dgs_addon.worker.process")
     monkeypatch.setattr(process, "COMPILE_PATIENCE", timeouts)
     running = process.Worker(fake_python(tmp_path / "python", COMPILES))
     try:
         running.greet(120.0)
         running.notice, answers, late = process.COMPILING, running._answers, iter(range(5))
+        if done:
+            running._hear({"event": "ready"})
+            assert running.notice == ""
 
         def get(timeout):
             if next(late, None) is not None:
@@ -478,7 +481,7 @@ def test_compilation_extends_the_timeout_and_not_forever(blender, monkeypatch, t
 
         monkeypatch.setattr(running, "_answers", types.SimpleNamespace(get=get, put=answers.put))
         if outcome == "answer":
-            assert running.request("hello", 0.1) == ({"missing": []}, {})
+            assert running.request("hello", 60.0 if done else 0.1) == ({"missing": []}, {})
         else:
             with pytest.raises(errors.BackendError, match="no answer to 'hello'"):
                 running.request("hello", 0.1)
