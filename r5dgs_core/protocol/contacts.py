@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -85,8 +84,7 @@ class ContactRequest:
 
 
 def _number(value: Any, name: str, least: float, most: float) -> float:
-    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    if not good or not least <= value <= most:
+    if not fields.is_number(value) or not least <= value <= most:
         raise errors.ConfigError(f"worker: {name!r} has to be a number from {least:g} to {most:g}, found {value!r:.60}")
     return float(value)
 

@@ -267,7 +267,7 @@ def _tint_of(value: dict[str, Any]) -> tuple[float, float, float] | None:
     tint = value.get("tint")
     if tint is None:
         return None
-    if not (isinstance(tint, list) and len(tint) == 3 and all(map(_is_number, tint))):
+    if not (isinstance(tint, list) and len(tint) == 3 and all(map(is_number, tint))):
         raise errors.ConfigError(f"worker: a tint has to hold three factors, found {_short(tint)}")
     if not all(0 <= factor <= _MAX_TINT for factor in tint):
         raise errors.ConfigError(f"worker: a tint has to hold factors from 0 to {_MAX_TINT:g}, found {tint}")
@@ -283,7 +283,7 @@ def distance_of(request: dict[str, Any]) -> float:
 def near_of(request: dict[str, Any]) -> float | None:
     """Return the nearest depth to render; None for the near plane of each scene."""
     near = request.get("near")
-    if near is not None and not (_is_number(near) and 0 < near <= cameras.FARTHEST):
+    if near is not None and not (is_number(near) and 0 < near <= cameras.FARTHEST):
         raise errors.ConfigError(f"worker: 'near' has to be a depth > 0, found {_short(near)}")
     return near
 
@@ -325,12 +325,13 @@ def _refuse_others(value: dict[str, Any], known: Sequence[str], what: str) -> No
 
 
 def _number(value: Any, problem: str) -> float:
-    if not _is_number(value) or abs(value) > cameras.FARTHEST:
+    if not is_number(value) or abs(value) > cameras.FARTHEST:
         raise errors.ConfigError(f"{problem}, found {_short(value)}")
     return float(value)
 
 
-def _is_number(value: Any) -> TypeGuard[int | float]:
+def is_number(value: Any) -> TypeGuard[int | float]:
+    """Return True for finite numbers, but not for booleans."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
