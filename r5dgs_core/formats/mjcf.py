@@ -19,16 +19,17 @@ KEY = "start"  # name of the keyframe
 
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
     """Write the bodies at each time. Implements `registry.Format.write`."""
+    height = rigid_bodies.ground_height(scene)
     for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
-        tree = model(scene, rigid_bodies.of(scene, t, options))
+        tree = model(scene, rigid_bodies.of(scene, t, options), height)
         ElementTree.indent(tree)
         with registry.writing(target):
             atomic_files.write(target, ElementTree.tostring(tree, "utf-8", xml_declaration=True) + b"\n")
         yield target
 
 
-def model(scene: Scene, bodies: list[RigidBody]) -> ElementTree.Element:
-    """Return the element ``mujoco`` of a scene and its bodies."""
+def model(scene: Scene, bodies: list[RigidBody], height: float | None) -> ElementTree.Element:
+    """Return the element ``mujoco`` of a scene and its bodies, over the ground at a height if there is one."""
     root = ElementTree.Element("mujoco", model=scene.name)
     add = ElementTree.SubElement
     # RK4 is exact for a parabola, and the elliptic cone for friction in any direction.
@@ -37,7 +38,6 @@ def model(scene: Scene, bodies: list[RigidBody]) -> ElementTree.Element:
     defaults = add(root, "default")
     add(defaults, "geom", type="mesh", condim="3", friction=numbers([rigid_bodies.FRICTION, 0.005, 0.0001]))
     assets, world = add(root, "asset"), add(root, "worldbody")
-    height = rigid_bodies.ground_height(scene)
     if height is not None:
         place = {"pos": numbers([0, 0, height]), "size": "0 0 1"}
         add(world, "geom", place, name=rigid_bodies.GROUND, type="plane")

@@ -31,8 +31,9 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
         with registry.writing(target):
             atomic_files.write(target, _obj(body).encode())
         yield target
+    height = rigid_bodies.ground_height(scene)
     for t, target in zip(options.times, targets[len(bodies) :], strict=True):
-        tree = _robot(scene, rigid_bodies.of(scene, t, options), [mesh.name for mesh in meshes])
+        tree = _robot(scene, rigid_bodies.of(scene, t, options), [mesh.name for mesh in meshes], height)
         ElementTree.indent(tree)
         with registry.writing(target):
             atomic_files.write(target, ElementTree.tostring(tree, "utf-8", xml_declaration=True) + b"\n")
@@ -48,14 +49,16 @@ def _mesh_names(bodies: list[RigidBody]) -> list[str]:
     return [f"{number}_{re.sub(r'[^A-Za-z0-9]+', '_', body.name)}.obj" for number, body in enumerate(bodies)]
 
 
-def _robot(scene: Scene, bodies: list[RigidBody], meshes: list[str]) -> ElementTree.Element:
+def _robot(scene: Scene, bodies: list[RigidBody], meshes: list[str], height: float | None) -> ElementTree.Element:
     root = ElementTree.Element("robot", name=scene.name)
     add = ElementTree.SubElement
     extension = add(root, "mujoco")
     add(extension, "compiler", discardvisual="true", fusestatic="false")
     add(extension, "option", gravity=numbers(rigid_bodies.gravity(scene)), cone="elliptic", integrator="RK4")
     extension[1].set("timestep", numbers([rigid_bodies.time_step(scene)]))
-    _add_ground(scene, add(root, "link", name=rigid_bodies.WORLD), bodies)
+    world = add(root, "link", name=rigid_bodies.WORLD)
+    if height is not None:
+        _add_ground(world, bodies, height)
     for body, mesh in zip(bodies, meshes, strict=True):
         link = add(root, "link", name=body.name)
         inertial = add(link, "inertial")
@@ -75,11 +78,8 @@ def _robot(scene: Scene, bodies: list[RigidBody], meshes: list[str]) -> ElementT
     return root
 
 
-def _add_ground(scene: Scene, world: ElementTree.Element, bodies: list[RigidBody]) -> None:
+def _add_ground(world: ElementTree.Element, bodies: list[RigidBody], height: float) -> None:
     """Add a large box whose upper side is the ground, as URDF has no planes."""
-    height = rigid_bodies.ground_height(scene)
-    if height is None:
-        return
     reach = max(float(np.abs(body.position).max()) + body.solid.size for body in bodies)
     side = _GROUND_SIDE * (reach + abs(height))
     collision = ElementTree.SubElement(world, "collision")
