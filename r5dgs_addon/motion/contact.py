@@ -73,8 +73,7 @@ def request(context: bpy.types.Context, collection: bpy.types.Collection) -> Con
             restitutions[group] = own.bounciness
         if own.mass != 1.0:
             masses[group] = own.mass
-    render = context.scene.render
-    rate = render.fps / render.fps_base / times.frames_per_unit  # units of scene time per second
+    rate = motion_fields.units_per_second(times)
     return ContactRequest(
         scene=str(render_request.scene_path(collection)),
         until=times.t_end,
@@ -150,9 +149,9 @@ def _obstacles(
     depsgraph = context.evaluated_depsgraph_get()
     back, found = np.linalg.inv(visible_clouds.world_of(collection)), {}
     for obj in objects:
-        corners = visible_meshes.corners(obj.evaluated_get(depsgraph))
-        matrix = back @ np.array(obj.evaluated_get(depsgraph).matrix_world, np.float64)
-        found[obj.name] = corners @ matrix[:3, :3].T + matrix[:3, 3]
+        evaluated = obj.evaluated_get(depsgraph)
+        matrix = back @ np.array(evaluated.matrix_world, np.float64)
+        found[obj.name] = visible_meshes.corners(evaluated) @ matrix[:3, :3].T + matrix[:3, 3]
     return found
 
 

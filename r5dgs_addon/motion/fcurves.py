@@ -8,6 +8,7 @@ it is split there without changing its shape.
 """
 
 import hashlib
+from collections.abc import Sequence
 
 import bpy
 import numpy as np
@@ -71,6 +72,14 @@ class KeyArrays:
 
     def at(self, k: int, frame: float) -> bool:
         return abs(float(self.co[k, 0]) - frame) <= FRAME_TOLERANCE
+
+
+def enums(curve: bpy.types.FCurve, names: Sequence[str]) -> np.ndarray:
+    """Enumerations of the keys as Blender's integers. [len(names), K] int32"""
+    values = np.empty((len(names), len(curve.keyframe_points)), np.int32)
+    for name, row in zip(names, values, strict=True):
+        curve.keyframe_points.foreach_get(name, row)
+    return values
 
 
 def _cut(name: str, curve: bpy.types.FCurve, points: KeyArrays, k: int, frame: float) -> np.ndarray:

@@ -19,7 +19,7 @@ from ...r5dgs_core.scene import gravity
 from ...r5dgs_core.shapes import solid
 from .. import compat
 from ..scene import hull_meshes, loaded_scenes, timeline
-from . import curve_place, duplicate_delete, extrapolate, physics
+from . import curve_place, duplicate_delete, extrapolate, motion_fields, physics
 
 NAME = "R5DGS Rigid Bodies"  # of the collection of proxies, and of the constraint of each anchor
 FRAME = "r5dgs_release"  # custom property of the collection: frame of release
@@ -253,7 +253,7 @@ def _set_gravity(scene: bpy.types.Scene, anchor: bpy.types.Object) -> None:
     up = parent[2, :3] / np.linalg.norm(parent[2, :3])
     found = gravity.of_motions([physics.smooth(one) for one in free], up)
     if found is not None:
-        scene.gravity = parent[:3, :3] @ found * (scene.render.fps / scene.render.fps_base / times.frames_per_unit) ** 2
+        scene.gravity = parent[:3, :3] @ found * motion_fields.units_per_second(times) ** 2
 
 
 def _proxy(proxies: bpy.types.Collection, body: _Body) -> tuple[bpy.types.Object, np.ndarray]:

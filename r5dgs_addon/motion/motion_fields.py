@@ -13,13 +13,14 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.motion import models
+from ..scene import timeline
 
 VECTORS = {name: unit for name, unit in models.FIELDS.items() if unit.size == 3}
 _re_extrapolate: Callable[[list[bpy.types.Object]], object] | None = None  # set by `extrapolate`
 
 
-def units_per_second(state: bpy.types.PropertyGroup) -> float:
-    """Units of scene time per second of Blender's time."""
+def units_per_second(state: bpy.types.PropertyGroup | timeline.Times) -> float:
+    """Units of scene time per second of Blender's time, for fields of an anchor or times of a loaded scene."""
     render = bpy.context.scene.render
     return render.fps / render.fps_base / state.frames_per_unit
 

@@ -119,10 +119,7 @@ def apply(plan: Replacement) -> None:
 
 def _read(curve: bpy.types.FCurve) -> Curve:
     points = fcurves.KeyArrays(curve)
-    enums = np.empty((len(_ENUMS), points.count), np.int32)
-    for field, values in zip(_ENUMS, enums, strict=True):
-        curve.keyframe_points.foreach_get(field, values)
-    return Curve(points.co, points.left, points.right, enums)
+    return Curve(points.co, points.left, points.right, fcurves.enums(curve, _ENUMS))
 
 
 def _constant(frame: float, value: float) -> Curve:

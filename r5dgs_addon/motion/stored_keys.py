@@ -59,16 +59,9 @@ def _keys(curve: bpy.types.FCurve, frame: float) -> dict[str, list]:
     points = fcurves.KeyArrays(curve)
     first = points.last(frame)
     first = first if first >= 0 and points.at(first, frame) else 0
-    found: dict[str, list] = {}
-    for name in _POINTS:
-        values = np.empty(2 * points.count, np.float32)
-        curve.keyframe_points.foreach_get(name, values)
-        found[name] = values[2 * first :].tolist()
-    for name in _ENUMS:
-        values = np.empty(points.count, np.int32)
-        curve.keyframe_points.foreach_get(name, values)
-        found[name] = values[first:].tolist()
-    return found
+    places = zip(_POINTS, (points.co, points.left, points.right), strict=True)
+    enums = zip(_ENUMS, fcurves.enums(curve, _ENUMS), strict=True)
+    return {name: values[first:].ravel().tolist() for name, values in (*places, *enums)}
 
 
 def _write(curve: bpy.types.FCurve, keys: dict[str, list]) -> None:
