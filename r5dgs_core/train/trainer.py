@@ -38,10 +38,11 @@ from .checkpoint import Checkpoint
 from .densification import densifier
 from .densification import registry as densification
 from .identity import joint_identity, packed_masks
-from .initialization import run_start
+from .initialization import free_space, run_start
 from .refinement import rig
 from .refinement.refinement import RefinedViews, Refinement
 from .representations import fused_posing, registry, still
+from .representations.representation import FIELD
 from .running_loss import CHECK_EVERY, RunningLoss, require_finite_state, require_finite_step
 from .step_graphs import StepInputs
 from .targets import Targets
@@ -92,6 +93,7 @@ class Trainer:
         self.object_ids = start.object_ids
         self.places = start.places
         self.first_time = start.first_time
+        self._free_space = start.free_space
         self.background = run_start.background(self.given_views, self.behind, start.sky, config)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         classes = {int(object_id): row for row, object_id in enumerate(self.object_ids)}
@@ -287,6 +289,9 @@ class Trainer:
             rest.grad[:, (self.iteration // every + 1) ** 2 - 1 :] = 0.0
 
     def _maintain(self) -> None:
+        free, due = self._free_space, self.iteration % free_space.CLEAR_EVERY == 0
+        if free is not None and due and self.motion.name != FIELD:  # a field also moves Gaussians of the background
+            free_space.clear(free, self.gaussians)
         self.motion.after_step(self.gaussians, self.iteration, self.generator)
         self.densifier.after_step(
             self.gaussians, self.optimizer, self.iteration, self.rates.at("means", self.iteration)

@@ -20,6 +20,7 @@ from . import (
     background_images,
     color_balance,
     evidence,
+    free_space,
     knots,
     place_gaussians,
     plane_sweep,
@@ -73,6 +74,7 @@ class InitialState:
         sky: Coefficients of the sky, or None if none was found. [9, 3]
         evidence: Evidence of the images on the objects' motion.
         colors: Colours of the cameras; None if they were not compared or do not differ.
+        free_space: Space to keep free of background; None if the depth of the background is not ambiguous.
     """
 
     gaussians: Gaussians
@@ -84,6 +86,7 @@ class InitialState:
     sky: np.ndarray | None
     evidence: evidence.BodyEvidence
     colors: color_balance.ColorBalance | None = None
+    free_space: free_space.FreeSpace | None = None
 
 
 def start(
@@ -126,7 +129,7 @@ def start(
     eyes = np.stack([v.camera.center for v in views])
     plane = supporting_plane(search.distinct_points(), places, eyes, rng)
     placed = search.place(swept, plane, find_sky, rng)
-    where, shade = _background(views, backgrounds, placed, init, rng, cloud)
+    where, shade, free = _cleared(_background(views, backgrounds, placed, init, rng, cloud), views, times, places)
     log.info("background: %d points from %d cameras; %d objects", len(where), len(backgrounds), len(clouds))
     parts = [place_gaussians.solid([*clouds, (where, shade, 0)], init.opacity)]
     casters, slope = np.zeros(0, np.int64), np.zeros(3)
@@ -145,7 +148,7 @@ def start(
     tracks = FirstTracks(times, centers, translations, casters, None if plane is None else plane[0], slope, to_light)
     ids = np.concatenate([[0], places.object_ids])
     seen = evidence.gather(views, places, times)
-    return InitialState(gaussians, tracks, ids, places, first, plane, placed.sky, seen, colors)
+    return InitialState(gaussians, tracks, ids, places, first, plane, placed.sky, seen, colors, free)
 
 
 def _balanced(
@@ -239,6 +242,29 @@ def _background(
             "is one" if len(backgrounds) == 1 else f"are {len(backgrounds)}",
         )
     return where, shade
+
+
+def _cleared(
+    background: tuple[np.ndarray, np.ndarray],
+    views: Sequence[TrainView],
+    times: np.ndarray,
+    places: triangulation.ObjectPositions,
+) -> tuple[np.ndarray, np.ndarray, free_space.FreeSpace | None]:
+    """Return the background points that hide no object, their colours, and the space to keep free of background.
+
+    Args:
+        background: Points and their colours. [P, 3] each
+        views: Training views.
+        times: Knots. [S]
+        places: Positions of the objects.
+    """
+    where, shade = background
+    free = free_space.find(views, times, places, where)
+    if free is None:
+        return where, shade, None
+    kept = ~free.contains(where)
+    log.info("background: %d points left out, as they would hide objects that the masks show", (~kept).sum())
+    return where[kept], shade[kept], free
 
 
 def supporting_plane(
