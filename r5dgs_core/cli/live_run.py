@@ -17,7 +17,8 @@ from typing import Any
 
 from .page_server import Page
 
-EVERY_S = 60.0  # shortest time from the start of a bake, or the end of a long one, to the start of the next
+EVERY_S = 60.0  # shortest time from the start of a bake to the start of the next
+SHARE = 0.1  # largest share of one core's time for bakes, which slow the training by the use of shared caches
 POLL_S = 2.0
 PAGE = Path(__file__).with_name("live_run.html")
 CHECKPOINT, CURVES, LOG = "checkpoint.pt", "learning_curves.png", "log.jsonl"  # of run folders
@@ -70,17 +71,18 @@ class LiveRun:
         }
 
     def watch(self) -> None:
-        """Bake each new checkpoint, at most one in `EVERY_S`, until `stop`."""
+        """Bake each new checkpoint, within `EVERY_S` and `SHARE`, until `stop`."""
         while not self._stop.is_set():
             stamp = _stamp(self.run / CHECKPOINT)
             wait = POLL_S
             if stamp is None:
                 self._problem = "no checkpoint yet"
             elif stamp != self._baked:
-                began = time.monotonic()
+                began, spent = time.monotonic(), _children_seconds()
                 self._bake()
                 self._baked = stamp
-                wait = max(EVERY_S - (time.monotonic() - began), EVERY_S if self._problem else POLL_S)
+                took, spent = time.monotonic() - began, _children_seconds() - spent
+                wait = max(max(EVERY_S, (spent or took) / SHARE) - took, POLL_S)
             self._stop.wait(wait)
 
     def stop(self) -> None:
@@ -107,6 +109,12 @@ class LiveRun:
             self._count, self._problem = self._count + 1, ""
         else:
             self._problem = (log.strip().splitlines() or ["the scene could not be made"])[-1][:300]
+
+
+def _children_seconds() -> float:
+    """Return the processor seconds of finished child processes; 0 on systems that do not count them."""
+    spent = os.times()
+    return spent.children_user + spent.children_system
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

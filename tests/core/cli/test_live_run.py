@@ -1,5 +1,6 @@
 """Live view of a training run."""
 
+import itertools
 import json
 import os
 import shutil
@@ -64,20 +65,24 @@ def test_a_checkpoint_is_baked_once_by_another_process(watched, monkeypatch):
     assert not thread.join(0.5) and (live.folder / live_run.SCENE).stat().st_mtime_ns == made
 
 
-def test_bakes_start_at_most_once_a_minute(watched, monkeypatch):
+@pytest.mark.parametrize(
+    ("spent", "wait"), [(0.0, live_run.EVERY_S), (2.0, live_run.EVERY_S), (30.0, 30.0 / live_run.SHARE)]
+)
+def test_bakes_start_at_most_once_a_minute_and_take_a_tenth_of_the_time(watched, monkeypatch, spent, wait):
     live, _ = watched
-    waits = []
+    waits, clock = [], itertools.count(0.0, spent)
 
-    def wait(seconds):
+    def sleep(seconds):
         waits.append(seconds)
         os.utime(live.run / live_run.CHECKPOINT, ns=(1, len(waits)))  # a new checkpoint each time
         if len(waits) == 3:
             live.stop()
 
     monkeypatch.setattr(live, "_bake", lambda: None)
-    monkeypatch.setattr(live._stop, "wait", wait)
+    monkeypatch.setattr(live_run, "_children_seconds", lambda: next(clock))
+    monkeypatch.setattr(live._stop, "wait", sleep)
     live.watch()
-    assert len(waits) == 3 and all(seconds > live_run.EVERY_S - 1 for seconds in waits)
+    assert len(waits) == 3 and all(wait - 1 < seconds <= wait for seconds in waits)
 
 
 @pytest.mark.heavy
