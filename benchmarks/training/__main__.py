@@ -5,7 +5,7 @@
     curve           quality against training time
     step            time of one step
     memory          peak memory by phase
-    scaling         peak memory and time against the number of frames
+    length          peak memory and time against the number of frames
     held_out_times  quality between the observed times
     full_length     tables of finished benchmarks of several networks and lengths
     network_playback  frame rate with the networks in the loop

@@ -43,7 +43,7 @@ def ray_cast(camera_world: np.ndarray, t: float, width: int, objects: int) -> tu
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     eye = camera_world[:3, 3]
     color = np.stack([0.5 + 0.1 * rays[..., 2], 0.6 + 0.1 * rays[..., 2], np.full((width, width), 0.85)], -1)
-    nearest, ids = np.full((width, width), np.inf), np.zeros((width, width), np.uint8)
+    nearest, ids = np.full((width, width), np.inf), np.zeros((width, width), np.int32)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = -eye[2] / rays[..., 2]
         point = eye + depth[..., None] * rays
@@ -51,16 +51,25 @@ def ray_cast(camera_world: np.ndarray, t: float, width: int, objects: int) -> tu
     color[floor] = texture(point[floor], 7.0, 0)
     nearest[floor] = depth[floor]
     for k in range(1, objects + 1):
-        around = 2 * np.pi * k / objects
-        center = np.array([1.1 * np.cos(around), 1.1 * np.sin(around), 0.35])
-        center[:2] += (t - 0.5 * T_MAX) * np.array([0.5 * np.sin(3.0 * k), 0.5 * np.cos(2.0 * k)])
+        center, radius = ball(k, objects)
+        center[:2] += (t - 0.5 * T_MAX) * radius / 0.3 * np.array([0.5 * np.sin(3.0 * k), 0.5 * np.cos(2.0 * k)])
         half = rays @ (center - eye)
-        square = half**2 - ((center - eye) ** 2).sum() + 0.3**2
+        square = half**2 - ((center - eye) ** 2).sum() + radius**2
         depth = half - np.sqrt(np.maximum(square, 0))
         hit = (square > 0) & (depth > 0) & (depth < nearest)
-        color[hit] = texture((eye + depth[hit][:, None] * rays[hit] - center) / 0.3, 4.0, k)
+        color[hit] = texture((eye + depth[hit][:, None] * rays[hit] - center) / radius, 4.0, k)
         nearest[hit], ids[hit] = depth[hit], k
     return color, ids
+
+
+def ball(number: int, count: int) -> tuple[np.ndarray, float]:
+    """Centre [3] and radius of a ball: on a circle, or over the floor if there are more than ten."""
+    if count <= 10:
+        around = 2 * np.pi * number / count
+        return np.array([1.1 * np.cos(around), 1.1 * np.sin(around), 0.35]), 0.3
+    around, away = 2.399963 * number, 1.8 * np.sqrt(number / count)  # the golden angle fills the disc evenly
+    radius = 1.2 / np.sqrt(count)
+    return np.array([away * np.cos(around), away * np.sin(around), radius + 0.05]), radius
 
 
 def texture(points: np.ndarray, frequency: float, seed: int) -> np.ndarray:
@@ -73,7 +82,7 @@ def texture(points: np.ndarray, frequency: float, seed: int) -> np.ndarray:
 
 def make_dataset(folder: Path, width: int, cameras: int, times: int, objects: int) -> None:
     """Write the data set: cameras on a circle, every camera at every time; two held-out views."""
-    from r5dgs_core.data import images
+    from r5dgs_core.data import images, masks
 
     plan = {"train": [(k, t) for t in np.linspace(0, T_MAX, times) for k in range(cameras)]}
     plan["val"] = [(0.5, 0.0), (2.5, T_MAX)]
@@ -89,7 +98,7 @@ def make_dataset(folder: Path, width: int, cameras: int, times: int, objects: in
             matrix[:3] = np.stack([right, np.cross(back, right), back, eye], -1)
             color, ids = ray_cast(matrix, float(t), width, objects)
             images.write_png(folder / split / f"r_{i:04d}.png", color)
-            images.write_png(folder / "object_mask" / split / f"r_{i:04d}.png", ids)
+            masks.write(folder / "object_mask" / split / f"r_{i:04d}.png", ids)
             frames.append({"file_path": f"{split}/r_{i:04d}", "time": float(t), "transform_matrix": matrix.tolist()})
         (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": ANGLE_X, "frames": frames}))
 

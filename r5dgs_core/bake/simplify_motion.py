@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from ..config.sections.needs import NeedsSection
 from ..motion import rotations
@@ -247,7 +247,7 @@ def _measured(
         for rows in (evidence.strongest_views(np.linalg.norm(dropped, axis=1)), None):
             support = evidence.support(group, scene.tracks.poses, _move_followers(scene, after), largest, rows)
             change = max(support.sigmas, 0.0) / np.sqrt(free)
-            allowed = float(np.sqrt(stats.f.ppf(1 - LEVEL, free, max(support.clusters - 1, 1))))
+            allowed = float(np.sqrt(special.fdtri(free, max(support.clusters - 1, 1), 1 - LEVEL)))
             if change > CLEARLY * allowed:
                 break
         why = f"{change:.2g} times its noise, at most {allowed:.2g} is noise"

@@ -281,7 +281,6 @@ def test_a_python_without_numba_is_named_with_the_remedy_and_the_next_choice_wor
     loaded.context.scene.render.engine = "R5DGS"
     said = "worker: .*python lacks numba; install the core there.*pip install r5dgs.*'Worker Python'"
     for act in (
-        loaded.ops.r5dgs.preview,
         loaded.ops.r5dgs.check_worker,
         lambda: f12(loaded),
         lambda: loaded.ops.r5dgs.export_masks(directory=str(tmp_path / "masks"), frames="CURRENT"),

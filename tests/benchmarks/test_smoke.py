@@ -31,7 +31,7 @@ PROGRAMS = {
     "raster.harmonics": ("--count", "50", "--size", "16", "--turns", "1"),
     "training.held_out_times": ("{data}", *SHORT, "--set", "train.iterations=10"),
     "training.memory": ("--size=48", "--cameras=5", "--times=3", "--objects=2", "--gaussians=500", *SHORT),
-    "training.scaling": ("--size=32", "--cameras=4", "--times", "3", "--steps=1", "--objects=1"),
+    "training.length": ("--size=32", "--cameras=4", "--times", "3", "--steps=1", "--objects=1"),
     "motion": ("--gaussians", "100", "--bodies", "2", "--size", "small", "--rounds", "1"),
     "raster.speed": ("--workloads", "W0", "tabletop-small", *ONCE),
     "raster.error": ("--workloads", "W0", "--groups", "resolution", "--repeats", "1"),
@@ -52,6 +52,7 @@ LONG = (  # more than five seconds each
     "extrapolation.appearance",
     "extrapolation.modes",
     "futures.textures",
+    "motion",
     "playback",
     "raster.first_frame",
     "raster.frames",
@@ -59,9 +60,9 @@ LONG = (  # more than five seconds each
     "raster.static_layer",
     "training.curve",
     "training.held_out_times",
+    "training.length",
     "training.memory",
     "training.network_playback",
-    "training.scaling",
     "words",
 )
 

@@ -61,7 +61,7 @@ class Browser:
         assert "error" not in answer, answer["error"]
         return answer["result"]
 
-    def open(self, url: str, width: int = 1280, height: int = 800, **options: bool) -> None:
+    def open(self, url: str, width: int = 640, height: int = 400, **options: bool) -> None:
         """Open an address and wait until the player is ready or has failed."""
         self.send(open=url, width=width, height=height, **options)
 

@@ -272,6 +272,7 @@ def test_colour_management_that_changes_colours_is_named_and_corrected(blender, 
     assert "r5dgs.show_colors_as_trained" not in layouts.draw(blender, *panels.CLASSES)
 
 
+@pytest.mark.default_cases("AgX-AgX - Medium High Contrast-1")
 @pytest.mark.parametrize(
     ("view", "look", "exposure"),
     [("AgX", "None", 0), ("AgX", "AgX - Medium High Contrast", 1), ("Filmic", "None", -1.5), ("Standard", "None", 2)],

@@ -52,6 +52,7 @@ def switched(tiny, tmp_path):
     return tmp_path / "switched"
 
 
+@pytest.mark.slow
 def test_a_numbering_per_video_becomes_one(scene_path, tiny, tmp_path):
     folder, out = tmp_path / "videos", tmp_path / "out"
     names = sorted({view.camera.name for view in datasets.read(tiny.root).train})

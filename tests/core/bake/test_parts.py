@@ -19,6 +19,7 @@ def loose(kind):
     return dataclasses.replace(scene, groups=tuple(groups))
 
 
+@pytest.mark.default_cases("hinge", "slider")
 @pytest.mark.parametrize("kind", ["hinge", "ball", "slider"])
 def test_joints_between_bodies_of_one_object_are_found(kind):
     scene = loose(kind)

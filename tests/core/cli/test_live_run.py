@@ -100,7 +100,10 @@ def test_baking_has_the_lowest_priority():
     code = "from r5dgs_core.cli import live_bake; import os; live_bake.lower_priority(); "
     code += "print(os.nice(0), os.sched_getscheduler(0))"
     settings = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=settings, check=True)
+    own_session = {"start_new_session": True}  # else the session of the tests would have the lowest priority, too
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=settings, check=True, **own_session
+    )
     assert done.stdout.split() == ["19", str(os.SCHED_IDLE)]
 
 
@@ -108,6 +111,7 @@ def test_a_path_that_is_no_run_is_named(tmp_path, capsys):
     assert "not a run folder" in complaint(capsys, "view", "--live", tmp_path, "--no-browser")
 
 
+@pytest.mark.slow
 def test_scene_and_sheet_have_the_names_that_the_view_looks_for(run, tmp_path):
     live_bake.make(run, tmp_path)
     assert {live_run.SCENE, live_run.SHEET} <= {path.name for path in tmp_path.iterdir()}

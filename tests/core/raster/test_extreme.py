@@ -23,6 +23,7 @@ LARGE_IMAGES = (  # seconds to a minute of the reference
     "one Gaussian covers a 4K image",
     "an image of 4096 by 4096 px",
     "an image 16384 px wide and 8 high",
+    "an image 8 px wide and 16384 high",
 )
 
 

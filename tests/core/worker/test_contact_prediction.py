@@ -1,10 +1,12 @@
 """The worker predicts motions with contacts for Blender."""
 
 import functools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from r5dgs_core.contact import scene_future
 from r5dgs_core.motion import models
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.protocol.contacts import ContactRequest
@@ -49,6 +51,18 @@ def test_a_sliding_box_stops_at_an_obstacle_and_moves_on_without(path):
     assert models.evaluate(model, 0.8)[1][0] < 0.6 - 0.05 - SIZE / 2 + 0.05 * SIZE
 
 
+def test_the_users_wishes_reach_the_prediction(path, monkeypatch):
+    given = []
+    unchanged = SimpleNamespace(groups=(), taken={}, lines=())
+    monkeypatch.setattr(scene_future, "predict", lambda scene, wishes: given.append(wishes) or unchanged)
+    changes = {"frictions": {2: 0.05}, "restitutions": {1: 0.4}, "masses": {2: 50.0}, "gravity": 0.4}
+    assert ask(path, **changes, obstacles={"wall": wall(0.6)})["result"] == {"motions": [], "taken": {}, "lines": []}
+    (wishes,) = given
+    assert wishes.materials == {1: (None, 0.4), 2: (0.05, None)} and wishes.masses == {2: 50.0}
+    assert wishes.until == 1.4 and [*wishes.gravity] == [0, 0, -0.4] and list(wishes.obstacles) == ["wall"]
+
+
+@pytest.mark.slow
 def test_the_users_friction_mass_and_gravity_count(path):
     pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
     near = contact_scenes.with_units(contact_scenes.scene(contact_scenes.sliding(1.5), contact_scenes.resting(0.8)))

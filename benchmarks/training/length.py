@@ -1,7 +1,7 @@
 """Peak memory and time of training against the number of frames. Linux only.
 
-    python -m benchmarks.training scaling [--times 15 30 60] [--cameras 20] [--size 1440] [--steps 20]
-                                          [--set SECTION.KEY=VALUE] [--json FILE]
+    python -m benchmarks.training length [--times 15 30 60] [--cameras 20] [--size 1440] [--steps 20]
+                                         [--set SECTION.KEY=VALUE] [--json FILE]
 
 For each number of times, a capture of moving balls (`memory.make_dataset`) is trained for some steps in a process of
 its own. Only ``--drawn`` times are ray cast; the files of the other times are links to these, so that a long capture
