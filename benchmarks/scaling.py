@@ -12,8 +12,10 @@ seconds between the two largest cases, where constant costs matter least. Result
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import importlib.util
+import io
 import json
 import math
 import multiprocessing
@@ -80,12 +82,14 @@ class Phases:
 
 def settings_of(case: Case) -> tuple[list[str], int]:
     """Settings that grow the scene to a number of Gaussians, and the steps that this takes."""
-    growth = 2 * math.ceil(math.log2(max(2.0, case.gaussians / 500)))
+    placed = min(case.gaussians, 4000)
+    growth = 2 * math.ceil(math.log2(max(2.0, 2 * case.gaussians / placed)))
     steps = growth + STEPS
     return [
         f"train.iterations={steps}",
         *("train.log_every=1", f"train.probe_every={10 * steps}", "curriculum.first=0", "curriculum.grow=0"),
-        *(f"densify.max_gaussians={case.gaussians}", f"init.gaussians={case.gaussians}"),
+        f"densify.max_gaussians={case.gaussians}",
+        *(f"init.background_points={placed // 2}", f"init.object_points={max(placed // 2 // case.objects, 20)}"),
         *("densify.start=2", "densify.every=2", "densify.gradient=0", "densify.share=1", "densify.prune_opacity=0"),
         *(f"densify.stop={growth / steps}", f"identity.iterations={IDENTITY_STEPS}"),
     ], growth
@@ -144,7 +148,8 @@ def measure(data: Path, folder: Path, case: Case, answers: Any) -> None:
     phases.begin()
     evaluate.evaluate(scene, dataset)
     phases.end("evaluate")
-    associate.run_associate(run, out=folder / "masks")
+    with contextlib.redirect_stdout(io.StringIO()):
+        associate.run_associate(path, data, out=folder / "masks")
     phases.end("associate")
     scene_file.write(scene, folder / "again.r5dgs")
     phases.end("write")
@@ -162,8 +167,9 @@ def measure_blender(path: Path, answers: Any) -> None:
     """Put the costs of loading and playing a scene in Blender into a queue."""
     import bpy
 
-    from tests.blender import run
+    from tests.blender import check_playback, run
 
+    check_playback.extension_package()
     phases = Phases()
     run.load(path)
     phases.end("Blender load")
