@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import functools
 import io
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,38 +29,49 @@ BACKEND = "associate"  # name in masks.json
 SEGMENTS, SUMMARY = "segments.csv", "association.json"
 
 
+class MaskFiles(Sequence[np.ndarray]):
+    """Masks of views, read from their files on each access, so that long captures need no memory for them. [H, W]"""
+
+    def __init__(self, views: Sequence[datasets.View]):
+        self._views = views
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: int) -> np.ndarray:  # type: ignore[override]
+        mask = datasets.load_mask(self._views[index])
+        assert mask is not None
+        return mask
+
+
 @dataclass(frozen=True)
 class Repair:
-    """Repaired masks and their inputs.
+    """New ids of segments, and all that their masks are made from.
 
     Attributes:
         views: Views with masks, in the order of the association's images.
-        incoming: Original masks. Tuple of [H, W]
+        incoming: Their original masks.
         result: New ids of segments.
-        mended: New masks; objects without a segment of their own may have gained pixels. Tuple of [H, W] uint16
         own_ids: True if the new ids belong to the folder, because those of the data set were valid per video only.
+        mend: Yields the new masks, rendering the votes of other images; each call renders again.
     """
 
     views: tuple[datasets.View, ...]
-    incoming: tuple[np.ndarray, ...]
+    incoming: MaskFiles
     result: associate.Association
-    mended: tuple[np.ndarray, ...]
     own_ids: bool
+    mend: Callable[[], Iterator[np.ndarray]]
+
+    @property
+    def mended(self) -> Iterator[np.ndarray]:
+        """New masks; objects without a segment of their own may have gained pixels. [H, W] uint16"""
+        return (mask.astype(np.uint16) for mask in self.mend())
 
     @property
     def numbering(self) -> str:
         """Scope of the new ids, as in `mask_notes`; if all incoming ids are kept, they remain valid per video."""
         apart = self.result.fallback and len({view.mask_video for view in self.views}) > 1
         return mask_notes.VIDEO if apart else mask_notes.SCENE
-
-    @property
-    def filled(self) -> int:
-        """Number of images in which pixels changed beyond the relabelling of segments."""
-        count = 0
-        for old, new, own in zip(self.incoming, self.mended, self.result.ids, strict=True):
-            ids = np.unique(old[old != masks.UNKNOWN])
-            count += bool((mending.relabel(old, ids, own) != new).any())
-        return count
 
 
 def repair(
@@ -86,7 +98,7 @@ def repair(
             f"{dataset.root}: expected masks of training views, found none. Remedy: r5dgs masks, or name their folder "
             "with --masks"
         )
-    incoming = tuple(mask for view in views if (mask := datasets.load_mask(view)) is not None)
+    incoming = MaskFiles(views)
     if not any(((mask > 0) & (mask != masks.UNKNOWN)).any() for mask in incoming):
         raise errors.DatasetError(
             f"{dataset.mask_folder}: expected objects in the masks, found only background and unknown pixels; "
@@ -110,9 +122,8 @@ def repair(
         neighbours.reshape(len(scene.gaussians.means), -1)[:, 1:],
         paths=render_segments.paths(scene, np.array(times)),
     )
-    made = render_votes.mend(scene, views, incoming, images, result, backend=backend)
-    mended = tuple(mask.astype(np.uint16) for mask in made)
-    return Repair(views, incoming, result, mended, own_ids=any(view.mask_video for view in views))
+    mend = functools.partial(render_votes.mend, scene, views, incoming, images, result, backend=backend)
+    return Repair(views, incoming, result, any(view.mask_video for view in views), mend)
 
 
 def check_place(folder: Path, views: Sequence[datasets.View]) -> None:
@@ -162,13 +173,16 @@ def write(
             path.unlink(missing_ok=True)
     except OSError as error:
         raise errors.DatasetError(f"{folder}: cannot be written: {error}") from error
-    for view, ids in zip(done.views, done.mended, strict=True):
+    present, filled = [], 0
+    for image, (view, ids) in enumerate(zip(done.views, done.mended, strict=True)):
         masks.write(folder / f"{view.name}.png", ids)
-    videos, found = _videos(done), summary(done)
+        present.append(np.unique(ids))
+        filled += _is_filled(done, image, ids)
+    videos, found = _videos(done, present), summary(done, filled)
     try:
         if names is not None:
-            present = sorted({k for video in videos.values() for k in video.ids})
-            called = {str(k): names.get(k, f"object {k}") for k in present}
+            ids = sorted({k for video in videos.values() for k in video.ids})
+            called = {str(k): names.get(k, f"object {k}") for k in ids}
             atomic_files.write(folder / OBJECTS, (json.dumps(called, indent=1) + "\n").encode())
         atomic_files.write(folder / SEGMENTS, _segments(done).encode())
         atomic_files.write(folder / SUMMARY, (json.dumps(found, indent=1) + "\n").encode())
@@ -178,29 +192,36 @@ def write(
     return found
 
 
-def _videos(done: Repair) -> dict[str, mask_notes.Video]:
-    """Groups of images within which the new ids are valid, with their ids."""
+def _is_filled(done: Repair, image: int, new: np.ndarray) -> bool:
+    """Return True if pixels of an image changed beyond the relabelling of segments."""
+    old = done.incoming[image]
+    ids = np.unique(old[old != masks.UNKNOWN])
+    return bool((mending.relabel(old, ids, done.result.ids[image]) != new).any())
+
+
+def _videos(done: Repair, present: Sequence[np.ndarray]) -> dict[str, mask_notes.Video]:
+    """Groups of images within which the new ids are valid, with the ids that are present in them."""
     images: dict[str, list[str]] = {}
     found: dict[str, set[int]] = {}
-    for view, ids in zip(done.views, done.mended, strict=True):
+    for view, ids in zip(done.views, present, strict=True):
         name = view.mask_video if done.numbering == mask_notes.VIDEO else "all"
         images.setdefault(name, []).append(view.name)
-        found.setdefault(name, set()).update(np.unique(ids).tolist())
+        found.setdefault(name, set()).update(ids.tolist())
     return {
         name: mask_notes.Video(tuple(some), tuple(sorted(found[name] - {0, masks.UNKNOWN})))
         for name, some in images.items()
     }
 
 
-def summary(done: Repair) -> dict[str, Any]:
-    """Summary of a repair, the content of ``association.json``."""
+def summary(done: Repair, filled: int) -> dict[str, Any]:
+    """Summary of a repair with ``filled`` mended images, the content of ``association.json``."""
     result = done.result
     counts = {what: sum(row.done == what for row in result.rows) for what in ("kept", "relabelled", "unknown")}
     return {
         "images": len(done.views),
         "segments": len(result.rows),
         **counts,
-        "mended": done.filled,
+        "mended": filled,
         "objects": [int(k) for k in result.objects],
         "confident": round(result.confident, 4),
         "agreement": round(result.agreement, 4),

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import shutil
+import weakref
 
 import numpy as np
 import pytest
@@ -130,6 +131,21 @@ def test_a_scene_file_does_as_well_as_its_run(scene_path, trained, tiny, switche
     two = cli_associate.run_associate(trained.folder, masks=switched, out=tmp_path / "two")
     for path in one.rglob("*.png"):
         assert path.read_bytes() == (two / path.relative_to(one)).read_bytes()
+
+
+def test_few_masks_are_in_memory_at_the_same_time(scene_path, tiny, switched, tmp_path, monkeypatch):
+    load, given, most = datasets.load_mask, [], 0
+
+    def counted(view):
+        nonlocal most
+        mask = load(view)
+        given.append(weakref.ref(mask))
+        most = max(most, sum(one() is not None for one in given))
+        return mask
+
+    monkeypatch.setattr(datasets, "load_mask", counted)
+    cli_associate.run_associate(scene_path, tiny.root, masks=switched, out=tmp_path / "out")
+    assert len(given) > 36 and most <= 4
 
 
 def test_masks_that_are_read_are_not_written_over(scene_path, tiny, switched):
