@@ -158,20 +158,49 @@ def training(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def training_settings(
-    folder: Path, config_path: Path | None, overrides: Sequence[str], *, preset: str | None, resume: bool
+    folder: Path,
+    config_path: Path | None,
+    overrides: Sequence[str],
+    *,
+    preset: str | None,
+    resume: bool,
+    processes: int = 1,
 ) -> config.Config:
     """Return the configuration of a new run; a resumed run keeps its own.
 
+    Args:
+        folder: The run folder.
+        config_path: Value of ``--config``.
+        overrides: Values of ``--set``.
+        preset: Value of ``--preset``.
+        resume: True if a run in the folder is resumed.
+        processes: Number of processes; by default, each draws one view per step.
+
     Raises:
-        UsageError: A run is resumed with options that change its configuration.
+        UsageError: A run is resumed with options that differ from its configuration.
         ConfigError: A key or value is invalid.
     """
+    given = config.load(config_path, tuple(overrides), preset)
+    if given.train.batch == 1 and processes > 1:
+        given = given.replace(**{"train.batch": processes})
     if resume and (config_path or overrides or preset) and (Path(folder) / input_paths.RUN_FILE).exists():
+        _refuse_changes(folder, given, overrides)
+    return given
+
+
+def _refuse_changes(folder: Path, given: config.Config, overrides: Sequence[str]) -> None:
+    """Raise UsageError if a configuration differs from that of a run; a run may be resumed on another device."""
+    from ..train import run_folder
+
+    own, other = run_folder.open_run(folder).config.to_dict(), given.to_dict()
+    if not any(text.startswith("train.device=") for text in overrides):
+        other["train"]["device"] = own["train"]["device"]
+    changed = [f"{name}.{key}" for name, keys in own.items() for key in keys if other[name][key] != keys[key]]
+    if changed:
         raise errors.UsageError(
-            "--resume continues with the configuration of the run; leave out --preset, --config, --set, --iterations, "
-            "--seed and --max-gaussians"
+            f"--resume continues with the configuration of the run, which has other values of {', '.join(changed)}; "
+            "leave out --preset, --config, --set, --iterations, --seed and --max-gaussians"
         )
-    return config.load(config_path, tuple(overrides), preset)
 
 
 def use_threads(count: int | None) -> None:

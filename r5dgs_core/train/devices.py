@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 
 import torch
 
@@ -17,18 +18,22 @@ AUTO, CPU = "auto", "cpu"
 def select(name: str) -> torch.device:
     """Return the device of a name: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``.
 
-    ``auto`` is the first CUDA device if torch finds one and gsplat can be loaded, and otherwise the CPU.
+    ``auto`` is a CUDA device if torch finds one and gsplat can be loaded, and otherwise the CPU. Of several processes
+    that train together, each takes its own CUDA device for ``cuda`` and ``auto``; others take the first one.
 
     Raises:
         BackendError: The named device cannot be used; the message has the remedy.
     """
     if name == CPU:
         return torch.device(CPU)
-    device = torch.device("cuda" if name == AUTO else name)
+    device = (
+        torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if name in (AUTO, "cuda") else torch.device(name)
+    )
     if torch.version.cuda is not None and torch.cuda.is_available():
         count, index = torch.cuda.device_count(), device.index or 0
         if index >= count:
-            raise BackendError(f"device {name}: torch finds {count} CUDA devices; remedy: --device cuda:{count - 1}")
+            remedy = f"--nproc-per-node {count}" if name in (AUTO, "cuda") else f"--device cuda:{count - 1}"
+            raise BackendError(f"device {name}: torch finds {count} CUDA devices; remedy: {remedy}")
         device = torch.device("cuda", index)
     reason = cuda.why_unavailable(device, torch.float32)
     if reason is None:

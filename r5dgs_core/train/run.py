@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-import shlex
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -38,6 +37,7 @@ from .identity import packed_masks
 from .refinement import trial
 from .representations.representation import TRACKS
 from .trainer import Trainer
+from .workers import ALONE, Workers, launch_command
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +57,7 @@ def train(
     device: str | None = None,
     resume_command: str | None = None,
     progress: Progress | None = None,
+    workers: Workers = ALONE,
 ) -> run_folder.Run:
     """Train a run folder from a data set.
 
@@ -71,6 +72,7 @@ def train(
         resume_command: Command that resumes this run, for messages; by default a call of ``r5dgs train``.
         progress: Called with a dictionary per event (docs/reference/run_folder.md#progress). If it is a
             `TimedProgress`, its estimate of the time left also counts phases that the caller has added.
+        workers: Processes that train together, of which this one leads; the others call `follow.follow`.
 
     Returns:
         The run.
@@ -83,7 +85,7 @@ def train(
     """
     if device is not None:
         config = config.replace(**{"train.device": device})
-    request = _Request(dataset_root, Path(folder), config, resume, overwrite, device, resume_command)
+    request = _Request(dataset_root, Path(folder), config, resume, overwrite, device, resume_command, workers)
     with contextlib.ExitStack() as stack:
 
         def claim() -> None:
@@ -105,6 +107,7 @@ class _Request:
     overwrite: bool
     device: str | None
     resume_command: str | None
+    workers: Workers
 
 
 @dataclass(frozen=True)
@@ -137,8 +140,8 @@ def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]
     request, dataset = _prepare(request, claim)
     folder, resume_command = request.folder, request.resume_command
     if resume_command is None:
-        root = str(Path(dataset.root).resolve())
-        resume_command = shlex.join(["r5dgs", "train", root, "--out", str(folder), "--resume"])
+        arguments = ["train", str(Path(dataset.root).resolve()), "--out", str(folder), "--resume"]
+        resume_command = launch_command(request.workers.count, arguments)
     run, state, replaces = _open(request, dataset)
     done = 0 if state is None else state.iteration
     start = {"event": "start", "iterations": run.config.train.iterations, "from": done}
@@ -147,6 +150,7 @@ def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]
     if state is not None and state.finished:
         count = len(state.tensors["gaussians.means"])
         progress({"event": "trained", "gaussians": count, "text": "already finished"})
+        request.workers.broadcast(None)
         return run
     kept = f"continue with: {resume_command}"
     if replaces:
@@ -161,8 +165,9 @@ def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]
         found = _found_masks(dataset, run.config, state, progress)
         note = memory.note(dataset, run.config.data.memory)
         progress({"event": "prepare", "text": f"images, objects, background{note}"})
-        trainer = Trainer(dataset, run.config, found)
-        held_out = _held_out_psnr(trainer)
+        request.workers.broadcast((run.config, found, state))
+        trainer = Trainer(dataset, run.config, found, request.workers)
+        held_out = view_psnr.configured(trainer)
     if replaces:
         run = run_folder.create_run(folder, dataset, request.config)
     if state is not None:
@@ -279,14 +284,6 @@ def take_step(trainer: Trainer, decision: int | None, progress: Progress) -> Non
         residual_trial.decide(trainer, progress)
 
 
-def _held_out_psnr(trainer: Trainer) -> view_psnr.HeldOutPsnr | None:
-    """Return the measurement on held-out views; None if there are none or ``train.probe_every`` is 0."""
-    section = trainer.config.train
-    if section.probe_every == 0 or not trainer.dataset.val:
-        return None
-    return view_psnr.HeldOutPsnr(trainer, section.probe_views)
-
-
 def _complete(session: _Session) -> None:
     """Take the remaining steps, and store the final state with labels and identities."""
     trainer = session.trainer
@@ -322,7 +319,7 @@ def _optimise(session: _Session) -> None:
                     event["val_psnr"] = held_out.measure()
                 steps.append(event)
                 session.progress(event)
-            stop = bool(asked)
+            stop = trainer.workers.any(bool(asked))
             if trainer.iteration % section.checkpoint_every == 0 or stop or trainer.done:
                 _save(session, finished=False)
                 session.curves.update()

@@ -46,6 +46,7 @@ from .representations.representation import FIELD
 from .running_loss import CHECK_EVERY, RunningLoss, require_finite_state, require_finite_step
 from .step_graphs import StepInputs
 from .targets import Targets
+from .workers import ALONE, Workers
 
 MAX_CAMERAS = 256  # maximum number of cameras in tests of visibility
 FREEZE_EVERY = 100  # steps between updates of the frozen Gaussians
@@ -58,6 +59,7 @@ class Trainer:
         dataset: The data set.
         config: The run's configuration.
         discovered_masks: Masks of the training views for the initialisation, if the data set has none.
+        workers: Processes that take the same steps.
 
     Raises:
         DatasetError: The training split is empty or cannot be read, or no Gaussian can be placed.
@@ -68,7 +70,10 @@ class Trainer:
         dataset: Dataset,
         config: Config,
         discovered_masks: Sequence[np.ndarray] | None = None,
+        workers: Workers = ALONE,
     ):
+        workers.check_batch(config.train.batch)
+        self.workers = workers
         torch.set_num_threads(config.train.threads)
         self.dataset = dataset
         device = devices.select(config.train.device)
@@ -176,8 +181,10 @@ class Trainer:
         if self.iteration % FREEZE_EVERY == 0 or len(self.frozen) != len(self.gaussians):
             # The depth of background that only one camera sees is not determined.
             self.frozen = densifier.seen_by_one_camera(self.gaussians, self.distinct_cameras)
-        batch = [self._inputs(index) for index in drawn]
-        if len(batch) > 1:
+        # All processes draw the random numbers of all views.
+        paths = [(index, self.motion.path(self.views[index].t, self.generator)) for index in drawn]
+        batch = [StepInputs(k, self.views[k], path, self.targets.of(k)) for k, path in self.workers.share(paths)]
+        if len(drawn) > 1:
             loss = view_batch.update(self, batch, place)
         elif self._graphs.take(batch[0]):
             loss = self._graphs.step(batch[0])
@@ -189,11 +196,6 @@ class Trainer:
         self._loss.add(loss)
         self._maintain()
         return loss
-
-    def _inputs(self, index: int) -> StepInputs:
-        """Return the inputs of a view, with the numbers that it draws."""
-        view = self.views[index]
-        return StepInputs(index, view, self.motion.path(view.t, self.generator), self.targets.of(index))
 
     def compare(
         self, inputs: StepInputs, stats: RasterStats, place: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..errors import TrainingError
 from ..raster import RasterStats
 from ..scene.cameras import Camera
 from . import devices, running_loss
@@ -34,6 +36,15 @@ class Drawn:
     stats: RasterStats
     correction: np.ndarray | None
 
+    def to(self, device: torch.device | str) -> Drawn:
+        """Return the result with its tensors on a device."""
+        found = RasterStats()
+        found.visible, found.radii, found.grad_norm = (
+            torch.as_tensor(values).to(device)
+            for values in (self.stats.visible, self.stats.radii, self.stats.grad_norm)
+        )
+        return dataclasses.replace(self, loss=self.loss.to(device), stats=found)
+
 
 def update(trainer: Any, batch: Sequence[StepInputs], place: str) -> Tensor:
     """Draw views, update all parameters by the mean of the gradients, and return the mean loss.
@@ -43,15 +54,16 @@ def update(trainer: Any, batch: Sequence[StepInputs], place: str) -> Tensor:
 
     Args:
         trainer: The `trainer.Trainer`, which imports this module.
-        batch: Inputs of the views.
+        batch: Inputs of the views that this process draws.
         place: Step and views, for messages.
     """
     trainer.optimizer.zero_grad(set_to_none=True)
-    drawn = [_draw(trainer, inputs, place) for inputs in batch]
+    drawn = _of_all(trainer, [_draw(trainer, inputs, place) for inputs in batch], place)
     parameters = [p for group in trainer.optimizer.param_groups for p in group["params"]]
+    trainer.workers.add_gradients(parameters)
     for parameter in parameters:
         if parameter.grad is not None:
-            parameter.grad /= len(batch)
+            parameter.grad /= len(drawn)
     penalties = [term for term in trainer.penalties() if term is not None]
     if penalties:
         torch.stack(penalties).sum().backward()
@@ -64,6 +76,25 @@ def update(trainer: Any, batch: Sequence[StepInputs], place: str) -> Tensor:
     for one in drawn:
         trainer.densifier.observe(one.stats, one.camera)
     return loss
+
+
+def _of_all(trainer: Any, drawn: Sequence[Drawn], place: str) -> list[Drawn]:
+    """Return the results of the processes of the run in the order of the views, on the device of this process.
+
+    Raises:
+        TrainingError: The processes have different Gaussians.
+    """
+    if trainer.workers.count == 1:
+        return list(drawn)
+    means = trainer.gaussians.means.detach()
+    state = len(means), float(means.sum(dtype=torch.float64))
+    found = trainer.workers.gather([(state, one.to("cpu")) for one in drawn])
+    if len({state for state, _ in found}) > 1:
+        raise TrainingError(
+            f"{place}: the processes of this run have different Gaussians; the last checkpoint is kept. Remedy: give "
+            "all processes the same files, packages and type of processor or GPU, and repeat the command with --resume"
+        )
+    return [one.to(trainer.device) for _, one in found]
 
 
 def _draw(trainer: Any, inputs: StepInputs, place: str) -> Drawn:

@@ -54,6 +54,14 @@ class HeldOutPsnr:
         return float(np.mean(found))
 
 
+def configured(trainer: Trainer) -> HeldOutPsnr | None:
+    """Return the measurement on held-out views; None if there are none or ``train.probe_every`` is 0."""
+    section = trainer.config.train
+    if section.probe_every == 0 or not trainer.dataset.val:
+        return None
+    return HeldOutPsnr(trainer, section.probe_views)
+
+
 def training_psnr(
     dataset: datasets.Dataset, behind: np.ndarray | None, draw: Callable[[datasets.View], np.ndarray]
 ) -> float:

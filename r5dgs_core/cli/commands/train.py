@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ... import terminal
-from .. import inputs, options
+from ... import errors, terminal
+from .. import exit_status, inputs, options
+from ..exit_status import ExitStatus
+
+if TYPE_CHECKING:
+    from ...train.workers import Workers
 
 NAME = "train"
 SHORT = "train on a data set and write a run folder"
@@ -25,13 +31,49 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     options.add_training(p)
 
 
-def run(args: argparse.Namespace) -> None:
-    """Run the command."""
+def run(args: argparse.Namespace) -> ExitStatus | None:
+    """Run the command, in this process or together with others that ``torch.distributed.run`` has started."""
     given = options.training(args)
     if args.masks is not None:
         masks = args.masks if args.masks == "none" else Path(args.masks).resolve()
         given["overrides"].append(f"data.masks={masks}")
-    run_train(args.data, args.out, **given)
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or "RANK" not in os.environ:
+        run_train(args.data, args.out, **given)
+        return None
+    from ...train import workers
+
+    group = workers.ALONE
+    try:
+        with workers.joined() as group:
+            run_together(args.data, args.out, group, **given)
+    except (errors.R5dgsError, KeyboardInterrupt) as error:
+        if group.explains(error):
+            raise
+        return exit_status.status_of(error)
+    return None
+
+
+def run_together(data: Path, out: Path, group: Workers, **given: Any) -> None:
+    """Train a run folder with other processes: lead them (see `run_train`), or take the steps of the leading one.
+
+    Raises:
+        UsageError: The processes are restarted without continuing the run.
+        ConfigError: All processes would use the same GPU.
+    """
+    from ...raster import thread_pool
+    from ...train import follow, workers
+
+    if workers.may_restart() and not given["resume"]:
+        raise errors.UsageError("--max-restarts: add --resume, so that a restart continues from the last checkpoint")
+    if ":" in (given["device"] or ""):
+        raise errors.ConfigError(f"--device {given['device']}: each process takes a GPU of its own; use --device cuda")
+    if given["threads"] is None and "NUMBA_NUM_THREADS" not in os.environ:
+        given["threads"] = max(1, thread_pool.threads() // workers.on_this_machine())
+    if group.leads:
+        run_train(data, out, **given, workers=group)
+    else:
+        options.use_threads(given["threads"])
+        follow.follow(data, group)
 
 
 def run_train(
@@ -46,19 +88,30 @@ def run_train(
     device: str | None = None,
     threads: int | None = None,
     progress_kind: str,
+    workers: Workers | None = None,
 ) -> None:
     """Train a run folder from a data set (see `train.run.train`), and name objects whose motion is not predictable."""
-    from ...progress import make
-
-    settings = options.training_settings(out, config_path, overrides, preset=preset, resume=resume)
+    count = 1 if workers is None else workers.count
+    settings = options.training_settings(out, config_path, overrides, preset=preset, resume=resume, processes=count)
     inputs.check_dataset(data)
     from ...bake import quick_fit
+    from ...progress import make
     from ...scene import camera_correction, predictability
     from ...train import interrupt, run
+    from ...train.workers import ALONE
 
     options.use_threads(threads)
     with make(progress_kind) as progress:
-        trained = run.train(data, out, settings, resume=resume, overwrite=overwrite, device=device, progress=progress)
+        trained = run.train(
+            data,
+            out,
+            settings,
+            resume=resume,
+            overwrite=overwrite,
+            device=device,
+            progress=progress,
+            workers=workers or ALONE,
+        )
         with interrupt.at_once(f"{out} is trained; stopped while its motion was fitted"):
             progress({"event": "prepare", "text": "motion past the last observed time"})
             scene = quick_fit.scene_of(trained)

@@ -18,7 +18,8 @@ class TrainSection:
 
     Attributes:
         iterations: Optimisation steps.
-        batch: Views of a step, which moves along the mean of their gradients. A step takes as many times longer.
+        batch: Views of a step, which moves along the mean of their gradients. A step takes as many times longer. It
+            counts the views of all processes of a run.
         seed: Seed of all random draws.
         representation: Motion representation: ``tracks`` (one SE(3) track per object) or ``field`` (deformation field
             and TRD, as in the paper).
