@@ -83,6 +83,7 @@ ALLOWED = {
     },
     "association": {"scene", "data", "raster", "playback", "render", "masks"},
     "bench": {"terminal", "progress", "scene", "data", "config", "playback", "render", "evaluation", "train", "bake"},
+    "batch": {"config", "train", "bench"},
     "error_vs_time": {
         "motion",
         "terminal",
@@ -122,12 +123,26 @@ ALLOWED = {
         "stability",
         "association",
         "bench",
+        "batch",
         "error_vs_time",
     },
 }
 # Commands that import numpy or torch.
 COMMANDS = (
-    *("associate", "bake", "bench", "demo", "evaluate", "export", "import_run", "info", "lookup", "masks", "name"),
+    *(
+        "associate",
+        "bake",
+        "batch",
+        "bench",
+        "demo",
+        "evaluate",
+        "export",
+        "import_run",
+        "info",
+        "lookup",
+        "masks",
+        "name",
+    ),
     *("extrapolate", "objects", "prepare", "query", "render", "report", "train", "view", "warm_up"),
 )
 # Modules that may import modules of the project inside functions: the command line and the public functions, which

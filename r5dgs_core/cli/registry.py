@@ -9,7 +9,7 @@ from typing import Protocol
 from .exit_status import ExitStatus
 
 MODULES = (  # modules of `commands`
-    *("demo", "prepare", "train", "masks", "associate", "bake", "import_run", "evaluate", "report", "bench"),
+    *("demo", "prepare", "train", "masks", "associate", "bake", "import_run", "evaluate", "report", "bench", "batch"),
     *(
         "extrapolate",
         "export",

@@ -1,0 +1,86 @@
+"""Job of one capture: train, bake, evaluate. A job that starts again continues."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .. import atomic_files, strict_json
+from ..bench import process
+from ..errors import CheckpointError, R5dgsError, TrainingError
+from ..train import checkpoint, run_folder
+from .captures import Capture
+
+
+@dataclass(frozen=True)
+class CaptureJob:
+    """Callable that a job executes. Its files are ``NAME`` (run folder), ``NAME.r5dgs``, ``NAME.json``, ``NAME.log``.
+
+    Attributes:
+        capture: The capture.
+        out: Output folder.
+        threads: Threads of the kernels; None for all cores of the job.
+    """
+
+    capture: Capture
+    out: Path
+    threads: int | None = None
+
+    def __call__(self) -> dict[str, Any]:
+        """Finish the capture; return its ``evaluation``, or the ``failure`` in one line."""
+        try:
+            return {"evaluation": self._finish()}
+        except R5dgsError as error:
+            return {"failure": str(error)}
+
+    def _finish(self) -> dict[str, Any]:
+        run, scene = self.path(""), self.path(".r5dgs")
+        if not self.is_trained():
+            given = [*self.capture.arguments, "--device", self.capture.device]
+            if (run / run_folder.RUN_FILE).exists():
+                given.append("--resume")
+            self._command("train", str(self.capture.data), "--out", str(run), *given)
+        made = self._stamp()
+        if self.result().get("checkpoint") != made:
+            self._command("bake", str(run), "--out", str(scene))
+            evaluation = self.path(".evaluation.json")
+            self._command("evaluate", str(scene), "--data", str(self.capture.data), "--json", str(evaluation))
+            found = strict_json.read(evaluation, CheckpointError, "repeat the command")
+            content = json.dumps({"checkpoint": made, "evaluation": found}, indent=2)
+            atomic_files.write(self.path(".json"), content.encode())
+        return self.result()["evaluation"]
+
+    def checkpoint(self) -> Any:
+        """Return the job that continues after preemption; submitit calls it. Training resumes from its checkpoint."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(dataclasses.replace(self))
+
+    def path(self, suffix: str) -> Path:
+        """Return the path of a file of the capture."""
+        return self.out / (self.capture.name + suffix)
+
+    def is_trained(self) -> bool:
+        """Return True if the training is finished."""
+        run = self.path("")
+        return checkpoint.newest_file(run) is not None and checkpoint.load(run).finished
+
+    def result(self) -> dict[str, Any]:
+        """Return the content of the result file; empty if there is none."""
+        path = self.path(".json")
+        return strict_json.read(path, CheckpointError, "remove it to evaluate again") if path.exists() else {}
+
+    def _stamp(self) -> list[int]:
+        """Return size and time of the checkpoint, which identify it."""
+        newest = checkpoint.newest_file(self.path(""))
+        assert newest is not None  # the run is trained
+        return [newest.stat().st_size, newest.stat().st_mtime_ns]
+
+    def _command(self, *arguments: str) -> None:
+        threads = () if self.threads is None else ("--threads", str(self.threads))
+        ended = process.train([*arguments, *threads], self.path(".log"), lambda event: None, lambda ended: None)
+        if ended.status != 0:
+            raise TrainingError(f"r5dgs {arguments[0]}: {process.reason(ended)}")

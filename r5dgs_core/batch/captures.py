@@ -1,0 +1,110 @@
+"""Files ``captures.toml``: data sets, the settings of their training, and the resources of their jobs."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..config import config as configs
+from ..errors import ConfigError
+
+_KEYS: dict[str, type] = {"data": str, "name": str, "preset": str, "config": str, "set": list, "device": str}
+_DEFAULTS = tuple(key for key in _KEYS if key not in ("data", "name"))
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One data set of a batch.
+
+    Attributes:
+        name: Name in the table; also that of its files in the output folder.
+        data: The data set.
+        arguments: Arguments of ``r5dgs train`` that choose its settings.
+        device: Device of training.
+    """
+
+    name: str
+    data: Path
+    arguments: tuple[str, ...]
+    device: str
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Content of a file.
+
+    Attributes:
+        captures: The captures, with different names.
+        resources: Parameters of submitit, such as ``slurm_partition``.
+    """
+
+    captures: tuple[Capture, ...]
+    resources: dict[str, Any]
+
+
+def read(path: Path) -> Batch:
+    """Read a file; relative paths in it are relative to its folder.
+
+    Raises:
+        ConfigError: The file cannot be read, or a key or value is invalid.
+    """
+    try:
+        found = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not valid TOML in UTF-8: {error}") from None
+    _check_keys(f"{path}", found, {"capture": list, "defaults": dict, "cluster": dict})
+    _check_keys(f"{path}: defaults", found.get("defaults", {}), {key: _KEYS[key] for key in _DEFAULTS})
+    tables = found.get("capture", [])
+    if not tables:
+        raise ConfigError(f"{path}: expected a table [[capture]] with 'data' for each capture, found none")
+    captures: dict[str, Capture] = {}
+    for number, table in enumerate(tables, 1):
+        place = f"{path}: capture {number}"
+        if not isinstance(table, dict):
+            raise ConfigError(f"{place}: expected a table [[capture]], found {table!r}")
+        _check_keys(place, table, _KEYS)
+        one = _capture(place, path.parent, found.get("defaults", {}), table)
+        if one.name in captures:
+            raise ConfigError(f"{place}: another capture is called {one.name}, too; give one of them another 'name'")
+        captures[one.name] = one
+    return Batch(tuple(captures.values()), found.get("cluster", {}))
+
+
+def _check_keys(place: str, table: dict[str, Any], kinds: dict[str, type]) -> None:
+    for key, value in table.items():
+        if key not in kinds:
+            raise ConfigError(f"{place}: unknown key {key!r}; expected one of {', '.join(kinds)}")
+        if not isinstance(value, kinds[key]):
+            expected = {str: "text", list: "a list", dict: "a table"}[kinds[key]]
+            raise ConfigError(f"{place}: {key}: expected {expected}, found {value!r}")
+
+
+def _capture(place: str, folder: Path, defaults: dict[str, Any], table: dict[str, Any]) -> Capture:
+    """Return the capture of a table; its settings are added to the defaults."""
+    if "data" not in table:
+        raise ConfigError(f"{place}: expected the key 'data', the folder of a data set")
+    data = folder / table["data"]
+    if not data.is_dir():
+        raise ConfigError(f"{place}: data: {data} is not a folder")
+    given = {**defaults, **table}
+    settings = [*defaults.get("set", []), *table.get("set", [])]
+    if not all(isinstance(text, str) for text in settings):
+        raise ConfigError(f"{place}: set: expected texts such as 'train.iterations=6000', found {settings!r}")
+    config = folder / given["config"] if "config" in given else None
+    try:
+        loaded = configs.load(config, tuple(settings), given.get("preset"))
+        loaded.replace(**{"train.device": given.get("device", "auto")})
+    except ConfigError as error:
+        raise ConfigError(f"{place}: {error}") from None
+    name = table.get("name", data.resolve().name)
+    if not re.fullmatch(r"[\w.-]*\w[\w.-]*", name):
+        raise ConfigError(f"{place}: name: expected letters, digits, '_', '-' and '.', found {name!r}")
+    arguments = ["--preset", given["preset"]] if "preset" in given else []
+    arguments += ["--config", str(config.resolve())] if config is not None else []
+    arguments += [text for setting in settings for text in ("--set", setting)]
+    return Capture(name, data.resolve(), tuple(arguments), given.get("device", "auto"))

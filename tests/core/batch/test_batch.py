@@ -1,0 +1,43 @@
+"""The command ``r5dgs batch`` trains, bakes and evaluates, and continues what has begun."""
+
+import json
+
+import pytest
+
+from r5dgs_core.cli import main
+from r5dgs_core.scene import scene_file
+from r5dgs_core.train import checkpoint
+from tests.support import tiny_datasets
+from tests.support.command_line import complaint
+
+pytestmark = pytest.mark.heavy
+
+SHORT = (*tiny_datasets.SETTINGS, "train.iterations=20", "train.probe_every=0", "identity.iterations=2")
+
+
+def write(path, data, *settings):
+    path.write_text(f"[defaults]\nset = {json.dumps([*SHORT, *settings])}\n[[capture]]\ndata = {json.dumps(str(data))}")
+    return path
+
+
+def test_a_fault_in_the_file_is_one_error(tmp_path, capsys):
+    path = tmp_path / "captures.toml"
+    path.write_text("[[capture]]\ndata = 'nowhere'\n")
+    assert "nowhere is not a folder" in complaint(capsys, "batch", str(path), "--out", str(tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_batch_ends_with_scene_and_figures_and_begins_nothing_twice(tiny, tmp_path, capsys):
+    path, out = write(tmp_path / "captures.toml", tiny.root), tmp_path / "out"
+    command = ["batch", str(path), "--out", str(out), "--progress", "none", "--threads", "1"]
+    assert main.main(command) == 0
+    name = tiny.root.name
+    assert checkpoint.load(out / name).iteration == 20
+    assert len(scene_file.read(out / f"{name}.r5dgs").objects) == 3
+    result = json.loads((out / "batch.json").read_text())
+    assert result["captures"][name]["splits"]["val"]["rigid"]["psnr"] > 10 and result["failures"] == {}
+    assert name in capsys.readouterr().out
+    stamp = (out / f"{name}.r5dgs").stat().st_mtime_ns
+    assert main.main(command) == 0
+    assert (out / f"{name}.r5dgs").stat().st_mtime_ns == stamp
