@@ -7,17 +7,35 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from .. import atomic_files, extras
 from ..errors import BackendError, ConfigError, TrainingError
 from . import table
-from .capture_job import CaptureJob
 
 RESULT_FILE, TABLE_FILE, JOBS_FOLDER = "batch.json", "table.md", "jobs"
 CLUSTERS = ("local", "slurm")
 LIMIT_MIN = 7 * 24 * 60  # maximum duration of a local job by default, minutes; Slurm has limits of its own
 POLL_S = 1.0
+
+
+class Job(Protocol):
+    """Interface of jobs; see `capture_job.CaptureJob`."""
+
+    @property
+    def capture(self) -> Any:
+        """Return the capture, which has a ``name``."""
+        ...
+
+    @property
+    def out(self) -> Path:
+        """Return the output folder."""
+        ...
+
+    def __call__(self) -> dict[str, Any]:
+        """Execute the job; return its ``evaluation`` or ``failure``."""
+        ...
+
 
 Progress = Callable[[dict[str, Any]], None]
 
@@ -48,7 +66,7 @@ def executor(cluster: str, folder: Path, resources: dict[str, Any]) -> Any:
     return found
 
 
-def run(jobs: Sequence[CaptureJob], start: Any, *, at_once: int, retries: int, progress: Progress) -> dict[str, Any]:
+def run(jobs: Sequence[Job], start: Any, *, at_once: int, retries: int, progress: Progress) -> dict[str, Any]:
     """Execute jobs, write the table after each of them, and return the content of `RESULT_FILE`.
 
     Args:
@@ -63,10 +81,11 @@ def run(jobs: Sequence[CaptureJob], start: Any, *, at_once: int, retries: int, p
         KeyboardInterrupt: The user stopped; the jobs are cancelled, and the same call continues.
     """
     waiting, tries = list(jobs), {job.capture.name: 0 for job in jobs}
-    running: dict[str, tuple[CaptureJob, Any]] = {}
+    running: dict[str, tuple[Job, Any]] = {}
     evaluations: dict[str, Any] = {}
     failures: dict[str, str] = {}
     out = jobs[0].out
+    result: dict[str, Any] = {}
     try:
         while waiting or running:
             while waiting and len(running) < at_once:
