@@ -26,6 +26,8 @@ from .representation import FIELD, TRACKS, Representation
 
 ROUGHNESS_EVERY = 4  # steps between evaluations of the roughness; its weight is multiplied by this
 REBASE_EVERY = 100  # steps
+DRIFT = 0.15  # distance of a track from the path of the masks above which it has drifted, radii of the object
+MIN_KNOTS = 3  # minimum number of knots that determine the usual offset of a track from the path
 
 
 @dataclass(frozen=True)
@@ -203,15 +205,32 @@ class TracksRepresentation(Representation):
                 rotations.multiply(quats[:, near], rotations.conjugate(quats[:, next_near]))
             )
         quats[:, knot] = rotations.multiply(rotations.rotvecs_to_quats(ratio * turns), quats[:, near])
-        for row, (path, measured, gone) in enumerate(
-            zip(self._places.centers, self._places.measured, self._absent, strict=True), start=1
-        ):
+        for row, (measured, gone) in enumerate(zip(self._places.measured, self._absent, strict=True), start=1):
             beyond = not (measured[: knot + 1] if towards > 0 else measured[knot:]).any()
             if beyond and steady and not gone[[knot, near]].any():
                 shifts[row, knot] = shifts[row, near] + ratio * (shifts[row, near] - shifts[row, next_near])
             else:
-                step = torch.from_numpy(path[knot] - path[near]).float().to(shifts.device, non_blocking=True)
-                shifts[row, knot] = shifts[row, near] + step
+                shifts[row, knot] = self._displacement(row, knot, near, entered)
+
+    def _displacement(self, row: int, knot: int, near: int, entered: tuple[int, int]) -> Tensor:
+        """Return the initial displacement of a body at a knot: that of a neighbour, and the step of the path. [3]
+
+        If the neighbour has drifted from the path, the displacement follows the path at the usual offset instead;
+        otherwise each of a series of knots would begin with the drift of all previous ones.
+        """
+        shifts, path = self.tracks.params["translations"], self._places.centers[row - 1]
+        start = shifts[row, near] + torch.from_numpy(path[knot] - path[near]).float().to(
+            shifts.device, non_blocking=True
+        )
+        measured = self._places.measured[row - 1]
+        used = entered[0] + np.flatnonzero(measured[entered[0] : entered[1] + 1])
+        if not measured[[near, knot]].all() or len(used) < MIN_KNOTS:
+            return start
+        offsets = shifts[row].cpu().numpy() - path
+        usual = np.median(offsets[used], axis=0)
+        if np.linalg.norm(offsets[near] - usual) <= DRIFT * self._places.radii[row - 1]:
+            return start
+        return torch.from_numpy(path[knot] + usual).float().to(shifts.device)
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
         """Fold learned rotations into the base rotations every `REBASE_EVERY` steps; end the shading of a ball.

@@ -90,6 +90,19 @@ def test_a_body_that_returns_is_placed_by_its_masks_not_by_extrapolation():
     np.testing.assert_allclose(found - found[3], path - path[3], atol=1e-5)
 
 
+@pytest.mark.parametrize("drift, kept", [(0.9, 1.0), (1.1, 0.0)])
+def test_a_body_that_has_drifted_from_its_masks_returns_to_them(drift, kept):
+    motion, radius = make([True] * 7), 1.0
+    set_knots(motion, range(1, 6))
+    offset, away = np.array([0.2, 0.1, -0.3]), np.array([0, 0, drift * tracks_representation.DRIFT * radius])
+    with torch.no_grad():
+        motion.tracks.params["translations"][1] += torch.from_numpy(offset).float()
+        motion.tracks.params["translations"][1, 5] += torch.from_numpy(away).float()
+    motion.enter(6, -1, (1, 5))
+    found = motion.tracks.params["translations"][1, 6].detach().numpy()
+    np.testing.assert_allclose(found, truth(TIMES[6])[0] + offset + kept * away, atol=1e-5)
+
+
 def test_velocity_continues_without_masks_and_follows_masks_if_absent():
     wrong = np.tile([0.0, 0.0, 0.0], (7, 1))  # the masks' path stands still
     for absent, expected in (([0] * 7, truth(TIMES[6])[0]), ([0, 0, 0, 0, 0, 1, 1], truth(TIMES[4])[0])):
