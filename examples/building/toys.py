@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import bpy
 
@@ -99,3 +100,14 @@ def vase(name: str) -> bpy.types.Object:
         return 2 if row in (3, 7) else 1 if row in (9, 10) else 0
 
     return shapes.lathe(name, profile, skins, material_at)
+
+
+def crate(name: str, size: Sequence[float]) -> bpy.types.Object:
+    """A box about its origin, with speckles of a different colour on each face."""
+    colors = ((0.70, 0.06, 0.08), (0.06, 0.24, 0.62), (0.82, 0.55, 0.04), (0.10, 0.45, 0.20), (0.45, 0.10, 0.50))
+    pairs = [(color, [0.35 * part + 0.35 for part in color]) for color in (*colors, (0.78, 0.74, 0.66))]
+    skins = [
+        materials.speckled(f"{name} face {k}", low, high, 3.0 / max(size), sharp=0.85)
+        for k, (low, high) in enumerate(pairs)
+    ]
+    return shapes.box(name, size, skins)

@@ -1,0 +1,1 @@
+"""Scenes of bodies that collide, simulated by Blender's rigid bodies, with parameters drawn by a seed."""
