@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.train import losses, step_graphs
+from r5dgs_core.train import finish, losses, step_graphs
 from r5dgs_core.train.trainer import Trainer
 from tests.support import pretended_device, tiny_datasets
 
@@ -60,6 +60,22 @@ def test_a_run_on_a_device_is_that_of_the_cpu_and_does_not_wait(tiny, name):
     again = 1 if name == "field" else 0  # it looks up the moved Gaussians after they have changed
     for step, found in enumerate(waits, start=2):
         assert found.total() <= {ROUND: 3, ROUND + 1: again}.get(step, 0), (step, found)
+
+
+@pytest.mark.slow
+def test_labels_and_identities_of_the_end_are_those_of_the_cpu(tiny):
+    settings = ("identity.iterations=6", "train.log_every=6")
+    with pretended_device.twins():
+        plain, _ = run(tiny, settings, "cpu")
+        expected = finish.final_tensors(plain, lambda event: None)
+    with pretended_device.mode():
+        there, _ = run(tiny, settings, pretended_device.DEVICE)
+        with pretended_device.record() as waits:
+            found = finish.final_tensors(there, lambda event: None)
+    assert {"labels", "identities", "classifier.weight"} <= set(expected) and set(found) == set(expected)
+    for key, value in expected.items():
+        assert torch.equal(found[key], value), key
+    assert not [place for place, count in waits.items() if "identity" in place and count >= 6]  # not in each step
 
 
 GRAPHS = {
