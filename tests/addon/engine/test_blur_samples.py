@@ -207,6 +207,7 @@ def added(kind, sharp, blurred):
 
 
 @pytest.mark.heavy
+@pytest.mark.default_cases("shutter")
 @pytest.mark.parametrize("kind", ("lens", "shutter"))
 def test_blur_is_as_wide_as_in_cycles(blender, dots, tmp_path, kind):
     scene, found = blender.context.scene, {}
@@ -224,6 +225,7 @@ def test_blur_is_as_wide_as_in_cycles(blender, dots, tmp_path, kind):
 
 
 @pytest.mark.heavy
+@pytest.mark.default_cases("shutter")
 @pytest.mark.parametrize("kind", ("lens", "shutter"))
 def test_meshes_and_gaussians_of_a_merged_picture_are_blurred_alike(blender, dots, tmp_path, kind):
     scene = blender.context.scene

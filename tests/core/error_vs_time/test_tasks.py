@@ -366,6 +366,7 @@ def test_a_report_without_any_row_is_still_written(scene, tmp_path):
     assert nothing["rows"] == [] and len(error_vs_time_report.write(nothing, tmp_path)) == 4
 
 
+@pytest.mark.slow
 def test_the_command_reports_a_scene_file(scene, data, tmp_path, capsys):
     path = tmp_path / "s.r5dgs"
     scene_file.write(scene, path)

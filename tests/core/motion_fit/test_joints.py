@@ -38,6 +38,7 @@ def test_exact_joints_are_found_exactly(kind):
         assert np.ptp(found.joint.limits) == pytest.approx(0.6 * 0.75 - 0.3 * 0.75**2)
 
 
+@pytest.mark.default_cases("hinge", "slider", "free")
 @pytest.mark.parametrize("kind", [*joints.KINDS, "free"])
 def test_the_kind_is_found_in_noise(kind):
     for seed in range(4):

@@ -60,6 +60,7 @@ def test_a_repair_leaves_other_bodies_alone(trainer):
     assert all(torch.equal(after[name], before[name]) for name in before if not name.startswith("tracks."))
 
 
+@pytest.mark.slow
 def test_a_body_that_no_pose_explains_keeps_its_bits(trainer, monkeypatch):
     slip(trainer, BRICK, (3,), (0, 0, 1), 40)
     before = trainer.state().tensors
