@@ -10,7 +10,7 @@ from typing import Any
 
 from .. import atomic_files, strict_json
 from ..bench import process
-from ..errors import CheckpointError, R5dgsError, TrainingError
+from ..errors import CheckpointError, ConfigError, R5dgsError, TrainingError
 from ..train import checkpoint, run_folder
 from .captures import Capture
 
@@ -38,8 +38,10 @@ class CaptureJob:
 
     def _finish(self) -> dict[str, Any]:
         run, scene = self.path(""), self.path(".r5dgs")
-        if not self.is_trained():
-            given = [*self.capture.arguments, "--device", self.capture.device]
+        if self.is_trained():
+            self._refuse_other_settings()
+        else:
+            given = [*self.capture.arguments, "--device", self.capture.config.train.device]
             if (run / run_folder.RUN_FILE).exists():
                 given.append("--resume")
             self._command("train", str(self.capture.data), "--out", str(run), *given)
@@ -72,6 +74,16 @@ class CaptureJob:
         """Return the content of the result file; empty if there is none."""
         path = self.path(".json")
         return strict_json.read(path, CheckpointError, "remove it to evaluate again") if path.exists() else {}
+
+    def _refuse_other_settings(self) -> None:
+        """Raise `ConfigError` if the capture was trained with other settings; the device may differ."""
+        own = run_folder.open_run(self.path("")).config
+        changed = own.differences(self.capture.config.replace(**{"train.device": own.train.device}))
+        if changed:
+            raise ConfigError(
+                f"{self.path('')}: was trained with other values of {', '.join(changed)}; choose another --out for "
+                "other settings"
+            )
 
     def _stamp(self) -> list[int]:
         """Return size and time of the checkpoint, which identify it."""

@@ -23,13 +23,13 @@ class Capture:
         name: Name in the table; also that of its files in the output folder.
         data: The data set.
         arguments: Arguments of ``r5dgs train`` that choose its settings.
-        device: Device of training.
+        config: The settings, with the device of training.
     """
 
     name: str
     data: Path
     arguments: tuple[str, ...]
-    device: str
+    config: configs.Config
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def _capture(place: str, folder: Path, defaults: dict[str, Any], table: dict[str
     config = folder / given["config"] if "config" in given else None
     try:
         loaded = configs.load(config, tuple(settings), given.get("preset"))
-        loaded.replace(**{"train.device": given.get("device", "auto")})
+        loaded = loaded.replace(**{"train.device": given.get("device", "auto")})
     except ConfigError as error:
         raise ConfigError(f"{place}: {error}") from None
     name = table.get("name", data.resolve().name)
@@ -107,4 +107,4 @@ def _capture(place: str, folder: Path, defaults: dict[str, Any], table: dict[str
     arguments = ["--preset", given["preset"]] if "preset" in given else []
     arguments += ["--config", str(config.resolve())] if config is not None else []
     arguments += [text for setting in settings for text in ("--set", setting)]
-    return Capture(name, data.resolve(), tuple(arguments), given.get("device", "auto"))
+    return Capture(name, data.resolve(), tuple(arguments), loaded)

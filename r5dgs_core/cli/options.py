@@ -192,10 +192,10 @@ def _refuse_changes(folder: Path, given: config.Config, overrides: Sequence[str]
     """Raise UsageError if a configuration differs from that of a run; a run may be resumed on another device."""
     from ..train import run_folder
 
-    own, other = run_folder.open_run(folder).config.to_dict(), given.to_dict()
+    own = run_folder.open_run(folder).config
     if not any(text.startswith("train.device=") for text in overrides):
-        other["train"]["device"] = own["train"]["device"]
-    changed = [f"{name}.{key}" for name, keys in own.items() for key in keys if other[name][key] != keys[key]]
+        given = given.replace(**{"train.device": own.train.device})
+    changed = own.differences(given)
     if changed:
         raise errors.UsageError(
             f"--resume continues with the configuration of the run, which has other values of {', '.join(changed)}; "

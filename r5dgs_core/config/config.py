@@ -59,6 +59,11 @@ class Config:
         """Return a copy with some keys changed: ``replace(**{"train.iterations": 100})``."""
         return from_dict(_merge(self.to_dict(), changes))
 
+    def differences(self, other: Config) -> list[str]:
+        """Return the keys whose values differ from those of another configuration, as ``section.key``."""
+        own, others = self.to_dict(), other.to_dict()
+        return [f"{name}.{key}" for name, keys in own.items() for key in keys if others[name][key] != keys[key]]
+
     def override(self, overrides: Sequence[str]) -> Config:
         """Return a copy with ``section.key=value`` overrides applied, as given to ``--set``."""
         return self.replace(**_parsed(overrides))

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from r5dgs_core.cli import main
+from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.scene import scene_file
 from r5dgs_core.train import checkpoint
 from tests.support import tiny_datasets
@@ -41,3 +42,6 @@ def test_a_batch_ends_with_scene_and_figures_and_begins_nothing_twice(tiny, tmp_
     stamp = (out / f"{name}.r5dgs").stat().st_mtime_ns
     assert main.main(command) == 0
     assert (out / f"{name}.r5dgs").stat().st_mtime_ns == stamp
+    write(path, tiny.root, "train.seed=5")
+    assert main.main(command) == ExitStatus.ERROR
+    assert "was trained with other values of train.seed" in (out / "batch.json").read_text()

@@ -35,9 +35,9 @@ def written(tmp_path):
 def test_captures_extend_the_defaults(written):
     batch = captures.read(written(GOOD))
     first, again = batch.captures
-    assert (first.name, first.device, first.data.name) == ("kitchen", "auto", "kitchen")
+    assert (first.name, first.config.train.device, first.data.name) == ("kitchen", "auto", "kitchen")
     assert first.arguments == ("--preset", "fast", "--set", "train.seed=1")
-    assert (again.name, again.device) == ("again", "cpu")
+    assert (again.name, again.config.train.device) == ("again", "cpu")
     assert again.arguments[-4:] == ("--set", "train.seed=1", "--set", "train.seed=2")
     assert batch.resources == {"slurm_partition": "gpu"}
 
