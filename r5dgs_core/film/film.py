@@ -41,6 +41,7 @@ def write(
     scene: Scene,
     settings: Settings,
     *,
+    file: Path | None = None,
     shown: Collection[int] | None = None,
     hidden: Collection[int] | None = None,
     dataset: datasets.Dataset | None = None,
@@ -51,6 +52,7 @@ def write(
     Args:
         scene: The scene.
         settings: Settings that passed `settings.check`.
+        file: File of the scene, whose content tells apart the frames of a folder; only folders need it.
         shown: Ids of the objects to show; None for all.
         hidden: Ids of the objects to leave out with their shadows, or None.
         dataset: Data set whose images are shown beside the picture, relative to the scene's origin, or None.
@@ -65,9 +67,9 @@ def write(
     plan = schedule.make(scene, settings)
     film = _Film(scene, settings, plan, rows, dataset)
     if settings.is_folder:
-        key = {name: repr(value) for name, value in dataclasses.asdict(settings).items() if name not in _SINGLE}
-        chosen = "all" if rows is None else hashlib.sha256(rows.tobytes()).hexdigest()[:16]
-        return _folder(film, {"scene": _digest(scene), **key, "gaussians": chosen}, progress)
+        if file is None:
+            raise ValueError("file: frames in a folder need the file of the scene")
+        return _folder(film, _key(settings, file, rows, dataset), progress)
     if settings.out.exists() and not settings.overwrite:
         raise errors.ConfigError(
             f"{settings.out}: the file exists; replace it with --overwrite, or choose another name"
@@ -93,15 +95,12 @@ def _folder(film: _Film, key: dict[str, str], progress: Progress) -> Result:
         if not shots:
             raise errors.ConfigError(f"--frames {first}:{last}: the film has the frames 1 to {len(film.plan.shots)}")
     frame_folder.create(folder)
+    frame_folder.claim(folder, key, overwrite=settings.overwrite)
     present = [path for shot in shots if (path := frame_folder.path_of(folder, shot.number, settings.suffix)).exists()]
     if present and not (settings.overwrite or settings.share):
         raise errors.ConfigError(
             f"{present[0]}: the file exists; draw only missing frames with --share, or replace all with --overwrite"
         )
-    if settings.share:
-        frame_folder.agree(folder, key)
-    else:
-        frame_folder.replace_settings(folder, key)
     written: list[Path] = []
     filled = frame_folder.fill(folder, shots, settings.suffix, film.draw, share=settings.share)
     for done, (shot, drawn) in enumerate(filled, 1):
@@ -165,12 +164,21 @@ def _rows(scene: Scene, shown: Collection[int] | None, hidden: Collection[int] |
     return rows
 
 
-def _digest(scene: Scene) -> str:
-    """Return a hash of what a scene shows."""
-    made = hashlib.sha256()
-    for values in (scene.gaussians.means, scene.gaussians.sh, scene.gaussians.opacity_logits, scene.tracks.poses):
-        made.update(np.ascontiguousarray(values).tobytes())
-    return made.hexdigest()[:16]
+def _key(settings: Settings, file: Path, rows: np.ndarray | None, dataset: datasets.Dataset | None) -> dict[str, str]:
+    """Return everything that determines the frames of a folder, with hashes of contents."""
+    key = {name: repr(value) for name, value in dataclasses.asdict(settings).items() if name not in _SINGLE}
+    paths = [Path(name) for name in settings.camera if name.lower().endswith(".json")]
+    return {
+        "scene": _digest(file.read_bytes()),
+        **key,
+        "camera_path": " ".join(_digest(path.read_bytes()) for path in paths if path.is_file()),
+        "gaussians": "all" if rows is None else _digest(rows.tobytes()),
+        "beside": "" if dataset is None else dataset.digest,
+    }
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def _event(done: int, total: int) -> dict[str, Any]:

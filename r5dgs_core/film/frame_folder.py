@@ -2,13 +2,15 @@
 
 A process holds a locked placeholder beside a frame while it draws it. The system releases the lock when the process
 ends in any way, so the frames of a process that was killed are drawn by the others. All processes must have the same
-settings: the first one writes them to ``render.json``, the others compare.
+settings: the first one writes them to ``render.json``, the others compare. Frames are removed only from folders that
+have this file.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,6 +21,8 @@ from .. import atomic_files, errors, folder_lock, strict_json
 from .schedule import Shot
 
 SETTINGS = "render.json"
+KEYS = {"scene", "camera", "gaussians"}  # by which the file is known to be of a film
+_FRAME = re.compile(r"frame_\d{4,}\.(png|exr)")
 POLL_S = 0.5  # interval between two checks for frames of other processes
 
 
@@ -68,38 +72,59 @@ def fill(
         waiting = left
 
 
-def agree(folder: Path, settings: dict[str, Any]) -> None:
-    """Write the settings of the frames of a folder, or compare them with those of another process.
+def claim(folder: Path, settings: dict[str, Any], *, overwrite: bool = False) -> None:
+    """Write the settings of the frames of a folder, or compare them with those that it has.
+
+    Args:
+        folder: The folder.
+        settings: Everything that determines the frames, with the keys `KEYS` at least.
+        overwrite: True to remove the frames of other settings.
 
     Raises:
-        ConfigError: The folder has frames with other settings, or cannot be written.
+        ConfigError: The folder has frames with other settings or of another program, or cannot be written.
     """
     path = folder / SETTINGS
-    temporary = folder / f".{SETTINGS}.{secrets.token_hex(8)}"
     try:
-        temporary.write_text(json.dumps(settings, indent=1))
-        try:
-            os.link(temporary, path)  # fails if another process was faster, and never leaves half a file
-        finally:
-            temporary.unlink(missing_ok=True)
-    except FileExistsError:
+        frames = [p for p in folder.iterdir() if _FRAME.fullmatch(p.name) and p.is_file()]
+        if not path.exists():  # after the list of frames: all processes write the settings first
+            if frames:
+                raise errors.ConfigError(
+                    f"{min(frames)}: not a frame of 'r5dgs render' (the folder has no {SETTINGS}); use another folder"
+                )
+            if _create_settings(path, settings):
+                return
         found = strict_json.read(path, errors.ConfigError)
-        other = [key for key in settings if found.get(key) != settings[key]] if isinstance(found, dict) else ["all"]
-        if other:
+        if not (isinstance(found, dict) and found.keys() >= KEYS):
+            raise errors.ConfigError(f"{path}: not the settings of a film; use another folder")
+        other = [key for key in settings | found if found.get(key) != settings.get(key)]
+        if other and not overwrite:
             raise errors.ConfigError(
-                f"--share: {path}: the folder has frames with other settings ({', '.join(other)}); use those, or "
-                "another folder"
-            ) from None
+                f"{path}: the folder has frames with other settings ({', '.join(other)}); use those or another folder, "
+                "or replace all frames with --overwrite"
+            )
+        if other:
+            for frame in frames:
+                frame.unlink(missing_ok=True)
+            atomic_files.write(path, json.dumps(settings, indent=1).encode())
     except OSError as error:
         raise errors.ConfigError(f"--out {folder}: cannot be written ({error})") from error
 
 
-def replace_settings(folder: Path, settings: dict[str, Any]) -> None:
-    """Write the settings of a folder whose frames this process writes alone. Raises ConfigError."""
+def _create_settings(path: Path, settings: dict[str, Any]) -> bool:
+    """Write the settings if there are none yet; returns False if another process was faster."""
+    temporary = path.with_name(f".{SETTINGS}.{secrets.token_hex(8)}")
     try:
-        atomic_files.write(folder / SETTINGS, json.dumps(settings, indent=1).encode())
-    except OSError as error:
-        raise errors.ConfigError(f"--out {folder}: cannot be written ({error})") from error
+        atomic_files.write(temporary, json.dumps(settings, indent=1).encode())
+        os.link(temporary, path)  # fails if the file exists, and never leaves half of it
+    except FileExistsError:
+        return False
+    except OSError:
+        if not temporary.exists():
+            raise
+        os.replace(temporary, path)  # on file systems without hard links
+    finally:
+        temporary.unlink(missing_ok=True)
+    return True
 
 
 def _draw_once(path: Path, shot: Shot, draw: Callable[[Shot, Path], None]) -> bool | None:

@@ -138,7 +138,8 @@ def _render(
     if beside is not None:
         dataset = datasets.read(beside, min_registered=0.0).relative_to(scene.origin)
     with make(progress_kind) as progress:
-        result = film.write(scene, settings, shown=shown, hidden=hidden, dataset=dataset, progress=progress)
+        chosen = {"shown": shown, "hidden": hidden, "dataset": dataset}
+        result = film.write(scene, settings, file=path, **chosen, progress=progress)
         if progress_kind == "json":
             progress({"event": "written", "paths": [str(path) for path in result.paths]})
     if progress_kind != "json":

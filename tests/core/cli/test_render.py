@@ -74,6 +74,31 @@ def test_frames_of_a_range_have_their_numbers_and_missing_ones_are_added(path, t
     assert "--frames 7:9: the film has the frames 1 to 6" in line
 
 
+def test_a_folder_never_mixes_films(tiny, path, scene, tmp_path, capsys):
+    view = datasets.read(tiny.root).train[0]
+    one = dataclasses.replace(scene, cameras=(view.camera,))
+    scene_file.write(one, path)
+    still = ("--out", tmp_path / "f", "--time", "0.5", "--seconds", "0.1", "--size", "16")
+
+    def refused(*arguments):
+        return complaint(capsys, "render", path, *still, "--share", *arguments)
+
+    assert film(path, *still) == 0
+    assert "other settings (beside)" in refused("--beside", tiny.root)
+    scene_file.write(dataclasses.replace(one, background_sh=one.background_sh + 0.1), path)
+    assert "other settings (scene)" in refused()
+    entry = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50}
+    track = {"render_width": 16, "render_height": 16, "fps": 24, "camera_path": [entry] * 3}
+    (tmp_path / "path.json").write_text(json.dumps(track))
+    moving = (*still, "--camera", tmp_path / "path.json")
+    assert film(path, *moving, "--overwrite") == 0
+    track["camera_path"] = [entry | {"fov": 60}] * 3
+    (tmp_path / "path.json").write_text(json.dumps(track))
+    assert "other settings (camera_path)" in refused("--camera", tmp_path / "path.json")
+    assert film(path, *still, "--frames", "1:1", "--overwrite") == 0
+    assert [p.name for p in (tmp_path / "f").glob("frame_*")] == ["frame_0001.png"]
+
+
 def test_layers_are_written_for_each_frame(path, tmp_path):
     given = ("--out", tmp_path / "f", "--time", "0:1", "--seconds", "0.1", "--passes", "depth,cryptomatte")
     assert film(path, *given) == 0

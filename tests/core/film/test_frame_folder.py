@@ -70,12 +70,46 @@ def test_a_frame_of_another_holder_is_waited_for(tmp_path, monkeypatch):
     assert waits == [frame_folder.POLL_S] and (tmp_path / "frame_0001.png").read_text() == "theirs"
 
 
+SETTINGS = {"scene": "0f", "camera": "()", "gaussians": "all", "fps": "24"}
+
+
 def test_processes_must_agree_on_the_settings(tmp_path):
-    frame_folder.agree(tmp_path, {"mode": "rigid", "fps": 24})
-    frame_folder.agree(tmp_path, {"mode": "rigid", "fps": 24})
-    with pytest.raises(errors.ConfigError, match=r"other settings \(fps\)"):
-        frame_folder.agree(tmp_path, {"mode": "rigid", "fps": 30})
+    for _ in range(2):
+        frame_folder.claim(tmp_path, SETTINGS)
+    for other in (SETTINGS | {"fps": "30"}, {key: SETTINGS[key] for key in SETTINGS if key != "fps"}):
+        with pytest.raises(errors.ConfigError, match=r"other settings \(fps\)"):
+            frame_folder.claim(tmp_path, other)
     assert [p.name for p in tmp_path.iterdir()] == [frame_folder.SETTINGS]
+
+
+def names(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_frames_of_other_settings_are_removed_only_on_demand(tmp_path):
+    frame_folder.claim(tmp_path, SETTINGS)
+    own = ["frame_0001.png", "frame_0002.exr", "frame_12345.png"]
+    others = ["frame_0001.jpg", "frame_001.png", "my_frame_0001.png", "notes.txt"]
+    for name in own + others:
+        (tmp_path / name).write_text(name)
+    (tmp_path / "frame_0009.png").mkdir()
+    before = names(tmp_path)
+    frame_folder.claim(tmp_path, SETTINGS, overwrite=True)
+    with pytest.raises(errors.ConfigError, match="--overwrite"):
+        frame_folder.claim(tmp_path, SETTINGS | {"size": "64"})
+    assert names(tmp_path) == before
+    frame_folder.claim(tmp_path, SETTINGS | {"size": "64"}, overwrite=True)
+    assert names(tmp_path) == sorted(set(before) - set(own))
+    assert json.loads((tmp_path / frame_folder.SETTINGS).read_text()) == SETTINGS | {"size": "64"}
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize(("name", "said"), [("frame_0001.png", "not a frame of"), ("render.json", "not the settings")])
+def test_files_of_other_programs_are_left(tmp_path, overwrite, name, said):
+    (tmp_path / name).write_text("[1]")
+    with pytest.raises(errors.ConfigError, match=said):
+        frame_folder.claim(tmp_path, SETTINGS, overwrite=overwrite)
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [(name, "[1]")]
 
 
 @pytest.mark.slow
