@@ -1,8 +1,9 @@
 """Process that bakes the newest checkpoint of a run for `live_run`: the player's page and the contact sheet.
 
-    python -m r5dgs_core.cli.live_bake RUN FOLDER [--until T] [--objects WORDS] [--idle]
+    python -m r5dgs_core.cli.live_bake RUN FOLDER [--until T] [--objects WORDS] [--idle] [--end-with-input]
 
-With ``--idle`` the process lowers its own priority first, so that the training is not delayed.
+With ``--idle`` the process lowers its own priority first, so that the training is not delayed. With
+``--end-with-input`` it ends with its standard input, which the system closes if the process at the other end is gone.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import contextlib
 import os
 import sys
+import threading
 from pathlib import Path
 
 from .. import errors
@@ -24,6 +26,17 @@ def lower_priority() -> None:
         Path("/proc/self/autogroup").write_text("19")
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+
+
+def end_with_input() -> None:
+    """End this process at the end of its standard input."""
+
+    def read() -> None:
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=read, daemon=True).start()
 
 
 def make(run: Path, folder: Path, until: float | None = None, words: str | None = None) -> None:
@@ -57,7 +70,10 @@ def main() -> int:
     p.add_argument("--until", type=float)
     p.add_argument("--objects")
     p.add_argument("--idle", action="store_true")
+    p.add_argument("--end-with-input", action="store_true")
     args = p.parse_args()
+    if args.end_with_input:
+        end_with_input()
     if args.idle:
         lower_priority()
     try:

@@ -20,6 +20,7 @@ from .page_server import Page
 EVERY_S = 60.0  # shortest time from the start of a bake to the start of the next
 SHARE = 0.1  # largest share of one core's time for bakes, which slow the training by the use of shared caches
 POLL_S = 2.0
+RETRY_S = 300.0  # from the start of a bake that failed to the next of the same checkpoint
 PAGE = Path(__file__).with_name("live_run.html")
 CHECKPOINT, CURVES, LOG = "checkpoint.pt", "learning_curves.png", "log.jsonl"  # of run folders
 SCENE, SHEET = "scene.html", "contact_sheet.png"  # made by `live_bake`
@@ -37,10 +38,12 @@ class LiveRun:
     """
 
     def __init__(self, run: Path, folder: Path, arguments: Sequence[str] = (), *, idle: bool = True):
-        self.run, self.folder, self._arguments = run, folder, [*arguments, *(["--idle"] if idle else [])]
+        self.run, self.folder, self._idle = run, folder, idle
+        self._arguments = ["--end-with-input", *arguments, *(["--idle"] if idle else [])]
         self._baked: tuple[int, int] | None = None  # size and time of the checkpoint of the last bake
         self._count, self._problem, self._busy = 0, "", False
         self._stop, self._process = threading.Event(), None
+        self._starting = threading.Lock()  # held while a process is started, so that `stop` ends every process
 
     def find(self, path: str) -> Page | None:
         """Return a page of the live view; see `page_server.serving`."""
@@ -65,19 +68,22 @@ class LiveRun:
             "run": self.run.name,
             "bakes": self._count,
             "baking": self._busy,
+            "idle": self._idle,
             "problem": self._problem,
             "log": _last_line(self.run / LOG),
             "curves": _stamp(self.run / CURVES),
         }
 
     def watch(self) -> None:
-        """Bake each new checkpoint, within `EVERY_S` and `SHARE`, until `stop`."""
+        """Bake each new checkpoint, within `EVERY_S` and `SHARE`, until `stop`; a failed bake again after `RETRY_S`."""
+        again = 0.0
         while not self._stop.is_set():
             stamp = _stamp(self.run / CHECKPOINT)
             wait = POLL_S
             if stamp is None:
                 self._problem = "no checkpoint yet"
-            elif stamp != self._baked:
+            elif stamp != self._baked or (self._problem and time.monotonic() >= again):
+                again = time.monotonic() + RETRY_S
                 began, spent = time.monotonic(), _children_seconds()
                 self._bake()
                 self._baked = stamp
@@ -88,8 +94,9 @@ class LiveRun:
     def stop(self) -> None:
         """End `watch` and its process."""
         self._stop.set()
-        if self._process is not None:
-            self._process.kill()
+        with self._starting:
+            if self._process is not None:
+                self._process.kill()
 
     def _bake(self) -> None:
         command = [sys.executable, "-m", "r5dgs_core.cli.live_bake", str(self.run), str(self.folder), *self._arguments]
@@ -97,13 +104,18 @@ class LiveRun:
         package = str(Path(__file__).parents[2])
         paths = os.pathsep.join(filter(None, (package, os.environ.get("PYTHONPATH", ""))))
         settings = {**os.environ, **one, "PYTHONPATH": paths, "CUDA_VISIBLE_DEVICES": ""}
-        self._busy = True
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-            env=settings, text=True, start_new_session=True,
-        )  # fmt: skip
-        _, log = self._process.communicate()
+        with self._starting:
+            if self._stop.is_set():
+                return
+            self._busy = True
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+                env=settings, text=True, start_new_session=True,
+            )  # fmt: skip
+        with self._process:  # closes the input, which ends the bake, only after its last line
+            assert self._process.stderr is not None
+            log = self._process.stderr.read()
         self._busy = False
         if self._process.returncode == 0:
             self._count, self._problem = self._count + 1, ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.server
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -24,7 +25,16 @@ class Page:
     kind: str = "text/html; charset=utf-8"
 
 
-def serving(find: Callable[[str], Page | None], port: int = 0) -> http.server.ThreadingHTTPServer:
+class Server(http.server.ThreadingHTTPServer):
+    """Web server that prints nothing if a browser drops a connection, for example by a reload of the page."""
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Print the traceback of the current error, unless it is a dropped connection."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
+
+
+def serving(find: Callable[[str], Page | None], port: int = 0) -> Server:
     """Return a server of pages at 127.0.0.1; ``find`` returns the page of a path such as "/", or None.
 
     Requests for another host name are refused, so that no web site can read a page by a name that leads here.
@@ -62,6 +72,6 @@ def serving(find: Callable[[str], Page | None], port: int = 0) -> http.server.Th
             """Print nothing."""
 
     try:
-        return http.server.ThreadingHTTPServer((HOST, port), Handler)
+        return Server((HOST, port), Handler)
     except OSError as error:
         raise errors.ConfigError(f"--port {port}: cannot be used: {error}; leave it out for a free one") from error

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import signal
 import tempfile
 import threading
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ... import errors, input_paths
@@ -82,7 +84,7 @@ def run_live(
     input_paths.check_run(run)
     arguments = [] if until is None else ["--until", str(until)]
     arguments += [] if words is None else ["--objects", words]
-    with tempfile.TemporaryDirectory(prefix="r5dgs_live_") as folder:
+    with _signals_as_ctrl_c(), tempfile.TemporaryDirectory(prefix="r5dgs_live_") as folder:
         live = live_run.LiveRun(run.resolve(), Path(folder), arguments)
         thread = threading.Thread(target=live.watch)
         thread.start()
@@ -91,6 +93,27 @@ def run_live(
         finally:
             live.stop()
             thread.join()
+
+
+@contextlib.contextmanager
+def _signals_as_ctrl_c() -> Iterator[None]:
+    """Raise KeyboardInterrupt at the first SIGTERM or SIGHUP within the block, unless the signal is ignored."""
+
+    def interrupt(number: int, frame: object) -> None:
+        for one in before:
+            signal.signal(one, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    present = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    in_main = threading.current_thread() is threading.main_thread()  # the only one that may set handlers
+    before = {one: signal.getsignal(one) for one in present if in_main and signal.getsignal(one) != signal.SIG_IGN}
+    try:
+        for one in before:
+            signal.signal(one, interrupt)
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
 
 
 def _check_port(port: int) -> None:

@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -93,6 +94,56 @@ def test_a_bake_that_fails_is_reported_and_the_last_scene_stays(watched):
     live._bake()
     assert "run.json" in live.state()["problem"] and live.state()["bakes"] == 0
     assert live.find("/scene").content == b"old"
+
+
+@pytest.mark.parametrize(("retry", "count"), [(0.0, 3), (1e6, 1)])
+def test_a_bake_that_fails_is_repeated_after_a_while(watched, monkeypatch, retry, count):
+    live, _ = watched
+    waits, bakes = [], []
+
+    def fail():
+        bakes.append(1)
+        live._problem = "out of memory"
+
+    def sleep(seconds):
+        waits.append(seconds)
+        if len(waits) == 3:
+            live.stop()
+
+    monkeypatch.setattr(live_run, "RETRY_S", retry)
+    monkeypatch.setattr(live, "_bake", fail)
+    monkeypatch.setattr(live._stop, "wait", sleep)
+    live.watch()
+    assert len(bakes) == count
+
+
+def test_no_bake_starts_after_the_end(watched):
+    live, _ = watched
+    live.stop()
+    live._bake()
+    assert live._process is None and not live.state()["baking"]
+
+
+def test_a_bake_ends_with_the_process_that_started_it():
+    code = "from r5dgs_core.cli import live_bake; import time; live_bake.end_with_input(); time.sleep(1000)"
+    settings = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, env=settings) as process:
+        process.stdin.close()
+        assert process.wait(patience.PATIENCE_S) == 1
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="needs the signals of Unix")
+@pytest.mark.parametrize("number", ["SIGTERM", "SIGHUP"])
+def test_a_signal_ends_the_view_and_removes_its_files(run, tmp_path, number):
+    (tmp_path / "temporary").mkdir()
+    settings = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path / "temporary")}
+    command = [sys.executable, "-m", "r5dgs_core", "view", "--live", str(run), "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=settings) as process:
+        assert "http://" in process.stdout.readline()
+        assert list((tmp_path / "temporary").glob("r5dgs_live_*"))
+        process.send_signal(getattr(signal, number))
+        assert process.wait(patience.PATIENCE_S) == 0
+    assert not list((tmp_path / "temporary").glob("r5dgs_live_*"))
 
 
 @pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="needs Linux")

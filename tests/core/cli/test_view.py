@@ -1,6 +1,7 @@
 """The command ``r5dgs view``."""
 
 import http.client
+import socket
 import threading
 
 import pytest
@@ -39,6 +40,19 @@ def test_only_the_page_is_served(port):
 def test_requests_for_another_host_are_refused(port):
     assert asked(port, "GET", "/", f"localhost:{port}")[0] == 200
     assert asked(port, "GET", "/", "attacker.example") == (404, b"")
+
+
+def test_a_dropped_connection_prints_nothing(capsys):
+    content = b"x" * (1 << 24)  # more than the buffers of the system hold
+    with page_server.serving({"/": page_server.Page(content)}.get) as server:
+        server.daemon_threads = False  # so that its end waits for them
+        thread = threading.Thread(target=server.handle_request)
+        thread.start()
+        with socket.create_connection(("127.0.0.1", server.server_port)) as connection:
+            connection.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode())
+            connection.recv(1)
+        thread.join()
+    assert capsys.readouterr().err == ""
 
 
 def test_wrong_arguments_are_named(port, tmp_path, capsys):
