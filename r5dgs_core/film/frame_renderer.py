@@ -24,7 +24,7 @@ class Layers:
     """Layers of a picture, without supersampling.
 
     Attributes:
-        depth: z in the camera frame, world units; `NOTHING` where the picture is nearly empty. [H, W] float32
+        depth: z in the camera frame, world units; `NOTHING` if the pixel is nearly empty. [H, W] float32
         index: Object id, 0 for background. [H, W] int32
         alpha: Coverage by Gaussians. [H, W] float32
         objects: Ids of the objects with the largest shares of each pixel, -1 for none. [H, W, RANKS] int32

@@ -16,6 +16,7 @@ from .. import errors, strict_json
 from ..scene import cameras as axes
 from ..scene.cameras import Camera
 from . import camera_path
+from .settings import FPS_RANGE
 
 
 def read(path: Path, origin: np.ndarray) -> camera_path.CameraPath:
@@ -42,7 +43,7 @@ def read(path: Path, origin: np.ndarray) -> camera_path.CameraPath:
     times = None
     if all("render_time" in entry for entry in entries):
         times = np.array([_number(f"{path}: camera_path[{k}]", e, "render_time") for k, e in enumerate(entries)])
-    fps = None if content.get("fps") is None else _number(path, content, "fps", 1e-3, 1e3)
+    fps = None if content.get("fps") is None else _number(path, content, "fps", *FPS_RANGE)
     return camera_path.lines(keys, times, fps)
 
 

@@ -13,7 +13,7 @@ PICTURES = (".png", ".exr")
 PASSES = ("depth", "index", "cryptomatte", "alpha")
 SIZES = (16, 8192)  # smallest and largest side of a picture, pixels
 MAX_SAMPLES = 8
-MAX_FPS = 1000.0
+FPS_RANGE = (1e-3, 1e3)
 
 
 @dataclass(frozen=True)
@@ -115,12 +115,12 @@ def _check_numbers(settings: Settings) -> None:
             raise errors.UsageError(f"--time {start:g}:{end:g}: a single picture has one time; give --out a folder")
     if not 1 <= settings.samples <= MAX_SAMPLES:
         raise errors.UsageError(f"--samples {settings.samples}: expected 1 to {MAX_SAMPLES}")
-    if settings.fps is not None and settings.fps > MAX_FPS:
-        raise errors.UsageError(f"--fps {settings.fps:g}: expected at most {MAX_FPS:g}")
+    if settings.fps is not None and not FPS_RANGE[0] <= settings.fps <= FPS_RANGE[1]:
+        raise errors.UsageError(f"--fps {settings.fps:g}: expected {FPS_RANGE[0]:g} to {FPS_RANGE[1]:g}")
     if settings.size is not None:
         width, height = settings.size
         given = f"--size {width}x{height}" if width else f"--size {height}"
-        sides = [side for side in settings.size if side]
+        sides = [width or height, height]
         if not all(SIZES[0] <= side <= SIZES[1] for side in sides):
             raise errors.UsageError(f"{given}: expected sides of {SIZES[0]} to {SIZES[1]} pixels")
         if settings.even and (width % 2 or height % 2):

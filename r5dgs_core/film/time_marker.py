@@ -21,14 +21,15 @@ def draw(picture: np.ndarray, t: float, t_max: float, span: tuple[float, float])
         picture: sRGB, with or without straight alpha. [H, W, 3 or 4]
         t: Scene time of the picture.
         t_max: Last observed time.
-        span: Times at the left and right end of the bar.
+        span: Times at the left and right end of the bar; equal for a scene of one time.
     """
     marked = picture.copy()
     height, width = picture.shape[:2]
     thick = max(height // 60, 3)
     times = np.linspace(*span, width)
     bar = np.where((times > t_max)[:, None], FUTURE, PAST) * np.where(times > t, DIMMED, 1.0)[:, None]
-    at = int(round((t - span[0]) / (span[1] - span[0]) * (width - 1)))
+    length = span[1] - span[0]
+    at = int(round((t - span[0]) / length * (width - 1))) if length > 0 else width - 1
     bar[max(at - thick // 3, 0) : at + thick // 3 + 1] = CURSOR
     marked[-thick:, :, :3] = bar
     later = t > t_max + 1e-9

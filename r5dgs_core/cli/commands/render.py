@@ -168,7 +168,7 @@ def time_range(text: str) -> tuple[float, float]:
 
 def picture_size(text: str) -> tuple[int, int]:
     """Convert an argument WxH or N to width and height, or to 0 and the longer side."""
-    found = re.fullmatch(r"(?:(\d{1,5})x)?(\d{1,5})", text.strip())
+    found = re.fullmatch(r"(?:(0*[1-9]\d{0,4})x)?(0*[1-9]\d{0,4})", text.strip())
     if found is None:
         raise argparse.ArgumentTypeError(f"expected width and height such as 1920x1080, or pixels, got {text!r}")
     return int(found[1] or 0), int(found[2])

@@ -32,3 +32,9 @@ def test_small_and_clipped_pictures_are_marked_too():
     for shape in ((2, 3, 3), (16, 16, 4)):
         found = time_marker.draw(np.zeros(shape, np.float32), 2.0, T_MAX, SPAN)
         assert found.shape == shape and np.isfinite(found).all()
+
+
+def test_a_scene_of_one_time_has_a_bar_that_has_been_played():
+    row = time_marker.draw(np.zeros((60, 80, 3), np.float32), 1.0, 1.0, (1.0, 1.0))[-1]
+    np.testing.assert_allclose(row[-1], time_marker.CURSOR)
+    np.testing.assert_allclose(row[:-2], np.broadcast_to(time_marker.PAST, (78, 3)), atol=1e-6)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.film import video
+from r5dgs_core.film import settings, video
 
 H, W, COUNT = 48, 64, 7
 
@@ -73,6 +73,14 @@ def test_frame_rates_of_television_are_exact(tmp_path):
     with av.open(str(tmp_path / "a.mp4")) as container:
         rate = container.streams.video[0].average_rate
         assert (rate.numerator, rate.denominator) == (30000, 1001)
+
+
+def test_the_slowest_frame_rate_is_stored(tmp_path):
+    for suffix in video.CODECS:
+        with video.writing(tmp_path / f"a{suffix}", settings.FPS_RANGE[0]) as append:
+            for picture in pictures(3):
+                append(picture)
+        assert decoded(tmp_path / f"a{suffix}", "rgb24")[2][1] == pytest.approx(1 / settings.FPS_RANGE[0], rel=1e-3)
 
 
 def test_an_error_leaves_nothing_and_keeps_the_old_file(tmp_path):
