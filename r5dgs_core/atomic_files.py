@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -77,6 +78,13 @@ def leftovers(path: str | Path) -> list[Path]:
     """Return temporary files of `replacing` beside a file, of killed processes or of writes in progress."""
     path = Path(path)
     return [p for p in path.parent.glob(f".{path.name}.*.part") if p.is_file()]
+
+
+def leftovers_by_name(path: str | Path) -> list[Path]:
+    """Return temporary files of `replacing_by_name` beside a file, of killed processes or of writes in progress."""
+    path = Path(path)
+    temporary = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{16}}{re.escape(path.suffix)}")
+    return [p for p in path.parent.iterdir() if temporary.fullmatch(p.name)]
 
 
 def _sync_folder(folder: Path) -> None:

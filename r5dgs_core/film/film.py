@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import errors
+from .. import atomic_files, errors, folder_lock
 from ..data import dataset as datasets
 from ..data import images
 from ..scene import spherical_harmonics
@@ -74,6 +75,25 @@ def write(
         raise errors.ConfigError(
             f"{settings.out}: the file exists; replace it with --overwrite, or choose another name"
         )
+    with _alone(settings.out):
+        _file(film, progress)
+    return Result((settings.out,))
+
+
+@contextlib.contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Lock an output file for the block, and remove what killed processes left of it. Raises ConfigError."""
+    with folder_lock.try_file(out.with_name(f".{out.name}.placeholder")) as held:
+        if not held:
+            raise errors.ConfigError(f"{out}: another process writes this file; wait for it, or choose another name")
+        for path in atomic_files.leftovers_by_name(out):
+            path.unlink(missing_ok=True)
+        yield
+
+
+def _file(film: _Film, progress: Progress) -> None:
+    """Write a video or a picture."""
+    settings, plan = film.settings, film.plan
     if settings.is_video:
         with video.writing(settings.out, plan.fps, alpha=settings.transparent) as append:
             for shot in plan.shots:
@@ -82,7 +102,6 @@ def write(
     else:
         film.draw(plan.shots[0], settings.out)
         progress(_event(1, 1))
-    return Result((settings.out,))
 
 
 def _folder(film: _Film, key: dict[str, str], progress: Progress) -> Result:

@@ -76,11 +76,13 @@ def writing(path: Path, fps: float, *, alpha: bool = False) -> Iterator[Callable
 
     Raises:
         BackendError: PyAV or the encoder is missing.
-        ConfigError: The file cannot be written.
+        ConfigError: The file cannot be written. Errors of the block pass unchanged.
     """
     av, codec = _library(), CODECS[path.suffix.lower()]
     check(path.suffix.lower())
     rate = Fraction(fps).limit_denominator(MAX_DENOMINATOR)
+    refusals = (av.error.FFmpegError, OSError)
+    of_block = None
     try:
         with (
             atomic_files.replacing_by_name(path) as temporary,
@@ -97,15 +99,29 @@ def writing(path: Path, fps: float, *, alpha: bool = False) -> Iterator[Callable
                     stream.height, stream.width = picture.shape[:2]
                 frame = _frame(av, codec, picture, stream.pix_fmt)
                 frame.pts, frame.time_base = count, 1 / rate
-                container.mux(stream.encode(frame))
+                try:
+                    container.mux(stream.encode(frame))
+                except refusals as error:
+                    raise _refused(path, error) from error
                 count += 1
 
-            yield append
+            try:
+                yield append
+            except Exception as error:
+                of_block = error
+                raise
             container.mux(stream.encode(None))
-    except (av.error.FFmpegError, OSError) as error:
-        raise errors.ConfigError(
-            f"{path}: the video cannot be written ({error.strerror or error}); check the folder and the free disk space"
-        ) from error
+    except refusals as error:
+        if error is of_block:
+            raise
+        raise _refused(path, error) from error
+
+
+def _refused(path: Path, error: OSError) -> errors.ConfigError:
+    reason = error.strerror or error
+    return errors.ConfigError(
+        f"{path}: the video cannot be written ({reason}); check the folder and the free disk space"
+    )
 
 
 def _frame(av: Any, codec: Codec, picture: np.ndarray, pixel_format: str) -> Any:

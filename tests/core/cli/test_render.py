@@ -7,6 +7,7 @@ import av
 import numpy as np
 import pytest
 
+from r5dgs_core import folder_lock
 from r5dgs_core.cli import main
 from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.data import dataset as datasets
@@ -225,6 +226,20 @@ def test_a_refused_write_is_one_line_and_leaves_nothing(path, tmp_path, monkeypa
     monkeypatch.undo()
     left = [p for p in folder.rglob("*") if p.is_file()]
     assert left == []
+
+
+def test_remains_of_a_killed_process_are_removed_and_writes_in_progress_left(path, tmp_path, capsys):
+    out = tmp_path / "a.mp4"
+    remains = [tmp_path / f".a.mp4.{'0a' * 8}.mp4", tmp_path / ".a.mp4.placeholder"]
+    others = [tmp_path / ".a.mp4.mine.mp4", tmp_path / f".b.mp4.{'0a' * 8}.mp4"]
+    for file in remains + others:
+        file.write_text("half")
+    given = ("render", path, "--out", out, "--time", "0.5", "--size", "64")
+    with folder_lock.try_file(remains[1]):
+        assert "another process writes this file" in complaint(capsys, *given)
+        assert remains[0].exists() and not out.exists()
+    assert main.main(list(map(str, given))) == 0
+    assert [file.exists() for file in (out, *remains, *others)] == [True, False, False, True, True]
 
 
 def test_an_existing_file_is_replaced_only_on_demand(path, tmp_path, capsys):

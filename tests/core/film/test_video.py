@@ -91,6 +91,22 @@ def test_an_error_leaves_nothing_and_keeps_the_old_file(tmp_path):
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.mp4", "mine")]
 
 
+def test_an_error_of_the_block_stays_what_it_is(tmp_path):
+    with pytest.raises(OSError, match="image") as raised, video.writing(tmp_path / "a.mp4", 24.0) as append:
+        append(next(pictures(3)))
+        raise OSError(5, "the image cannot be read")
+    assert type(raised.value) is OSError and list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_that_the_encoder_refuses_is_one_error(tmp_path):
+    with (
+        pytest.raises(errors.ConfigError, match="cannot be written"),
+        video.writing(tmp_path / "a.mp4", 24.0) as append,
+    ):
+        append(np.zeros((33, 17, 3), np.float32))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_missing_codec_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(video.CODECS, ".mp4", video.Codec("no_such_codec", "yuv420p", None))
     with pytest.raises(errors.BackendError, match="no encoder no_such_codec"), video.writing(tmp_path / "a.mp4", 24.0):
