@@ -120,11 +120,11 @@ def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) 
     for view in in_turn(masked, MASK):
         s, mask = nearest_knot(times, view.t), view.mask
         assert mask is not None
-        for object_id in np.unique(mask):
-            if object_id > 0 and object_id != masks.UNKNOWN:
-                sighting = _sight(view.camera, mask, s, int(object_id), min_share)
+        for object_id, box in enumerate(ndimage.find_objects(mask), 1):
+            if box is not None and object_id != masks.UNKNOWN:
+                sighting = _sight(view.camera, mask, box, s, object_id, min_share)
                 if sighting is not None:
-                    found.setdefault(int(object_id), []).append(sighting)
+                    found.setdefault(object_id, []).append(sighting)
     for object_id in [i for i, seen in found.items() if len(seen) == 1 and len(masked) > 1]:
         del found[object_id]
         log.warning(
@@ -135,13 +135,16 @@ def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) 
     return found
 
 
-def _sight(camera: Camera, ids: np.ndarray, knot: int, object_id: int, min_share: float) -> _Sighting | None:
-    mask = ids == object_id
-    area = int(mask.sum())
-    if area < max(6, min_share * mask.size):
+def _sight(
+    camera: Camera, ids: np.ndarray, box: tuple[slice, slice], knot: int, object_id: int, min_share: float
+) -> _Sighting | None:
+    """Return the sighting of an object whose pixels lie in a box of the mask, None if it is too small there."""
+    rows, cols = np.nonzero(ids[box] == object_id)
+    area = len(rows)
+    if area < max(6, min_share * ids.size):
         return None
-    rows, cols = np.nonzero(mask)
-    height, width = mask.shape
+    rows, cols = rows + box[0].start, cols + box[1].start
+    height, width = ids.shape
     whole = rows.min() > 0 and cols.min() > 0 and rows.max() < height - 1 and cols.max() < width - 1
     k = camera.intrinsics
     u = (cols.mean() + 0.5 - k[0, 2]) / k[0, 0]
