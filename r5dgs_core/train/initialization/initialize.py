@@ -129,7 +129,8 @@ def start(
     eyes = np.stack([v.camera.center for v in views])
     plane = supporting_plane(search.distinct_points(), places, eyes, rng)
     placed = search.place(swept, plane, find_sky, rng)
-    where, shade, free = _cleared(_background(views, backgrounds, placed, init, rng, cloud), views, times, places)
+    found = _background(views, backgrounds, placed, init, rng, cloud)
+    where, shade, free = _cleared(found, views, times, places, config)
     log.info("background: %d points from %d cameras; %d objects", len(where), len(backgrounds), len(clouds))
     parts = [place_gaussians.solid([*clouds, (where, shade, 0)], init.opacity)]
     casters, slope = np.zeros(0, np.int64), np.zeros(3)
@@ -249,6 +250,7 @@ def _cleared(
     views: Sequence[TrainView],
     times: np.ndarray,
     places: triangulation.ObjectPositions,
+    config: Config,
 ) -> tuple[np.ndarray, np.ndarray, free_space.FreeSpace | None]:
     """Return the background points that hide no object, their colours, and the space to keep free of background.
 
@@ -257,8 +259,11 @@ def _cleared(
         views: Training views.
         times: Knots. [S]
         places: Positions of the objects.
+        config: Configuration of the run.
     """
     where, shade = background
+    if config.train.representation != TRACKS:  # objects may then consist of Gaussians of the background
+        return where, shade, None
     free = free_space.find(views, times, places, where)
     if free is None:
         return where, shade, None
