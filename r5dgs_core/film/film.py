@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import atomic_files, errors, folder_lock
 from ..data import dataset as datasets
-from ..data import images
+from ..data import images, memory
 from ..scene import spherical_harmonics
 from ..scene.scene import Scene
 from . import frame_folder, frame_renderer, multilayer, schedule, side_by_side, video
@@ -66,6 +66,7 @@ def write(
     """
     rows = _rows(scene, shown, hidden)
     plan = schedule.make(scene, settings)
+    _check_memory(settings, plan)
     film = _Film(scene, settings, plan, rows, dataset)
     if settings.is_folder:
         if file is None:
@@ -171,6 +172,18 @@ class _Film:
             multilayer.write(path, multilayer.channels(self.scene, picture, layers, self.settings.passes), self.scene)
         except errors.DatasetError as error:
             raise errors.ConfigError(str(error)) from error
+
+
+def _check_memory(settings: Settings, plan: Schedule) -> None:
+    """Raise ConfigError if drawing a frame needs more than the available memory."""
+    width, height = plan.shots[0].camera.width, plan.shots[0].camera.height
+    needed = frame_renderer.memory(width, height, samples=settings.samples, layers=bool(settings.passes))
+    free = memory.available()
+    if free is not None and needed > free:
+        raise errors.ConfigError(
+            f"--size {width}x{height} with --samples {settings.samples}: a picture needs {needed / memory.GB:.1f} GB "
+            f"of memory, {free / memory.GB:.1f} GB are available; choose a smaller size or fewer samples"
+        )
 
 
 def _rows(scene: Scene, shown: Collection[int] | None, hidden: Collection[int] | None) -> np.ndarray | None:

@@ -17,6 +17,7 @@ from ..scene.scene import Scene
 NOTHING = 1e10  # depth of empty pixels, as in Blender
 SOLID = 0.5  # minimum alpha of pixels that have a depth and an object
 RANKS = 6  # objects per pixel in Cryptomatte layers
+SAMPLE_BYTES, LAYER_BYTES = 45, 148  # measured memory of a picture per sample, and of layers per pixel
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,11 @@ class FrameRenderer:
     def _render(self, posed: posed_scene.PosedScene, camera: Camera) -> RenderOutput:
         background = None if self._transparent else "scene"
         return scene_renderer.render_frame(self._scene, posed, camera, background=background)
+
+
+def memory(width: int, height: int, *, samples: int = 1, layers: bool = False) -> int:
+    """Return the memory that drawing a picture needs besides the scene, bytes."""
+    return width * height * max(SAMPLE_BYTES * samples**2, LAYER_BYTES if layers else 0)
 
 
 def rows_of(

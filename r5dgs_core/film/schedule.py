@@ -88,7 +88,7 @@ def _path(scene: Scene, settings: Settings) -> CameraPath:
     """Return the path that ``--camera`` names."""
     names = settings.camera
     if len(names) > 1:
-        return camera_path.curve([viewpoints.named(scene, name) for name in names])
+        return camera_path.curve([_named(scene, name, "orbits and camera paths are given alone") for name in names])
     if not names:
         return camera_path.still(scene.cameras[0] if scene.cameras else viewpoints.overview(scene))
     known = {camera.name for camera in scene.cameras}
@@ -96,7 +96,14 @@ def _path(scene: Scene, settings: Settings) -> CameraPath:
         return camera_path.orbit(scene)
     if names[0].lower().endswith(".json") and names[0] not in known:
         return path_file.read(Path(names[0]), scene.origin)
-    return camera_path.still(viewpoints.named(scene, names[0]))
+    return camera_path.still(_named(scene, names[0], "or orbit, or a camera path (.json)"))
+
+
+def _named(scene: Scene, name: str, further: str) -> Camera:
+    try:
+        return viewpoints.named(scene, name)
+    except errors.ConfigError as error:
+        raise errors.ConfigError(f"{error}; {further}") from error
 
 
 def _count(scene: Scene, settings: Settings, path: CameraPath, fps: float, duration: float) -> int:

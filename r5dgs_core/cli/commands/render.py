@@ -40,10 +40,13 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 def _add_content(p: argparse.ArgumentParser) -> None:
     camera = (
         "name or number of a captured camera, 'orbit', or a camera path of nerfstudio (.json); several captured "
-        "cameras for a curve through them (default: the first captured camera)"
+        "cameras for a curve through them (default: the first captured camera); write SCENE before this option"
     )
     p.add_argument("--camera", nargs="+", default=[], metavar="CAMERA", help=camera)
-    when = "scene time, or first and last one; may exceed t_max (default: up to a third of the observed span after it)"
+    when = (
+        "scene time, or first and last one; may exceed t_max (default: up to a third of the observed span after it, or "
+        "scene time 1 if later; a picture shows t_max)"
+    )
     p.add_argument("--time", type=time_range, metavar="T[:T]", help=when)
     p.add_argument("--seconds", type=options.positive, metavar="S", help="length of the film (default: real time)")
     p.add_argument("--fps", type=options.positive, metavar="N", help="frames per second (default: 24)")

@@ -91,7 +91,8 @@ def _held(*parts: np.ndarray) -> tuple[np.ndarray, ...]:
 @functools.cache
 def _warn_of_wild_motion() -> None:
     log.warning(
-        "a motion model gives poses that are not finite; its body stays at its pose at t_max. Remedy: smaller rates"
+        "a motion model gives poses that are not finite; its body stays at its pose at t_max. Remedy: an earlier time "
+        "or smaller rates"
     )
 
 

@@ -181,6 +181,10 @@ def test_things_that_cannot_be_done_are_one_line_and_leave_nothing(path, scene, 
     assert "--camera back" in line("--out", out, "--camera", "back")
     assert "path.json" in line("--out", out, "--camera", tmp_path / "path.json")
     assert "the folder" in line("--out", tmp_path / "no" / "a.mp4")
+    with monkeypatch.context() as patch:
+        patch.setattr("r5dgs_core.data.memory.available", lambda: 8 * 2.0**30)
+        large = line("--out", tmp_path / "a.png", "--size", "8192", "--samples", "8")
+        assert "--size 8192x6144 with --samples 8: a picture needs 135.0 GB of memory, 8.0 GB are available" in large
     assert "has data for rigid only" in line("--out", out, "--mode", "standard")
     monkeypatch.setitem(video.CODECS, ".mp4", video.Codec("no_such_codec", "yuv420p", None))
     assert "no encoder no_such_codec" in line("--out", out)

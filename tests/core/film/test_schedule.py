@@ -79,3 +79,7 @@ def test_times_before_the_first_observed_one_are_outside(scene, monkeypatch):
         made(scene, seconds=1e6)
     with pytest.raises(errors.ConfigError, match="--camera 7: expected 0 to 1"):
         made(scene, camera=("7",))
+    with pytest.raises(errors.ConfigError, match=r"--camera back: .*; or orbit, or a camera path \(.json\)"):
+        made(scene, camera=("back",))
+    with pytest.raises(errors.ConfigError, match="--camera orbit: .*; orbits and camera paths are given alone"):
+        made(scene, camera=("0", "orbit"))
