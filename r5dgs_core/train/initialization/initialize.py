@@ -147,8 +147,7 @@ def start(
     if motion.moves and config.train.shading and config.train.representation == TRACKS:
         place_gaussians.shade_outwards(gaussians, centers, init.shading)
     tracks = FirstTracks(times, centers, translations, casters, None if plane is None else plane[0], slope, to_light)
-    ids = np.concatenate([[0], places.object_ids])
-    seen = evidence.gather(views, places, times)
+    ids, seen = np.concatenate([[0], places.object_ids]), evidence.gather(views, places, times)
     return InitialState(gaussians, tracks, ids, places, first, plane, placed.sky, seen, colors, free)
 
 
