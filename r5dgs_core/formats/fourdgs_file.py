@@ -140,18 +140,19 @@ def _attributes(scene: Scene, end: float, ids: dict[tuple[int, int], int]) -> di
     }
 
 
-def losses(scene: Scene) -> list[str]:
+def losses(scene: Scene, options: registry.Options) -> list[str]:
     """Parts of this scene that a file does not hold, or that only our own programs read, as sentences."""
-    found = scene_nodes.lost_bending(scene)
+    found = scene_nodes.lost_bending(scene, options.object_ids)
     if available(scene, "standard"):
         found.append("motion of single Gaussians past t_max (modes standard and hybrid)")
     if scene.shading is not None:
         found.append("colours other than those of t_max")
-    dc = spherical_harmonics.dc_to_rgb(played_splats.at(Player(scene), scene.t_max).sh[:, 0])
+    dc = spherical_harmonics.dc_to_rgb(played_splats.at(Player(scene), scene.t_max, options.object_ids).sh[:, 0])
     outside = int(((dc < -_ROUNDING) | (dc > 1 + _ROUNDING)).any(1).sum())
     if outside:
         found.append(f"{outside} Gaussians have mean colours outside [0, 1], which are clipped")
-    clipped = int((np.abs(scene.gaussians.sh[:, 1:]) > HIGH).any((1, 2)).sum())
+    shown = scene_nodes.selected(scene, options.object_ids)
+    clipped = int((np.abs(scene.gaussians.sh[shown, 1:]) > HIGH).any((1, 2)).sum())
     if clipped:
         found.append(f"{clipped} Gaussians have harmonics beyond {HIGH:g}, which are clipped")
     if len(scene.background_sh) > 1 or scene.background_sh.any():

@@ -48,7 +48,7 @@ def build(scene: Scene, options: registry.Options) -> tuple[dict[str, Any], gltf
     up, size = _Y_UP @ cameras.WORLD_TO_BLENDER[scene.world_convention], scene.units.meters_per_unit
     scale = {} if size is None else {"scale": [size] * 3}
     root = tree.add(scene.name, None, rotation=_xyzw(up), **scale, children=tree.roots)
-    extras = scene_notes.of(scene, end, KIND) | {"modes": [mode for mode, _ in played], "lost": losses(scene)}
+    extras = scene_notes.of(scene, end, KIND) | {"modes": [mode for mode, _ in played], "lost": losses(scene, options)}
     content = {
         "asset": {"version": "2.0", "generator": "r5dgs"},
         "extensionsUsed": [glb_splats.EXTENSION],
@@ -63,9 +63,9 @@ def build(scene: Scene, options: registry.Options) -> tuple[dict[str, Any], gltf
     return content, arrays
 
 
-def losses(scene: Scene) -> list[str]:
+def losses(scene: Scene, options: registry.Options) -> list[str]:
     """Parts of this scene that a file does not hold, or that only our own programs read, as sentences."""
-    found = scene_nodes.lost_bending(scene)
+    found = scene_nodes.lost_bending(scene, options.object_ids)
     lost = [mode for mode in modes.MODES if mode != "rigid" and available(scene, mode)]
     if lost:
         found.append(f"motion of single Gaussians (modes {', '.join(lost)})")

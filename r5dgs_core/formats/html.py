@@ -37,9 +37,9 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     yield path
 
 
-def losses(scene: Scene) -> list[str]:
+def losses(scene: Scene, options: registry.Options) -> list[str]:
     """Parts of this scene that the player does not show, as sentences."""
-    return [sentence for sentence in glb.losses(scene) if not sentence.endswith(glb.ELSEWHERE)]
+    return [sentence for sentence in glb.losses(scene, options) if not sentence.endswith(glb.ELSEWHERE)]
 
 
 def _text(data: bytes) -> str:

@@ -12,7 +12,7 @@ from .. import errors
 from ..playback import object_poses
 from ..playback.object_poses import ObjectPoses
 from ..scene.scene import Scene
-from . import registry
+from . import registry, scene_nodes
 
 FRAME = (
     "T_world_object: maps points of the object's frame to the world. The object's frame has its origin at its anchor "
@@ -82,7 +82,8 @@ def make(scene: Scene, options: registry.Options) -> Table:
     return Table(times, seconds * times, scaled, times > scene.t_max, header)
 
 
-def losses(scene: Scene) -> list[str]:
+def losses(scene: Scene, options: registry.Options) -> list[str]:
     """Parts of this scene that poses do not hold, as sentences."""
-    bending = 0 if scene.residuals is None else len(scene.residuals.rows)
+    shown = scene_nodes.selected(scene, options.object_ids)
+    bending = 0 if scene.residuals is None else int(shown[scene.residuals.rows].sum())
     return [LOST_BENDING.format(bending)] if bending else []

@@ -122,24 +122,25 @@ def time_step(scene: Scene) -> float:
     return _time_unit(scene) * (float(np.ptp(scene.tracks.times)) or 1.0) / 1000
 
 
-def losses(scene: Scene) -> list[str]:
+def losses(scene: Scene, options: registry.Options) -> list[str]:
     """Parts of this scene that rigid bodies do not hold, as sentences."""
-    found, hulls = [], _hulls(scene)
+    found, hulls, ids = [], _hulls(scene), options.object_ids
     present = {(hull.object_id, hull.motion_id) for hull in hulls}
     sound = {(hull.object_id, hull.motion_id) for hull, _ in _solids(hulls)}
     lacks = {"without a hull": object_hulls.bodies(scene) - present, "with a flat hull": present - sound}
     for lack, pairs in lacks.items():
-        names = [scene.object(number).name for number in sorted({pair[0] for pair in pairs})]
+        numbers = sorted({pair[0] for pair in pairs if ids is None or pair[0] in ids})
+        names = [scene.object(number).name for number in numbers]
         found += [f"objects {lack}: {', '.join(names)}"] if names else []
-    if any(group.joint is not None for group in scene.groups):
+    if any(group.joint is not None and (ids is None or group.object_id in ids) for group in scene.groups):
         found.append("joints: parts are bodies of their own")
-    return found + scene_nodes.lost_bending(scene)
+    return found + scene_nodes.lost_bending(scene, ids)
 
 
-def simulator_losses(scene: Scene) -> list[str]:
+def simulator_losses(scene: Scene, options: registry.Options) -> list[str]:
     """As `losses`, for formats of simulators."""
     unknown = [] if gravity(scene).any() else ["gravity is unknown and set to 0; set it in the simulator"]
-    return [*losses(scene), *unknown, ground.MISSING if ground_height(scene) is None else ground.LOSS]
+    return [*losses(scene, options), *unknown, ground.MISSING if ground_height(scene) is None else ground.LOSS]
 
 
 def _hulls(scene: Scene) -> tuple[Hull, ...]:

@@ -63,11 +63,18 @@ def group_names(scene: Scene) -> list[str]:
     return found
 
 
-def lost_bending(scene: Scene) -> list[str]:
-    """Sentence about Gaussians that bend, for formats in which each piece is rigid; empty without them."""
+def selected(scene: Scene, object_ids: Collection[int] | None) -> np.ndarray:
+    """Return a mask of the Gaussians of the selected objects, all if None. [N] bool"""
+    found = scene.gaussians.object_ids
+    return np.ones(len(found), bool) if object_ids is None else np.isin(found, list(object_ids))
+
+
+def lost_bending(scene: Scene, object_ids: Collection[int] | None) -> list[str]:
+    """Sentence about selected Gaussians that bend, for formats with rigid pieces; empty without them."""
     residuals = scene.residuals
-    if residuals is None or len(residuals.rows) == 0:
+    bend = np.zeros(0, bool) if residuals is None else selected(scene, object_ids)[residuals.rows]
+    count = int(bend.sum())
+    if residuals is None or not count:
         return []
-    most = float(np.linalg.norm(residuals.offsets, axis=-1).max()) / scene.extent
-    count = len(residuals.rows)
+    most = float(np.linalg.norm(residuals.offsets[bend], axis=-1).max()) / scene.extent
     return [f"{count} Gaussians bend, by up to {100 * most:.2g} % of the extent: as at t_max, they move rigidly"]

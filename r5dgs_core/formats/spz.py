@@ -11,7 +11,7 @@ import numpy as np
 from .. import atomic_files, errors, extras
 from ..playback import played_splats
 from ..playback.scene_player import Player
-from ..scene import cameras
+from ..scene import cameras, sampling
 from ..scene.scene import Scene
 from . import registry, scene_nodes, turned_splats
 
@@ -21,6 +21,7 @@ _MOST_BITS = 20  # fraction of a position
 _DC = 127.5 / (0.15 * 255)  # largest stored coefficient of degree 0, and of the others
 _SH = 127 / 128
 _LOG_SCALES = (-10.0, 5.9375)
+_TIMES = 8  # at which losses are counted
 
 
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
@@ -49,12 +50,14 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
         yield target
 
 
-def losses(scene: Scene) -> list[str]:
-    """Parts of this scene that a file does not hold, as sentences; values are those of t_max."""
-    splats = played_splats.at(Player(scene), scene.t_max)
-    wrong = (np.abs(splats.sh[:, 0]) > _DC).any(-1) | (np.abs(splats.sh[:, 1:]) > _SH).any((1, 2))
-    low, high = _LOG_SCALES
-    sizes = ((splats.log_scales < low) | (splats.log_scales > high)).any(-1)
+def losses(scene: Scene, options: registry.Options) -> list[str]:
+    """Parts of this scene that files do not hold, as sentences, from at most `_TIMES` of the times."""
+    player, (low, high) = Player(scene), _LOG_SCALES
+    wrong = sizes = np.zeros((), bool)
+    for t in sampling.spread(options.times, _TIMES):
+        splats = played_splats.at(player, t, options.object_ids)
+        wrong = wrong | (np.abs(splats.sh[:, 0]) > _DC).any(-1) | (np.abs(splats.sh[:, 1:]) > _SH).any((1, 2))
+        sizes = sizes | ((splats.log_scales < low) | (splats.log_scales > high)).any(-1)
     found = []
     if wrong.any():
         found.append(f"{int(wrong.sum())} Gaussians have colours beyond the range of SPZ, which are clipped")

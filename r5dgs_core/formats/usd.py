@@ -251,7 +251,7 @@ def _floats(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, np.float32)
 
 
-def losses(scene: Scene) -> list[str]:
+def losses(scene: Scene, options: registry.Options) -> list[str]:
     """Parts of this scene that a file does not hold, as sentences."""
     found = []
     if available(scene, "standard"):

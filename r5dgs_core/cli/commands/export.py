@@ -87,7 +87,7 @@ def run_export(
 
     Raises:
         UsageError: The format is unknown, or another argument does not suit it.
-        ConfigError: A file exists, or no object matches the words.
+        ConfigError: A file exists, no object matches the words, or a time is before the first observed one.
         BackendError: The format needs a package that is not installed.
     """
     if to not in registry.MODULES:
@@ -104,17 +104,24 @@ def run_export(
     present = [target for target in targets if target.exists()]
     if present and not overwrite:
         raise errors.ConfigError(f"{present[0]}: the file exists; replace it with --overwrite, or choose another name")
-    written = _write(chosen, scene, out, what, len(targets), progress_kind)
+    lost = chosen.losses(scene, what)
+    written = _write(chosen, scene, out, what, len(targets), progress_kind, lost)
     if progress_kind != "json":
         print(f"written: {written[0]}" + (f" to {written[-1].name}" if len(written) > 1 else ""))
         print(f"not kept: {chosen.loses}")
-        for sentence in chosen.losses(scene):
+        for sentence in lost:
             print(f"lost here: {sentence}")
     return written
 
 
 def _write(
-    chosen: registry.Format, scene: Scene, out: Path, what: registry.Options, total: int, progress_kind: str
+    chosen: registry.Format,
+    scene: Scene,
+    out: Path,
+    what: registry.Options,
+    total: int,
+    progress_kind: str,
+    lost: list[str],
 ) -> list[Path]:
     """Write a number of files of a format with progress output and return their paths."""
     from ...progress import make
@@ -125,7 +132,8 @@ def _write(
             written.append(target)
             progress({"event": "export", "done": len(written), "total": total, "unit": "files"})
         if progress_kind == "json":
-            progress({"event": "written", "paths": [str(target) for target in written]})
+            told = {"not_kept": chosen.loses, "lost": lost}
+            progress({"event": "written", "paths": [str(target) for target in written], **told})
     return written
 
 
@@ -170,7 +178,7 @@ def selection(
 
     Raises:
         UsageError: ``until`` is not finite or before t_max, or the words are empty.
-        ConfigError: No object matches the words.
+        ConfigError: No object matches the words, or a time is before the first observed one.
     """
     if until is not None and not (math.isfinite(until) and until >= scene.t_max):
         raise errors.UsageError(f"--until {until:g}: expected a time from t_max on, which is {scene.t_max:g}")
@@ -179,6 +187,11 @@ def selection(
     numbers = None if frames is None else tuple(range(frames[0], frames[1] + 1))
     if numbers is not None:
         times = tuple((number - 1) / scene.frames_per_unit for number in numbers)
+    first = float(scene.tracks.times[0])
+    if times is not None and min(times) < first - _ROUNDING / scene.frames_per_unit:
+        option = "--time" if frames is None else "--frames"
+        expected = f"expected scene times from the first observed one, {first:g}, on"
+        raise errors.ConfigError(f"{option}: {expected}, got {min(times):g}")
     ids = None if words is None else object_ids(scene, words)
     return registry.Options(
         times or (scene.t_max,), numbers, ids, until, _still(scene, ids) if chosen.has_still else None

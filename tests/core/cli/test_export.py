@@ -1,5 +1,6 @@
 """The command ``r5dgs export``."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from r5dgs_core.cli import main
 from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.data import transforms
-from r5dgs_core.formats import ply
+from r5dgs_core.formats import ply, registry
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import cameras, scene_file
 from tests.support.command_line import complaint
@@ -96,3 +97,33 @@ def test_files_are_replaced_only_on_demand(path, tmp_path, capsys):
 )
 def test_wrong_arguments_are_named(path, capsys, arguments, named):
     assert named in complaint(capsys, "export", path, *arguments, status=ExitStatus.USAGE)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--to", "ply", "--time", "-3"),
+        ("--to", "ply", "--frames=-3:2"),
+        ("--to", "poses", "--time", "0.1,-3"),
+    ],
+)
+def test_times_before_the_first_observed_one_are_refused(path, tmp_path, capsys, arguments):
+    out = tmp_path / ("a.ply" if "ply" in arguments else "a.json")
+    assert "from the first observed one" in complaint(capsys, "export", path, *arguments, "--out", out)
+    assert not out.exists()
+
+
+def test_losses_are_those_of_the_selected_objects(scene):
+    bright = scene.gaussians.sh.copy()
+    bright[scene.gaussians.object_ids == 3, 0] = 5.0
+    bright = dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, sh=bright))
+    count = int((scene.gaussians.object_ids == 3).sum())
+    for ids, number in ((None, count), (frozenset({3}), count), (frozenset({1}), 0)):
+        said = " ".join(registry.get("spz").losses(bright, registry.Options((scene.t_max,), object_ids=ids)))
+        assert said == (f"{number} Gaussians have colours beyond the range of SPZ, which are clipped" if number else "")
+
+
+def test_losses_are_in_the_event(path, tmp_path, capsys):
+    assert export(path, "--to", "usd", "--out", tmp_path / "a.usd", "--progress", "json") == 0
+    event = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert event["not_kept"] == registry.get("usd").loses and "the sky" in event["lost"]

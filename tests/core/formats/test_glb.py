@@ -309,7 +309,7 @@ def test_losses_of_a_scene_are_named():
     offsets = zeros.copy()
     offsets[0, 0, 1] = 0.1 * scene.extent
     bent = dataclasses.replace(scene, residuals=Residuals(rows, offsets, turns, zeros))
-    said = " ".join(glb.losses(bent.with_arrays(dynamics=np.zeros((100, 12), np.float32))))
+    said = " ".join(glb.losses(bent.with_arrays(dynamics=np.zeros((100, 12), np.float32)), OPTIONS))
     for part in (
         "2 Gaussians bend, by up to 10 % of the extent",
         "modes hybrid, standard",
@@ -320,7 +320,7 @@ def test_losses_of_a_scene_are_named():
         assert part in said
     plain = scenes.make_scene(n=100, shading=False, identities=False)
     plain = plain.with_arrays(background_sh=np.zeros((1, 3), np.float32))
-    assert glb.losses(plain) == []
+    assert glb.losses(plain, OPTIONS) == []
 
 
 def test_stored_words_keep_their_matches(tmp_path):

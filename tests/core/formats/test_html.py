@@ -41,4 +41,4 @@ def test_no_half_written_page_is_left(tmp_path):
 
 
 def test_losses_of_other_programs_are_not_those_of_the_page():
-    assert html.losses(scenes.make_scene(n=50, identities=False)) == []
+    assert html.losses(scenes.make_scene(n=50, identities=False), OPTIONS) == []

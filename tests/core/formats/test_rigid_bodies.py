@@ -165,7 +165,7 @@ def test_gravity_has_the_units_and_axes_of_the_file_and_is_zero_if_unknown(throw
         thrown, groups=tuple(dataclasses.replace(one, model=MotionModel()) for one in thrown.groups)
     )
     assert not rigid_bodies.gravity(still).any()
-    assert any("gravity is unknown" in line for line in mjcf.FORMAT.losses(still))
+    assert any("gravity is unknown" in line for line in mjcf.FORMAT.losses(still, OPTIONS))
 
 
 def test_objects_without_a_hull_are_named_and_refused_if_no_other_is_left():
@@ -173,7 +173,7 @@ def test_objects_without_a_hull_are_named_and_refused_if_no_other_is_left():
     logits = np.where(scene.gaussians.object_ids == 2, -8, scene.gaussians.opacity_logits).astype(np.float32)
     faint = scene.with_arrays(opacity_logits=logits)
     assert {body.name for body in rigid_bodies.of(faint, 0.3, OPTIONS)} == {"mug", "toy car"}
-    assert "objects without a hull: red apple" in hulls.FORMAT.losses(faint)
+    assert "objects without a hull: red apple" in hulls.FORMAT.losses(faint, OPTIONS)
     with pytest.raises(errors.ConfigError, match="expected objects with enough Gaussians for a hull, found none"):
         rigid_bodies.of(faint, 0.3, registry.Options((0.3,), object_ids=frozenset({2})))
 
@@ -184,7 +184,7 @@ def test_objects_with_a_flat_hull_are_left_out_and_named():
     flat = dataclasses.replace(flat, vertices=flat.vertices * [1, 1, 0])
     made = dataclasses.replace(scene, hulls=(flat, *others))
     assert {body.name for body in rigid_bodies.of(made, 0.3, OPTIONS)} == {"red apple", "toy car"}
-    assert hulls.FORMAT.losses(made) == ["objects with a flat hull: mug"]
+    assert hulls.FORMAT.losses(made, OPTIONS) == ["objects with a flat hull: mug"]
 
 
 def test_an_object_named_world_gets_another_name(thrown):
@@ -217,7 +217,7 @@ def test_a_thrown_box_lands_on_the_ground_under_the_one_that_rests(tmp_path, kin
     half = contact_scenes.SIZE  # of 0.4 units of 2 m each
     height = data.xpos[model.body("box 1").id][2]
     assert 0.9 * half < height < 1.8 * half and np.abs(data.qvel).max() < 0.05
-    assert ground.LOSS in registry.get(kind).losses(boxes)
+    assert ground.LOSS in registry.get(kind).losses(boxes, OPTIONS)
 
 
 def test_the_ground_is_below_all_observed_places_and_missing_if_nothing_rests(thrown):
@@ -226,4 +226,4 @@ def test_the_ground_is_below_all_observed_places_and_missing_if_nothing_rests(th
     assert ground.height(scene, scene.hulls[1:]) == pytest.approx(0.0, abs=1e-9)
     lowest = min(float(corners[:, 2].min()) for corners in posed(scene, scene.t_max))
     assert ground.height(scene, scene.hulls) == pytest.approx(lowest) and lowest < -0.05
-    assert ground.height(thrown, thrown.hulls) is None and ground.MISSING in mjcf.FORMAT.losses(thrown)
+    assert ground.height(thrown, thrown.hulls) is None and ground.MISSING in mjcf.FORMAT.losses(thrown, OPTIONS)
