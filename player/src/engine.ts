@@ -7,16 +7,19 @@ import { conjugate, rotate, sub } from "./rigid.ts";
 import { skyEntity } from "./sky.ts";
 
 const STILL_FRAMES = 20; // frames without a change after which drawing stops
+const MAX_RATIO = 2; // drawn pixels per CSS pixel
 const SHADING = "shading";
 
 interface Drawn { piece: Piece; entity: pc.Entity }
 
 export class Engine {
   readonly app: pc.AppBase;
-  readonly eye: pc.Entity;
+  private readonly eye: pc.Entity;
+  private readonly room: pc.Entity; // parent of the eye, which VR moves in it
   private readonly drawn: Drawn[] = [];
   private still = 0;
-  private lens: Lens | null = null;
+  private viewer: Eye = { place: [0, 0, 0], turn: [0, 0, 0, 1] };
+  private lens: Lens = { fx: 1, fy: 1, cx: 0.5, cy: 0.5, width: 1, height: 1 };
   private waiting: (() => void)[] = [];
 
   private constructor(readonly canvas: HTMLCanvasElement, readonly model: Model, device: pc.GraphicsDevice) {
@@ -35,18 +38,21 @@ export class Engine {
     params.minContribution = 0;
     params.alphaClipForward = 1 / 255;
     kernel.install(device, params);
-    this.eye = new pc.Entity("eye");
+    [this.room, this.eye] = [new pc.Entity("room"), new pc.Entity("eye")];
     this.eye.addComponent("camera", {
       clearColor: new pc.Color(...model.skyColor), nearClip: model.near, farClip: 100 * model.extent,
       toneMapping: pc.TONEMAP_NONE,
     });
     this.eye.camera!.calculateProjection = (matrix) => this.project(matrix);
-    this.app.root.addChild(this.eye);
+    this.app.root.addChild(this.room);
+    this.room.addChild(this.eye);
     const sky = skyEntity(device, model);
     if (sky) this.app.root.addChild(sky);
     for (const piece of model.pieces) this.drawn.push({ piece, entity: this.add(piece) });
     this.app.autoRender = false;
     this.app.on("update", () => this.tick());
+    this.app.xr!.on("start", () => this.enterRoom());
+    this.app.xr!.on("end", () => this.leaveRoom());
     this.app.on("frameend", () => this.waiting.splice(0).forEach((done) => done()));
     this.app.start();
   }
@@ -117,7 +123,7 @@ export class Engine {
   }
 
   view(eye: Eye, lens: Lens): void {
-    this.lens = lens;
+    [this.viewer, this.lens] = [eye, lens];
     this.eye.setPosition(...eye.place);
     this.eye.setRotation(...eye.turn);
     this.redraw();
@@ -161,7 +167,7 @@ export class Engine {
 
   private project(matrix: pc.Mat4): void {
     const { nearClip: near, farClip: far } = this.eye.camera!;
-    const { fx, fy, cx, cy, width, height } = this.lens ?? { fx: 1, fy: 1, cx: 0.5, cy: 0.5, width: 1, height: 1 };
+    const { fx, fy, cx, cy, width, height } = this.lens;
     matrix.set([
       (2 * fx) / width, 0, 0, 0,
       0, (2 * fy) / height, 0, 0,
@@ -170,7 +176,11 @@ export class Engine {
     ]);
   }
 
+  // Drawn pixels per CSS pixel.
+  get ratio(): number { return Math.min(devicePixelRatio || 1, MAX_RATIO); }
+
   resize(): void {
+    this.app.graphicsDevice.maxPixelRatio = this.ratio;
     this.app.resizeCanvas();
     this.redraw();
   }
@@ -181,15 +191,22 @@ export class Engine {
   onVr(changed: () => void): void { this.app.xr?.on(`available:${pc.XRTYPE_VR}`, changed); }
 
   enterVr(failed: (message: string) => void): void {
-    this.eye.camera!.calculateProjection = null as any;
-    this.app.autoRender = true;
-    this.app.xr!.once("end", () => {
-      this.eye.camera!.calculateProjection = (matrix) => this.project(matrix);
-      this.app.autoRender = false;
-      this.redraw();
-    });
     this.eye.camera!.startXr(pc.XRTYPE_VR, pc.XRSPACE_LOCAL, {
       callback: (error) => { if (error) failed(error.message); },
     });
+  }
+
+  // Put the viewer where the camera was, upright and facing the same way.
+  private enterRoom(): void {
+    const { place, turn } = this.viewer, [x, , z] = rotate(turn, [0, 0, 1]);
+    this.room.setPosition(...place);
+    this.room.setEulerAngles(0, (180 / Math.PI) * Math.atan2(x, z), 0);
+  }
+
+  private leaveRoom(): void {
+    this.room.setPosition(0, 0, 0);
+    this.room.setEulerAngles(0, 0, 0);
+    this.view(this.viewer, this.lens);
+    setTimeout(() => this.resize()); // the engine refuses until the session is over
   }
 }

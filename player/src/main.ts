@@ -15,6 +15,7 @@ function content(): ArrayBuffer {
 }
 
 function fail(text: string): void {
+  document.body.classList.remove("ready");
   document.body.classList.add("failed");
   element("message").textContent = text;
 }
@@ -25,23 +26,32 @@ const hasWebGl = (): boolean => {
   return found !== null;
 };
 
+const brief = (t: number): string => String(Number(t.toPrecision(3)));
+
 // ?t=0.5&object=mug&camera=front&ui=0
 function follow(player: Player, address: URLSearchParams): void {
-  const { model } = player, t = Number(address.get("t") ?? NaN), object = address.get("object"), camera = address.get("camera");
+  const { model } = player, time = address.get("t"), object = address.get("object"), camera = address.get("camera");
+  const t = time?.trim() ? Number(time) : NaN, refused: string[] = [];
   if (address.get("ui") === "0") document.body.classList.add("bare");
   if (camera !== null) {
-    const number = model.cameras.findIndex((one, k) => one.name === camera || String(k) === camera);
-    if (number < 0 && camera !== "fly" && camera !== "orbit") player.controls.say(`no camera “${camera}” in this scene`);
+    const named = model.cameras.findIndex((one) => one.name === camera);
+    const number = named < 0 ? model.cameras.findIndex((_, k) => String(k) === camera) : named;
+    if (number < 0 && camera !== "fly" && camera !== "orbit") refused.push(`no camera “${camera}” in this scene`);
     else player.setCamera(number < 0 ? camera : String(number));
   }
   if (object !== null) {
     const [id] = player.controls.find(object);
-    if (id === undefined) player.controls.say(`nothing matches “${object}”`);
+    if (id === undefined) refused.push(`nothing matches “${object}”`);
     else player.choose(id);
     player.controls.find("");
   }
-  if (Number.isFinite(t)) player.go(t);
+  if (time !== null && !Number.isFinite(t)) refused.push(`t=${time} is not a time`);
+  if (Number.isFinite(t)) {
+    player.go(t);
+    if (player.t !== t) refused.push(`t=${time} is outside this scene, which lasts from ${brief(model.start)} to ${brief(model.end)}`);
+  }
   else if (!matchMedia("(prefers-reduced-motion: reduce)").matches) player.play(true);
+  if (refused.length) player.controls.say(refused.join("; "));
 }
 
 async function main(): Promise<void> {

@@ -28,7 +28,7 @@ export class Player {
     this.overlay = new Overlay(element<HTMLCanvasElement>("overlay"), model);
     this.controls = new Controls(this, labels);
     new ResizeObserver(() => this.resize()).observe(engine.canvas);
-    this.resize();
+    this.followRatio();
     this.look();
     this.go(this.t);
   }
@@ -105,9 +105,10 @@ export class Player {
 
   // Object at a point of the picture in CSS pixels, or null.
   pick(x: number, y: number): number | null {
-    const { width, height } = this.size;
-    const lens = this.views.lens(width, height);
-    const found = pick(this.model, this.t, this.views.eye(), lens, Math.floor(x) + 0.5, Math.floor(y) + 0.5, this.hiddenPieces);
+    const { width, height } = this.size, { ratio } = this.engine;
+    const lens = this.views.lens(ratio * width, ratio * height); // of the drawn pixels
+    const [column, row] = [Math.floor(ratio * x) + 0.5, Math.floor(ratio * y) + 0.5];
+    const found = pick(this.model, this.t, this.views.eye(), lens, column, row, this.hiddenPieces);
     return found !== null && found >= 0 ? found : null;
   }
 
@@ -146,6 +147,12 @@ export class Player {
     this.overlay.draw(group, eye, lens, style.getPropertyValue("--past"), style.getPropertyValue("--future"));
     const captured = this.views.captured;
     this.controls.cameraName(captured ? String(this.model.cameras.indexOf(captured)) : this.views.flying ? "fly" : "orbit");
+  }
+
+  // Resize now, and again each time the device's pixels change, as on another screen.
+  private followRatio(): void {
+    this.resize();
+    matchMedia(`(resolution: ${devicePixelRatio}dppx)`).addEventListener("change", () => this.followRatio(), { once: true });
   }
 
   private resize(): void {

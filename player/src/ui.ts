@@ -133,7 +133,9 @@ export class Controls {
     if (!item) return;
     info.append(made("h2", item.name));
     if (item.caption) info.append(made("p", item.caption));
-    info.append(made("p", `Motion: ${item.motion}`), ...this.confidence(item));
+    const { warning } = item.prediction; // has its own line
+    const motion = warning ? item.motion.replaceAll(`; ${warning}`, "").replaceAll(`, ${warning}`, "") : item.motion;
+    info.append(made("p", `Motion: ${motion}`), ...this.confidence(item));
     const isolate = made("button", player.isolated === item.id ? "Show all" : "Isolate");
     isolate.onclick = () => player.isolate(player.isolated === item.id ? null : item.id);
     const focus = made("button", "Look at");

@@ -1,5 +1,5 @@
 // Drives Chromium for the tests: one JSON command per line on stdin, one JSON answer per line on stdout.
-// {"open": URL, "width": W, "height": H, "touch": false, "webgl": true, "still": false}  {"eval": JS}
+// {"open": URL, "width": W, "height": H, "touch": false, "webgl": true, "still": false, "ratio": 1}  {"eval": JS}
 // {"key": KEY}  {"type": TEXT}  {"click": [X, Y]}  {"tap": [X, Y]}  {"shot": FILE}  {"log": true}
 import readline from "node:readline";
 import puppeteer from "puppeteer-core";
@@ -9,7 +9,7 @@ const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swifts
   "--force-color-profile=srgb", "--hide-scrollbars"];
 let browser = null, webgl = true, page = null, log = [], requests = [];
 
-async function open({ open: url, width, height, touch = false, webgl: wanted = true, still = false }) {
+async function open({ open: url, width, height, touch = false, webgl: wanted = true, still = false, ratio = 1 }) {
   if (browser && wanted !== webgl) { await browser.close(); browser = page = null; }
   webgl = wanted;
   browser ??= await puppeteer.launch({
@@ -22,7 +22,7 @@ async function open({ open: url, width, height, touch = false, webgl: wanted = t
   page.on("pageerror", (error) => log.push(String(error.message ?? error)));
   page.on("console", (line) => { if (["error", "warn"].includes(line.type())) log.push(line.text()); });
   page.on("request", (request) => { if (!/^(data|blob):/.test(request.url())) requests.push(request.url()); });
-  await page.setViewport({ width, height, hasTouch: touch, isMobile: touch });
+  await page.setViewport({ width, height, hasTouch: touch, isMobile: touch, deviceScaleFactor: ratio });
   if (still) await page.emulateMediaFeatures([{ name: "prefers-reduced-motion", value: "reduce" }]);
   await page.goto(url);
   await page.waitForFunction("window.r5dgs || document.body.classList.contains('failed')", { timeout: 120000 });

@@ -84,6 +84,20 @@ def test_picking_finds_the_object_of_each_pixel(browser, scene, url):
     assert len(found) >= 3 and all(right == tried for right, tried in found.values())
 
 
+def test_all_pixels_of_a_fine_screen_are_drawn_and_picked(browser, scene, url, tmp_path):
+    seen = dataclasses.replace(scene, cameras=scene.cameras[:1])
+    found = player_checks.compare(browser, seen, url, SIDE, END, tmp_path, ratio=2)
+    assert min(one.psnr for one in found) > 43 and max(one.shift for one in found) < 0.5
+    assert browser.eval("[view.width / view.clientWidth, overlay.width / view.width]") == [2, 1]
+    picked = player_checks.picks(browser, seen, url, SIDE, ratio=2)
+    assert len(picked) >= 2 and all(right == tried for right, tried in picked.values())
+
+
+def test_more_than_two_pixels_per_css_pixel_are_not_drawn(browser, url):
+    browser.open(f"{url}?t=0", ratio=3)
+    assert browser.eval("[view.width / view.clientWidth, overlay.width / view.clientWidth]") == [2, 3]
+
+
 def test_search_ranks_as_query_does(browser, scene, url):
     texts = player_checks.prompts(scene)
     browser.open(url + "?t=0")
@@ -107,7 +121,45 @@ def test_the_address_chooses_time_object_and_camera(browser, scene, url):
     assert "Motion: " in browser.eval("document.getElementById('info').textContent")
     browser.open(f"{url}?t=99&object=zebra&camera=fly")
     assert browser.eval("[r5dgs.t, r5dgs.chosen, r5dgs.views.flying]") == [END, None, True]
-    assert "zebra" in browser.eval("document.getElementById('message').textContent")
+    said = browser.eval("document.getElementById('message').textContent")
+    assert "zebra" in said and "t=99 is outside this scene, which lasts from 0 to 1.3" in said
+    browser.open(f"{url}?t=soon")
+    assert "t=soon is not a time" in browser.eval("document.getElementById('message').textContent")
+
+
+def test_a_name_of_a_camera_wins_over_a_number(browser, scene, tmp_path):
+    names = [dataclasses.replace(camera, name=str((k + 1) % 2)) for k, camera in enumerate(scene.cameras[:2])]
+    browser.open(page_of(dataclasses.replace(scene, cameras=tuple(names)), tmp_path) + "?t=0&camera=1")
+    assert browser.eval("r5dgs.model.cameras.indexOf(r5dgs.views.captured)") == 0
+
+
+def test_vr_starts_at_the_camera_and_gives_it_back(browser, url):
+    browser.open(f"{url}?t=0&camera=0")
+    before = browser.eval("r5dgs.engine.picture()")
+    browser.eval("""(xr = r5dgs.engine.app.xr, eye = r5dgs.engine.eye, place = () => eye.getPosition().toArray(),
+        xr.start = (camera, type, space, options) => options.callback(new Error('denied')), vr.click())""")
+    assert browser.eval("message.textContent") == "denied"
+    assert browser.eval("r5dgs.engine.picture()") == before
+    browser.eval("""void (fire = (name) => {
+        xr._session = Object.assign(new EventTarget(), { enabledFeatures: [], inputSources: [] });
+        xr.fire(name); xr._session = null; })""")
+    browser.eval("(fire('start'), eye.setLocalPosition(0, 0, 0), eye.setLocalEulerAngles(0, 0, 0))")
+    assert browser.eval("place()") == pytest.approx(browser.eval("r5dgs.views.eye().place"), abs=1e-5)
+    ahead, wanted = browser.eval("[eye.forward.toArray(), r5dgs.views.eye().turn]")
+    x, y, z, w = wanted
+    forward = np.array([-2 * (x * z + w * y), 0, -1 + 2 * (x * x + y * y)])
+    assert ahead == pytest.approx(forward / np.linalg.norm(forward), abs=1e-5)
+    browser.eval("(eye.setLocalPosition(0.3, 0, 0), fire('end'))")
+    assert browser.eval("r5dgs.engine.picture()") == before
+
+
+def test_a_warning_is_shown_once(browser, scene, url):
+    browser.open(f"{url}?t=0&object=mug")
+    browser.eval("""(item = r5dgs.model.object(r5dgs.chosen), item.prediction.warning = 'not predictable past 1.2',
+        item.motion = 'spin; hit at 0.5, not predictable past 1.2', r5dgs.controls.marks())""")
+    shown = browser.eval("[...document.querySelectorAll('#info p')].map((line) => line.textContent)")
+    assert "Motion: spin; hit at 0.5" in shown and shown.count("not predictable past 1.2") == 1
+    assert sum("not predictable" in line for line in shown) == 1
 
 
 def test_it_plays_and_loops_unless_motion_is_reduced(browser, url):
@@ -156,6 +208,12 @@ def test_hiding_an_object_hides_its_shadow(browser, scene, url):
     assert sorted(browser.eval(hidden)) == [[0, "shadow"], [1, "body"]]
 
 
+def boxes_of(*selectors):
+    """Script whose value is left, top, right and bottom of elements, in CSS pixels."""
+    return f"""{list(selectors)}.map((one) => document.querySelector(one).getBoundingClientRect())
+        .map((b) => [b.left, b.top, b.right, b.bottom])"""
+
+
 def test_it_fits_a_phone(browser, url, tmp_path):
     browser.open(f"{url}?t=0.4&object=mug", 360, 640, touch=True)
     assert browser.eval("document.documentElement.scrollWidth") <= 360
@@ -166,6 +224,10 @@ def test_it_fits_a_phone(browser, url, tmp_path):
         .filter((e) => !(e.getAttribute('aria-label') || e.textContent.trim() || e.closest('label')))
         .map((e) => e.outerHTML)""")
     assert unnamed == []
+    fold, info = browser.eval(boxes_of("aside", "#info"))
+    assert fold[3] <= info[1]
+    marks = browser.eval(boxes_of("#marks span:first-child", "#marks span:last-child", "#now"))
+    assert marks[0][2] < marks[1][0] and marks[1][2] < marks[2][0]
     browser.eval("r5dgs.engine.settle()")
     browser.send(shot=str(tmp_path / "phone.png"))
     assert (tmp_path / "phone.png").stat().st_size > 5000
@@ -176,6 +238,8 @@ def test_without_webgl_a_picture_and_a_message_are_shown(browser, url):
     assert "WebGL 2 is missing" in browser.eval("document.getElementById('message').textContent")
     assert browser.eval("document.getElementById('still').naturalWidth") == 40
     assert browser.eval("getComputedStyle(document.getElementById('still')).display") != "none"
+    still, message = browser.eval(boxes_of("#still", "#message"))
+    assert still[3] - still[1] > 200 and still[3] <= message[1] and message[3] <= 400
     assert_quiet(browser, url)
 
 

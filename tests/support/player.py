@@ -61,8 +61,8 @@ class Browser:
         assert "error" not in answer, answer["error"]
         return answer["result"]
 
-    def open(self, url: str, width: int = 640, height: int = 400, **options: bool) -> None:
-        """Open an address and wait until the player is ready or has failed."""
+    def open(self, url: str, width: int = 640, height: int = 400, **options: float) -> None:
+        """Open an address in a window of a size in CSS pixels, and wait until the player is ready or has failed."""
         self.send(open=url, width=width, height=height, **options)
 
     def eval(self, code: str) -> Any:

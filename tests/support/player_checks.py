@@ -51,7 +51,9 @@ def shown_times(scene: Scene, end: float) -> list[float]:
     return [first, 0.5 * (first + last), last, 0.5 * (last + end), end]
 
 
-def compare(browser: Browser, scene: Scene, url: str, side: int, end: float, folder: Path) -> list[Comparison]:
+def compare(
+    browser: Browser, scene: Scene, url: str, side: int, end: float, folder: Path, ratio: int = 1
+) -> list[Comparison]:
     """Compare pictures of some captured cameras at `shown_times`.
 
     Args:
@@ -61,11 +63,13 @@ def compare(browser: Browser, scene: Scene, url: str, side: int, end: float, fol
         side: Longest side of the pictures.
         end: Last scene time of the page.
         folder: Existing folder for files.
+        ratio: Pixels of the device per CSS pixel.
     """
     player, found = Player(scene), []
     for number in shown_cameras(scene):
         camera = viewpoints.resized(scene.cameras[number], side)
-        browser.open(f"{url}?ui=0&t={scene.t_max}&camera={number}", camera.width, camera.height)
+        window = (camera.width // ratio, camera.height // ratio)
+        browser.open(f"{url}?ui=0&t={scene.t_max}&camera={number}", *window, ratio=ratio)
         for t in shown_times(scene, end):
             data = browser.eval(f"(r5dgs.go({t}), r5dgs.engine.picture())").partition(",")[2]
             path = folder / "picture.png"
@@ -97,8 +101,10 @@ def _shift(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.hypot(*moved))
 
 
-def picks(browser: Browser, scene: Scene, url: str, side: int, count: int = 50) -> dict[int, tuple[int, int]]:
-    """Pick visible pixels of each object in captured views at t_max.
+def picks(
+    browser: Browser, scene: Scene, url: str, side: int, count: int = 50, ratio: int = 1
+) -> dict[int, tuple[int, int]]:
+    """Pick visible pixels of each object in captured views at t_max, with a number of pixels per CSS pixel.
 
     Returns:
         Numbers of right and of tried pixels by object id.
@@ -107,12 +113,13 @@ def picks(browser: Browser, scene: Scene, url: str, side: int, count: int = 50) 
     for number in shown_cameras(scene):
         camera = viewpoints.resized(scene.cameras[number], side)
         ids = scene_renderer.render(player, camera, scene.t_max).ids
-        browser.open(f"{url}?ui=0&t={scene.t_max}&camera={number}", camera.width, camera.height)
+        window = (camera.width // ratio, camera.height // ratio)
+        browser.open(f"{url}?ui=0&t={scene.t_max}&camera={number}", *window, ratio=ratio)
         for object_id in np.unique(ids[ids > 0]).tolist():
             seen = np.argwhere(ids == object_id).tolist()
             if object_id not in result and len(seen) >= count:
                 pixels = random_.sample(seen, count)
-                found = browser.eval(f"{pixels}.map(([y, x]) => r5dgs.pick(x, y))")
+                found = browser.eval(f"{pixels}.map(([y, x]) => r5dgs.pick(x / {ratio}, y / {ratio}))")
                 result[object_id] = (found.count(object_id), count)
     return result
 
