@@ -6,7 +6,7 @@ Axes: ``gaussians``, ``lines`` (of the images), ``views``, ``times``, ``objects`
 others stay as in `BASE`. Each case is a capture of moving balls (`benchmarks.training.memory`), which a process of its
 own reads, trains, bakes, evaluates, associates, stores and plays; Blender loads and plays the scene if bpy is
 installed. Prints processor seconds and peak memory of each phase. ``exponent`` is the slope of the logarithm of the
-seconds between the two largest cases, where constant costs matter least. Results: docs/results/scaling.md.
+seconds between the two largest cases, where constant costs matter least. Results: docs/results/training.md.
 """
 
 from __future__ import annotations

@@ -137,12 +137,17 @@ def test_a_bake_ends_with_the_process_that_started_it():
 def test_a_signal_ends_the_view_and_removes_its_files(run, tmp_path, number):
     (tmp_path / "temporary").mkdir()
     settings = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path / "temporary")}
-    command = [sys.executable, "-m", "r5dgs_core", "view", "--live", str(run), "--no-browser"]
+    code = f"import signal; signal.signal(signal.{number}, signal.SIG_DFL); "  # nohup ignores one of them
+    code += "import sys; from r5dgs_core.cli import main; sys.exit(main.main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "view", "--live", str(run), "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=settings) as process:
-        assert "http://" in process.stdout.readline()
-        assert list((tmp_path / "temporary").glob("r5dgs_live_*"))
-        process.send_signal(getattr(signal, number))
-        assert process.wait(patience.PATIENCE_S) == 0
+        try:
+            assert "http://" in process.stdout.readline()
+            assert list((tmp_path / "temporary").glob("r5dgs_live_*"))
+            process.send_signal(getattr(signal, number))
+            assert process.wait(patience.PATIENCE_S) == 0
+        finally:
+            process.kill()
     assert not list((tmp_path / "temporary").glob("r5dgs_live_*"))
 
 
