@@ -475,6 +475,8 @@ NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, fo
     ["report", "nowhere", "--out", "report", "--repeats", "0"],
     ["report", "--stability", "--json", "nowhere/rows.json"],
     ["report"],
+    ["batch", "nowhere.toml", "--out", "runs"],
+    ["batch", "nowhere.toml", "--out", "runs", "--jobs", "0"],
     ["bench", "nowhere", "--out", "tables"],
     ["bench", "nowhere", "--out", "tables", "--variants", "best"],
     ["render", "nowhere", "--out", "film.mp4"],
