@@ -159,7 +159,9 @@ def _release(body: RigidBody, step: float) -> None:
         ob.rotation_quaternion = Quaternion(body.spin, since * body.spin.length) @ body.turn
         ob.keyframe_insert("location", frame=frame)
         ob.keyframe_insert("rotation_quaternion", frame=frame)
-    for curve in ob.animation_data.action.fcurves:
+    action = ob.animation_data.action
+    owner = action if hasattr(action, "fcurves") else action.layers[0].strips[0].channelbags[0]  # since Blender 5.0
+    for curve in owner.fcurves:
         for point in curve.keyframe_points:
             point.interpolation = "LINEAR"
     for kinematic, frame in ((True, FIRST_FRAME), (False, FIRST_FRAME + 1)):
