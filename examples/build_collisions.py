@@ -131,15 +131,10 @@ def main(arguments: Sequence[str]) -> None:
     parser = stage.parser("build_collisions.py", __doc__.split("\n", 1)[0])
     parser.add_argument("number", type=int, choices=range(len(parameters.KINDS)), help="which scene")
     parser.add_argument("--seed", type=int, default=parameters.SEED, help="seed of the parameters")
-    parser.add_argument("--size", type=int, default=128, help="width and height of the images in pixels")
-    parser.add_argument("--samples", type=int, default=8, help="Cycles samples per pixel")
-    parser.add_argument("--views", type=int, default=8, help="observed cameras")
-    parser.add_argument("--threads", type=int, default=0, help="threads of Cycles, 0 for one per core")
+    stage.add_rendering(parser, samples=8, views=8)
     chosen = parser.parse_args(arguments)
     drawn, _ = build(chosen.number, chosen.seed)
-    if chosen.threads > 0:
-        render = bpy.context.scene.render
-        render.threads_mode, render.threads = "FIXED", chosen.threads
+    stage.use_threads(chosen.threads)
     if chosen.blend is not None:
         stage.save(chosen.blend)
     if chosen.dataset is not None:

@@ -14,8 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
-import bpy
-
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import rooms
 from building import stage
@@ -68,12 +66,9 @@ def room_settings(
 def _parser() -> argparse.ArgumentParser:
     parser = stage.parser("build_rooms.py", __doc__.split("\n", 1)[0])
     parser.add_argument("scene", choices=sorted(rooms.SCENES), help="which scene")
-    parser.add_argument("--size", type=int, default=128, help="width and height of the images in pixels")
-    parser.add_argument("--samples", type=int, default=24, help="Cycles samples per pixel")
-    parser.add_argument("--views", type=int, default=12, help="observed cameras")
+    stage.add_rendering(parser, samples=24, views=12)
     parser.add_argument("--novel", type=int, default=2, help="cameras between them, for val and test")
     parser.add_argument("--frame-step", type=int, default=4, help="distance of captured frames, of 61 in total")
-    parser.add_argument("--threads", type=int, default=0, help="threads of Cycles, 0 for one per core")
     return parser
 
 
@@ -81,9 +76,7 @@ def main(arguments: Sequence[str]) -> None:
     """Build a scene, and save or capture it."""
     chosen = _parser().parse_args(arguments)
     rooms.SCENES[chosen.scene]()
-    if chosen.threads > 0:
-        render = bpy.context.scene.render
-        render.threads_mode, render.threads = "FIXED", chosen.threads
+    stage.use_threads(chosen.threads)
     if chosen.blend is not None:
         stage.save(chosen.blend)
     if chosen.dataset is not None:

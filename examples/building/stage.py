@@ -101,6 +101,21 @@ def capture(service: ModuleType, settings) -> None:
     print(f"{result.directory}: {result.images}, objects {result.objects}, not seen {result.unseen or 'none'}")
 
 
+def add_rendering(parser: argparse.ArgumentParser, samples: int, views: int) -> None:
+    """Add the options of rendered images, with default numbers of Cycles samples per pixel and of observed cameras."""
+    parser.add_argument("--size", type=int, default=128, help="width and height of the images in pixels")
+    parser.add_argument("--samples", type=int, default=samples, help="Cycles samples per pixel")
+    parser.add_argument("--views", type=int, default=views, help="observed cameras")
+    parser.add_argument("--threads", type=int, default=0, help="threads of Cycles, 0 for one per core")
+
+
+def use_threads(count: int) -> None:
+    """Set the number of threads of Cycles; 0 keeps one per core."""
+    if count > 0:
+        render = bpy.context.scene.render
+        render.threads_mode, render.threads = "FIXED", count
+
+
 def parser(prog: str, description: str) -> argparse.ArgumentParser:
     """Return a parser with the arguments of all builders."""
     built = argparse.ArgumentParser(prog=prog, description=description)
