@@ -14,7 +14,6 @@ from ..errors import BackendError, ConfigError, TrainingError
 from . import table
 
 RESULT_FILE, TABLE_FILE, JOBS_FOLDER = "batch.json", "table.md", "jobs"
-CLUSTERS = ("local", "slurm")
 LIMIT_MIN = 7 * 24 * 60  # maximum duration of a local job by default, minutes; Slurm has limits of its own
 POLL_S = 1.0
 
@@ -44,7 +43,7 @@ def executor(cluster: str, folder: Path, resources: dict[str, Any]) -> Any:
     """Return the executor of submitit for a cluster.
 
     Args:
-        cluster: From `CLUSTERS`.
+        cluster: "local" or "slurm".
         folder: Folder for the files of the jobs.
         resources: Parameters of submitit.
 

@@ -71,7 +71,7 @@ class Format:
         has_objects: True if a file holds objects, so that `Options.object_ids` applies.
         has_motion: True if a file holds the motion up to `Options.until`; `Options.times` then do not apply.
         has_still: True if a file holds `Options.still`.
-        losses: Returns sentences about the parts of the exported part of a scene that a file does not hold.
+        losses: Returns sentences about what a file loses of the exported objects.
         extra: Extra of ``pip install r5dgs[extra]`` that it needs, or None.
         packages: Packages of the extra that `write` imports.
         program: Program that `write` runs, or None.

@@ -42,7 +42,6 @@ from .initialization import free_space, run_start
 from .refinement import rig
 from .refinement.refinement import RefinedViews, Refinement
 from .representations import fused_posing, registry, still
-from .representations.representation import FIELD
 from .running_loss import CHECK_EVERY, RunningLoss, require_finite_state, require_finite_step
 from .step_graphs import StepInputs
 from .targets import Targets
@@ -291,9 +290,8 @@ class Trainer:
             rest.grad[:, (self.iteration // every + 1) ** 2 - 1 :] = 0.0
 
     def _maintain(self) -> None:
-        free, due = self._free_space, self.iteration % free_space.CLEAR_EVERY == 0
-        if free is not None and due and self.motion.name != FIELD:  # a field also moves Gaussians of the background
-            free_space.clear(free, self.gaussians)
+        if self._free_space is not None and self.iteration % free_space.CLEAR_EVERY == 0:
+            free_space.clear(self._free_space, self.gaussians)
         self.motion.after_step(self.gaussians, self.iteration, self.generator)
         self.densifier.after_step(
             self.gaussians, self.optimizer, self.iteration, self.rates.at("means", self.iteration)

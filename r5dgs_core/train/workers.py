@@ -22,9 +22,8 @@ from ..errors import ConfigError, Interrupted, TrainingError
 
 Item = TypeVar("Item")
 
-LONGEST = timedelta(
-    days=1
-)  # others wait while the leading process searches for objects; broken connections end at once
+# Others wait while the leading process searches for objects; broken connections end at once.
+LONGEST = timedelta(days=1)
 ATTEMPT = timedelta(seconds=3)
 LEADER = "r5dgs.leader"  # key of the port of the leading process
 

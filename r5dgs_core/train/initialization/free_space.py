@@ -83,7 +83,7 @@ def clear(space: FreeSpace, gaussians: Gaussians) -> None:
 
 
 def _depths(views: Sequence[TrainView], times: np.ndarray, places: ObjectPositions) -> np.ndarray:
-    """Return the depths up to which a camera sees no background, 0 where no mask shows an object. [h, w] float32"""
+    """Return the depths up to which a camera sees no background, 0 if no mask shows an object. [h, w] float32"""
     camera = views[0].camera
     stride = -(-camera.height // LINES)
     rows, columns = (np.arange(stride // 2, size, stride) for size in (camera.height, camera.width))
