@@ -125,10 +125,10 @@ def _serve(find: Callable[[str], Page | None], port: int, browser: bool) -> None
     """Serve pages until Ctrl-C."""
     with page_server.serving(find, port) as server:
         address = f"http://{page_server.HOST}:{server.server_port}/"
-        print(f"{address} (end with Ctrl-C)", flush=True)
-        if browser:
-            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-        try:
+        try:  # Ctrl-C may arrive as soon as the address is visible
+            print(f"{address} (end with Ctrl-C)", flush=True)
+            if browser:
+                threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
             server.serve_forever()
         except KeyboardInterrupt:
             print()

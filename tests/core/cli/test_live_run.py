@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from r5dgs_core.cli import live_bake, live_run
+from r5dgs_core.cli.commands import view
 from tests.support import patience
 from tests.support.command_line import complaint
 
@@ -149,6 +150,19 @@ def test_a_signal_ends_the_view_and_removes_its_files(run, tmp_path, number):
         finally:
             process.kill()
     assert not list((tmp_path / "temporary").glob("r5dgs_live_*"))
+
+
+def test_ctrl_c_ends_the_view_as_soon_as_the_address_is_visible(monkeypatch):
+    printed = []
+
+    def interrupted(*words, **options):
+        printed.append(words)
+        if len(printed) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(view, "print", interrupted, raising=False)
+    view._serve({}.get, 0, browser=False)
+    assert "http://" in printed[0][0]
 
 
 @pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="needs Linux")
