@@ -41,6 +41,9 @@ def steps(
         every: True for the scene's frame range, False for the current frame.
         step: Number of frames from one exported frame to the next.
 
+    Returns:
+        The outcome, with a warning for each part of the scene that the format loses.
+
     Raises:
         ConfigError: Nothing to export is visible at the current frame, or a point cloud has lost its points.
         SceneFileError: The scene's own file is missing, or a file cannot be written.
@@ -67,7 +70,8 @@ def steps(
     except OSError as error:
         raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
     files = path.name if targets == [path] else plural.of(len(targets), "file")
-    return Outcome(f"{files}: {format.label} of {plural.of(len(clouds), 'cloud')}", edited.notes)
+    lost = [f"Lost in this format: {sentence}" for sentence in format.losses(edited.scene, options)]
+    return Outcome(f"{files}: {format.label} of {plural.of(len(clouds), 'cloud')}", [*edited.notes, *lost])
 
 
 def _by_worker(

@@ -75,13 +75,15 @@ def test_the_format_of_the_developers_page_appears_in_blender(blender, loaded, c
 
 
 @pytest.mark.parametrize(("name", "suffix"), [("poses", "json"), ("tum", "txt"), ("glb", "glb"), ("usd", "usd")])
-def test_formats_with_motion_or_poses_are_written(blender, loaded, tmp_path, name, suffix):
+def test_formats_with_motion_or_poses_are_written_and_losses_reported(blender, loaded, tmp_path, capfd, name, suffix):
     if (reason := registry.get(name).why_unavailable()) is not None:
         pytest.skip(reason)
     path = tmp_path / f"a.{suffix}"
     assert blender.ops.r5dgs.export_format(format=name, filepath=str(path), frames="RANGE") == {"FINISHED"}
     found = sorted(tmp_path.glob(f"a*.{suffix}"))
     assert len(found) == (3 if name == "tum" else 1) and all(one.stat().st_size for one in found)
+    said = capfd.readouterr().out
+    assert ("Warning: Lost in this format: identity encodings" in said) == (name in ("glb", "usd"))
 
 
 def test_without_the_format_there_is_no_button(blender, loaded, tmp_path, monkeypatch):
@@ -160,11 +162,13 @@ def test_a_format_whose_package_is_missing_is_disabled_with_the_reason(blender, 
     assert reason in str(refused.value) and not (tmp_path / "a.csv").exists()
 
 
-def test_a_format_whose_package_only_the_worker_has_is_written_there(blender, loaded, tmp_path, monkeypatch):
+def test_a_format_whose_package_only_the_worker_has_is_written_there(blender, loaded, tmp_path, monkeypatch, capfd):
     options = {"format": "poses", "frames": "RANGE"}
     assert blender.ops.r5dgs.export_format(filepath=str(tmp_path / "own.json"), **options) == {"FINISHED"}
     module = importlib.import_module("r5dgs_core.formats.poses")
-    lacking = dataclasses.replace(module.FORMAT, extra="tables", packages=("no_such_package",))
+    lacking = dataclasses.replace(
+        module.FORMAT, losses=lambda scene, options: ["a hue"], extra="tables", packages=("no_such_package",)
+    )
     monkeypatch.setattr(module, "FORMAT", lacking)  # the worker is another process
     jobs = importlib.import_module("r5dgs.r5dgs_addon.worker.jobs")
     jobs.stop()
@@ -176,5 +180,6 @@ def test_a_format_whose_package_only_the_worker_has_is_written_there(blender, lo
     found, expected = (np.array(re.findall(number, text), float) for text in (written, own))
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
     assert "poses" in jobs.formats() and "Keeps: " in tooltip(blender, "poses")
+    assert "Warning: Lost in this format: a hue" in capfd.readouterr().out
     with pytest.raises(RuntimeError, match="cannot be written"):
         blender.ops.r5dgs.export_format(filepath=str(tmp_path / "missing" / "a.json"), **options)
