@@ -5,6 +5,7 @@ A path without read permission passes: the code that opens it reports the reason
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -54,7 +55,7 @@ def check_scene_output(out: Path) -> None:
 
     Raises:
         UsageError: The name has another suffix.
-        SceneFileError: The path is a folder, or lies in a folder that does not exist.
+        SceneFileError: The path is a folder, or lies in a folder that does not exist or cannot be written.
     """
     if out.is_dir():
         raise errors.SceneFileError(f"{out}: is a folder; name the file, for example {out / 'scene.r5dgs'}")
@@ -62,13 +63,17 @@ def check_scene_output(out: Path) -> None:
         raise errors.UsageError(f"{out}: expected a name that ends in {SCENE_SUFFIX}, which Blender filters files by")
     if not out.parent.is_dir():
         raise errors.SceneFileError(f"{out}: expected the folder {out.parent} to exist; create it first")
+    if not _is_writable(out.parent):
+        raise errors.SceneFileError(f"{out}: {_not_writable(out.parent)}")
 
 
 def check_output(option: str, path: Path | None) -> None:
-    """Raise `ConfigError` if the file that an option names is a folder, or its folder is missing."""
+    """Raise `ConfigError` if the file that an option names is a folder, or its folder is missing or not writable."""
     if path is not None and (path.is_dir() or not path.parent.is_dir()):
         expected = "a file" if path.is_dir() else f"the folder {path.parent} to exist; create it first"
         raise errors.ConfigError(f"{option} {path}: expected {expected}")
+    if path is not None and not _is_writable(path.parent):
+        raise errors.ConfigError(f"{option} {path}: {_not_writable(path.parent)}")
 
 
 def check_output_folder(option: str, path: Path) -> None:
@@ -93,6 +98,14 @@ def prepare_command(source: Path) -> str:
     """Return the command that makes a data set from a folder of videos or distorted images, for messages."""
     out = source.with_name(f"{source.name}_data")
     return f"r5dgs prepare {shlex.quote(str(source))} --out {shlex.quote(str(out))}"
+
+
+def _is_writable(folder: Path) -> bool:
+    return os.access(folder, os.W_OK | os.X_OK)
+
+
+def _not_writable(folder: Path) -> str:
+    return f"no write access to the folder {folder}; choose another folder"
 
 
 def _found(path: Path) -> str:

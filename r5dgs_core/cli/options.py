@@ -52,7 +52,10 @@ def add_settings(p: argparse.ArgumentParser) -> None:
 
 def add_lpips(p: argparse.ArgumentParser) -> None:
     """Add ``--lpips``."""
-    shown = "files of features and heads for LPIPS (default: the user's setting metrics.lpips_weights)"
+    shown = (
+        "files of features and heads for LPIPS, after all other arguments (default: the user's setting "
+        "metrics.lpips_weights)"
+    )
     p.add_argument("--lpips", type=Path, nargs="+", metavar="FILE", help=shown)
 
 

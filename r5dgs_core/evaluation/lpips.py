@@ -178,7 +178,7 @@ def _read(path: Path) -> Tensors:
     except errors.BackendError:
         raise
     except Exception as error:  # the libraries raise many types for damaged files
-        reason = " ".join(str(error).split())[:120]
+        reason = getattr(error, "strerror", None) or "not a file of tensors without code"
         raise errors.BackendError(f"--lpips {path}: cannot be read ({reason}); {REMEDY}") from error
     if not isinstance(content, dict) or not all(isinstance(value, torch.Tensor) for value in content.values()):
         raise errors.BackendError(f"--lpips {path}: expected tensors by name, found other content; {REMEDY}")

@@ -107,7 +107,7 @@ def claim(folder: Path, settings: dict[str, Any], *, overwrite: bool = False) ->
                 frame.unlink(missing_ok=True)
             atomic_files.write(path, json.dumps(settings, indent=1).encode())
     except OSError as error:
-        raise errors.ConfigError(f"--out {folder}: cannot be written ({error})") from error
+        raise errors.ConfigError(f"--out {folder}: cannot be written ({error.strerror or error})") from error
 
 
 def _create_settings(path: Path, settings: dict[str, Any]) -> bool:

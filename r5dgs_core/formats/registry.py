@@ -162,4 +162,5 @@ def writing(path: Path, also: tuple[type[Exception], ...] = ()) -> Iterator[None
     try:
         yield
     except (OSError, *also) as error:
-        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
+        reason = getattr(error, "strerror", None) or error  # without the name of the temporary file
+        raise errors.SceneFileError(f"{path}: cannot be written: {reason}") from error

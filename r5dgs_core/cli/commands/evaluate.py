@@ -66,7 +66,7 @@ def run_evaluate(
         The evaluation, in the form of ``evaluation.json``.
     """
     _check(target, data, modes, json_path)
-    weights = options.lpips_files(lpips)
+    weights = options.lpips_network(options.lpips_files(lpips))
 
     from ...evaluation import evaluate, evaluation_table
     from ...progress import make
@@ -87,7 +87,7 @@ def run_evaluate(
             modes=modes,
             train=scene.provenance.get("train"),
             align=align,
-            perceptual=options.lpips_network(weights),
+            perceptual=weights,
             progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
         )
     if progress_kind != "json":

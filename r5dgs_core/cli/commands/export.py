@@ -42,9 +42,12 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     when.add_argument("--time", type=times, metavar="T", help=time)
     frames = "range of Blender frames, both included; frame 1 is scene time 0"
     when.add_argument("--frames", type=frame_range, metavar="A:B", help=frames)
-    until = "last scene time in files with motion (default: a third of the observed span after t_max, at least 1)"
+    until = (
+        "last scene time in files with motion (default: a third of the observed span after t_max, or scene time 1 if "
+        "later)"
+    )
     when.add_argument("--until", type=float, metavar="T", help=until)
-    p.add_argument("--objects", metavar="WORDS", help="objects to export: 'red mug', 'all except the table'")
+    p.add_argument("--objects", metavar="WORDS", help="objects to export: 'red mug', 'all except the background'")
     p.add_argument("--overwrite", action="store_true", help="replace existing files")
     options.add_progress(p)
 
@@ -256,7 +259,10 @@ def object_ids(scene: Scene, words: str, option: str = "--objects") -> frozenset
 
     if not object_search.phrases_of(words):
         raise errors.UsageError(f"{option} {words!r}: expected words for objects, such as 'red mug'")
-    found = object_search.search(scene, words)
+    try:
+        found = object_search.search(scene, words)
+    except errors.ConfigError as error:
+        raise type(error)(f"{option}: {error}") from error
     missing = query.unanswered(scene, words) if found else [words]
     if missing:
         labels = [label for label in object_search.labels_of(scene) if label.object_id > 0]

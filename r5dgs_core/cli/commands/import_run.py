@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 NAME = "import"
 SHORT = "convert a run of 3DGS or a related program, or an exported scene, to a scene file"
 LONG = (
-    "Read a run folder of 3DGS, Gaussian Grouping, Deformable-3DGS, TRACE or FreeGave, or a .glb file that\n"
-    "'r5dgs export' wrote, and write a scene file."
+    "Read a run folder of 3DGS, Gaussian Grouping, Deformable-3DGS, TRACE or FreeGave, or a .glb or .4dgs file\n"
+    "that 'r5dgs export' wrote, and write a scene file."
 )
 EXAMPLE = "OUTPUT --data DATA --out scene.r5dgs"
 PAGE = "user/import.md"
@@ -39,27 +39,33 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--world", choices=WORLDS, help="world axes (default: those of the data set)")
     still = "largest motion that counts as rest, as a share of the extent"
     p.add_argument("--still", type=options.not_negative, metavar="SHARE", help=still)
+    p.add_argument("--overwrite", action="store_true", help="replace an existing scene file")
     options.add_progress(p)
 
 
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
     names = ("iteration", "data", "knots", "t_max", "world", "still")
-    run_import(args.run, args.out, progress_kind=args.progress, **{name: getattr(args, name) for name in names})
+    given = {name: getattr(args, name) for name in names}
+    run_import(args.run, args.out, overwrite=args.overwrite, progress_kind=args.progress, **given)
 
 
 @folder_lock.writes("out")
-def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **fields: Any) -> None:
+def run_import(
+    run_folder: Path, out: Path, *, overwrite: bool = False, progress_kind: str = "none", **fields: Any
+) -> None:
     """Convert a run folder of another program (`importing.importer.import_run`), or an exported file, to a scene file.
 
     Args:
         run_folder: Run folder of the other program, or file of ``r5dgs export --to glb`` or ``4dgs``.
         out: Scene file to write.
+        overwrite: True to replace an existing file.
         progress_kind: Form of progress output (`progress.make`).
         **fields: Fields of `importing.importer.Options`; all None for a file.
 
     Raises:
         UsageError: ``out`` has another suffix, or an option does not apply to a file.
+        ConfigError: ``out`` exists.
     """
     input_paths.check_scene_output(out)
     given = {name: value for name, value in fields.items() if value is not None}
@@ -69,6 +75,8 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **fi
         raise errors.UsageError(f"{option}: applies to run folders only, and {run_folder} is a file; leave it out")
     if not is_file:
         input_paths.check_foreign_run(run_folder)
+    if out.exists() and not overwrite:
+        raise errors.ConfigError(f"{out}: the file exists; replace it with --overwrite, or choose another name")
     if "data" in given:
         inputs.check_dataset(given["data"])
     from ...progress import make

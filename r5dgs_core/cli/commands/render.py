@@ -52,7 +52,7 @@ def _add_content(p: argparse.ArgumentParser) -> None:
     p.add_argument("--fps", type=options.positive, metavar="N", help="frames per second (default: 24)")
     mode = f"playback mode past t_max, one of {', '.join(modes.every())} (default: rigid)"
     p.add_argument("--mode", default="rigid", metavar="MODE", help=mode)
-    p.add_argument("--objects", metavar="WORDS", help="objects to show: 'red mug', 'all except the table'")
+    p.add_argument("--objects", metavar="WORDS", help="objects to show: 'red mug', 'all except the background'")
     p.add_argument("--hide", metavar="WORDS", help="objects to leave out, with their shadows")
 
 

@@ -30,9 +30,9 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     p.add_argument("file", type=Path, metavar="SCENE|RUN", help=".r5dgs file, or with --live a run folder")
     p.add_argument("--live", action="store_true", help="follow the training of a run folder")
-    until = "last scene time (default: a third of the observed span after t_max)"
+    until = "last scene time (default: a third of the observed span after t_max, or scene time 1 if later)"
     p.add_argument("--until", type=float, metavar="T", help=until)
-    p.add_argument("--objects", metavar="WORDS", help="objects to show: 'red mug', 'all except the table'")
+    p.add_argument("--objects", metavar="WORDS", help="objects to show: 'red mug', 'all except the background'")
     p.add_argument("--port", type=int, default=0, metavar="N", help="port to listen on (default: a free one)")
     p.add_argument("--no-browser", action="store_true", help="print the address without opening a browser")
 
@@ -57,9 +57,13 @@ def run_view(
 
     Raises:
         UsageError: ``until``, ``words`` or ``port`` cannot be used.
+        SceneFileError: The path is not a scene file.
         ConfigError: No object matches the words, or the port is taken.
     """
     _check_port(port)
+    if (path / input_paths.RUN_FILE).is_file():
+        found = "found a run folder; show it with --live, or make a scene file with 'r5dgs bake'"
+        raise errors.SceneFileError(f"{path}: expected a {input_paths.SCENE_SUFFIX} file, {found}")
     input_paths.check_scene(path)
     from ...formats import html
     from ...scene import scene_file

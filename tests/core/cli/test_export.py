@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 
 import numpy as np
 import pytest
@@ -62,6 +63,21 @@ def test_objects_are_chosen_by_words(path, scene, tmp_path, capsys):
     for words in ("zebra", "cup and zebra"):
         line = complaint(capsys, "export", path, "--to", "ply", "--out", tmp_path / "b.ply", "--objects", words)
         assert "zebra" in line and not (tmp_path / "b.ply").exists()
+
+
+def test_an_unknown_excluded_object_is_named_with_the_option(path, tmp_path, capsys):
+    words = "all except the zebra"
+    line = complaint(capsys, "export", path, "--to", "ply", "--out", tmp_path / "a.ply", "--objects", words)
+    assert line.startswith(f"r5dgs: --objects: {words!r} excludes an unknown object")
+
+
+def test_a_folder_without_write_access_is_named_before_the_scene_is_read(path, tmp_path, capsys, monkeypatch):
+    path.write_bytes(b"damaged")
+    monkeypatch.setattr(os, "access", lambda folder, mode: folder != tmp_path)
+    line = complaint(capsys, "export", path, "--to", "html", "--out", tmp_path / "a.html")
+    assert f"--out {tmp_path / 'a.html'}: no write access to the folder {tmp_path}" in line
+    line = complaint(capsys, "import", tmp_path, "--out", tmp_path / "a.r5dgs")
+    assert f"{tmp_path / 'a.r5dgs'}: no write access to the folder {tmp_path}" in line
 
 
 def test_cameras_are_those_of_the_scene(path, scene, tmp_path):

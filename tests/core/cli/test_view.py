@@ -61,3 +61,5 @@ def test_wrong_arguments_are_named(port, tmp_path, capsys):
     assert "--until" in complaint(capsys, "view", path, "--until", "0.1", status=2)
     assert "zebra" in complaint(capsys, "view", path, "--objects", "zebra")
     assert f"--port {port}: cannot be used" in complaint(capsys, "view", path, "--port", port)
+    (tmp_path / "run.json").write_text("{}")
+    assert "found a run folder; show it with --live" in complaint(capsys, "view", tmp_path)

@@ -246,6 +246,11 @@ def test_import_gives_the_scene_back(tmp_path, capsys):
     assert "not kept: bending" in said and "lost here: identity encodings" in said
     assert main.main(["import", str(tmp_path / "a.glb"), "--out", str(tmp_path / "b.r5dgs")]) == 0
     again = scene_file.read(tmp_path / "b.r5dgs")
+    arguments = ("import", tmp_path / "a.glb", "--out", source)
+    assert "replace it with --overwrite" in complaint(capsys, *arguments)
+    np.testing.assert_array_equal(scene_file.read(source).gaussians.means, scene.gaussians.means)
+    assert main.main([*map(str, arguments), "--overwrite"]) == 0
+    np.testing.assert_array_equal(scene_file.read(source).gaussians.means, again.gaussians.means)
     for name in ("name", "t_max", "frames_per_unit", "world_convention", "objects", "near_plane"):
         assert getattr(again, name) == getattr(scene, name), name
     assert [g.model.to_dict() for g in again.groups] == [g.model.to_dict() for g in scene.groups]

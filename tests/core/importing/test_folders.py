@@ -291,12 +291,13 @@ def test_the_command_writes_a_scene_that_info_reads(deformed, tmp_path, capsys):
     out = tmp_path / "scene.r5dgs"
     assert main.main(["import", str(deformed), "--out", str(out), "--knots", "3", "--progress", "none"]) == 0
     assert f"{out}: 24 Gaussians, 0 objects, t_max 1" in capsys.readouterr().out
-    assert main.main(["import", str(deformed), "--out", str(out), "--knots", "3"]) == 0
+    assert main.main(["import", str(deformed), "--out", str(out), "--knots", "3", "--overwrite"]) == 0
     assert "import 24 of 24 Gaussians" in capsys.readouterr().out
     scene = scene_file.read(out)
     assert scene.name == "run" and len(scene.tracks.times) == 3
     assert scene.provenance["imported"]["settings"]["is_blender"] is True
-    assert main.main(["import", str(deformed), "--out", str(out), "--knots", "3", "--progress", "json"]) == 0
+    arguments = ["--out", str(out), "--knots", "3", "--overwrite", "--progress", "json"]
+    assert main.main(["import", str(deformed), *arguments]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert events[0] == {"event": "import", "done": 24, "total": 24, "unit": "Gaussians"}
     assert events[-1] == {"event": "imported", "path": str(out), "gaussians": 24}
@@ -305,7 +306,7 @@ def test_the_command_writes_a_scene_that_info_reads(deformed, tmp_path, capsys):
 def test_a_failed_import_leaves_the_old_scene(deformed, tmp_path, capsys):
     out = tmp_path / "scene.r5dgs"
     out.write_bytes(b"old")
-    assert main.main(["import", str(deformed), "--out", str(out), "--iteration", "5"]) == 3
+    assert main.main(["import", str(deformed), "--out", str(out), "--iteration", "5", "--overwrite"]) == 3
     assert "N = 5, found the iterations 20000" in capsys.readouterr().err
     assert out.read_bytes() == b"old"
     assert main.main(["import", str(deformed), "--out", str(tmp_path / "scene.ply")]) == 2
