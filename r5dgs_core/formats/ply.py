@@ -69,15 +69,14 @@ def write(
     """
     path = Path(path)
     columns = _columns(splats, plain)
-    data = np.empty(len(splats.means), [(name, kind) for name, kind, _ in columns])
-    for name, _, values in columns:
+    data = np.empty(len(splats.means), [(name, "<f4") for name, _ in columns])
+    for name, values in columns:
         data[name] = values
-    kinds = {"<f4": "float", "<i4": "int"}
     header = ["ply", "format binary_little_endian 1.0", "comment SplatRenderMode: default"]
     if origin is not None and np.any(origin):
         header.append("comment origin " + " ".join(repr(float(value)) for value in origin))
     header += [f"comment {text}" for text in comments]
-    header += [f"element vertex {len(data)}", *(f"property {kinds[kind]} {name}" for name, kind, _ in columns)]
+    header += [f"element vertex {len(data)}", *(f"property float {name}" for name, _ in columns)]
     with registry.writing(path), atomic_files.replacing(path) as stream:
         stream.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
         stream.write(data.tobytes())
@@ -90,7 +89,8 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     player = Player(scene)
     for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
         splats = played_splats.at(player, t, options.object_ids)
-        yield write(splats, target, origin=scene.origin, comments=_bands(scene, t, options.object_ids))
+        comments = _bands(scene, t, options.object_ids)
+        yield write(splats, target, plain=options.plain, origin=scene.origin, comments=comments)
 
 
 def _bands(scene: Scene, t: float, object_ids: Collection[int] | None) -> list[str]:
@@ -114,6 +114,7 @@ FORMAT = registry.Format(
     loses="motion between frames, names of objects, sky, cameras",
     write=export,
     per_frame=True,
+    has_columns=True,
 )
 
 
@@ -135,21 +136,21 @@ def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Splats:
     return _to_splats(table, str(path), guard)
 
 
-def _columns(splats: Splats, plain: bool) -> list[tuple[str, str, np.ndarray]]:
-    """Names, types and values of the columns in 3DGS order."""
+def _columns(splats: Splats, plain: bool) -> list[tuple[str, np.ndarray]]:
+    """Names and values of the columns in 3DGS order."""
     zeros = np.zeros(len(splats.means), np.float32)
-    columns = [(name, "<f4", splats.means[:, i]) for i, name in enumerate("xyz")]
-    columns += [(name, "<f4", zeros) for name in ("nx", "ny", "nz")]
-    columns += [(f"f_dc_{c}", "<f4", splats.sh[:, 0, c]) for c in range(3)]
+    columns = [(name, splats.means[:, i]) for i, name in enumerate("xyz")]
+    columns += [(name, zeros) for name in ("nx", "ny", "nz")]
+    columns += [(f"f_dc_{c}", splats.sh[:, 0, c]) for c in range(3)]
     rest = splats.sh.shape[1] - 1
-    columns += [(f"f_rest_{c * rest + k}", "<f4", splats.sh[:, 1 + k, c]) for c in range(3) for k in range(rest)]
-    columns += [("opacity", "<f4", splats.opacity_logits)]
-    columns += [(f"scale_{i}", "<f4", splats.log_scales[:, i]) for i in range(3)]
-    columns += [(f"rot_{i}", "<f4", splats.quats[:, i]) for i in range(4)]
+    columns += [(f"f_rest_{c * rest + k}", splats.sh[:, 1 + k, c]) for c in range(3) for k in range(rest)]
+    columns += [("opacity", splats.opacity_logits)]
+    columns += [(f"scale_{i}", splats.log_scales[:, i]) for i in range(3)]
+    columns += [(f"rot_{i}", splats.quats[:, i]) for i in range(4)]
     if splats.identities is not None and not plain:
-        columns += [(f"obj_dc_{i}", "<f4", splats.identities[:, i]) for i in range(splats.identities.shape[1])]
+        columns += [(f"obj_dc_{i}", splats.identities[:, i]) for i in range(splats.identities.shape[1])]
     if splats.object_ids is not None and not plain:
-        columns += [("obj_id", "<i4", splats.object_ids)]
+        columns += [("obj_id", splats.object_ids)]  # a float, as some readers take all columns for floats
     return columns
 
 

@@ -44,6 +44,7 @@ class Options:
         object_ids: Objects to export; None for all.
         until: Last scene time of formats with motion; None for the time up to which Blender extrapolates by default.
         still: PNG of the scene at t_max for formats with a picture, or None.
+        plain: True to leave out columns that other programs do not know.
     """
 
     times: tuple[float, ...]
@@ -51,6 +52,7 @@ class Options:
     object_ids: frozenset[int] | None = None
     until: float | None = None
     still: bytes | None = None
+    plain: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class Format:
         has_objects: True if a file holds objects, so that `Options.object_ids` applies.
         has_motion: True if a file holds the motion up to `Options.until`; `Options.times` then do not apply.
         has_still: True if a file holds `Options.still`.
+        has_columns: True if files have columns of our own, so that `Options.plain` applies.
         losses: Returns sentences about what a file loses of the exported objects.
         extra: Extra of ``pip install r5dgs[extra]`` that it needs, or None.
         packages: Packages of the extra that `write` imports.
@@ -91,6 +94,7 @@ class Format:
     has_objects: bool = True
     has_motion: bool = False
     has_still: bool = False
+    has_columns: bool = False
     losses: Callable[[Scene, Options], list[str]] = lambda scene, options: []
     extra: str | None = None
     packages: tuple[str, ...] = ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import logging
 import math
 from pathlib import Path
@@ -48,13 +49,15 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     )
     when.add_argument("--until", type=float, metavar="T", help=until)
     p.add_argument("--objects", metavar="WORDS", help="objects to export: 'red mug', 'all except the background'")
+    plain = "leave out object ids and identity encodings of ply, for programs that refuse unknown columns"
+    p.add_argument("--plain", action="store_true", help=plain)
     p.add_argument("--overwrite", action="store_true", help="replace existing files")
     options.add_progress(p)
 
 
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
-    given = {"times": args.time, "frames": args.frames, "until": args.until, "words": args.objects}
+    given = {"times": args.time, "frames": args.frames, "until": args.until, "words": args.objects, "plain": args.plain}
     run_export(args.file, args.to, args.out, **given, overwrite=args.overwrite, progress_kind=args.progress)
 
 
@@ -68,6 +71,7 @@ def run_export(
     frames: tuple[int, int] | None = None,
     until: float | None = None,
     words: str | None = None,
+    plain: bool = False,
     overwrite: bool = False,
     progress_kind: str = "none",
 ) -> list[Path]:
@@ -82,6 +86,7 @@ def run_export(
         frames: First and last Blender frame; frame 1 is scene time 0.
         until: Last scene time of formats with motion (see `formats.registry.Options`).
         words: Objects to export, as in ``r5dgs query``; all if None.
+        plain: True to leave out columns of our own; see `formats.registry.Options`.
         overwrite: True to replace existing files.
         progress_kind: Form of progress output (`progress.make`).
 
@@ -98,11 +103,12 @@ def run_export(
     input_paths.check_output("--out", out)
     input_paths.check_scene(path)
     chosen = registry.usable(to)  # imports numpy
-    _check_arguments(chosen, out, words, times=times, frames=frames, until=until)
+    _check_arguments(chosen, out, words, plain, times=times, frames=frames, until=until)
     from ...scene import scene_file
 
     scene = scene_file.read(path)
     what = selection(chosen, scene, times=times, frames=frames, until=until, words=words)
+    what = dataclasses.replace(what, plain=plain)
     targets = chosen.paths(out, what, scene)
     present = [target for target in targets if target.exists()]
     if present and not overwrite:
@@ -144,6 +150,7 @@ def _check_arguments(
     chosen: registry.Format,
     out: Path,
     words: str | None,
+    plain: bool,
     *,
     times: tuple[float, ...] | None,
     frames: tuple[int, int] | None,
@@ -154,6 +161,8 @@ def _check_arguments(
         raise errors.UsageError(f"--out {out}: expected a name that ends in {chosen.suffix}")
     if words is not None and not chosen.has_objects:
         raise errors.UsageError(f"--objects: files of format {chosen.name} hold no objects; leave it out")
+    if plain and not chosen.has_columns:
+        raise errors.UsageError(f"--plain: files of format {chosen.name} have no columns of R5DGS; leave it out")
     if chosen.has_motion and not (times is None and frames is None):
         option = "--frames" if times is None else "--time"
         raise errors.UsageError(f"{option}: files of format {chosen.name} hold the motion; give its end with --until")

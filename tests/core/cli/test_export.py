@@ -38,6 +38,10 @@ def test_ply_holds_the_gaussians_of_a_time(path, scene, tmp_path):
 def test_without_a_time_the_gaussians_at_t_max_are_written(path, scene, tmp_path):
     assert export(path, "--to", "ply", "--out", tmp_path / "a.ply") == 0
     np.testing.assert_array_equal(ply.read(tmp_path / "a.ply").means, scene.gaussians.means)
+    assert export(path, "--to", "ply", "--out", tmp_path / "b.ply", "--plain") == 0
+    plain = ply.read(tmp_path / "b.ply")
+    assert plain.object_ids is None and plain.identities is None
+    np.testing.assert_array_equal(plain.means, scene.gaussians.means)
 
 
 def test_each_frame_of_a_range_is_a_file(path, scene, tmp_path, capsys):
@@ -105,6 +109,7 @@ def test_files_are_replaced_only_on_demand(path, tmp_path, capsys):
         (("--to", "obj", "--out", "a.obj"), "ply, cameras"),
         (("--to", "ply", "--out", "a.json"), ".ply"),
         (("--to", "cameras", "--out", "a.json", "--objects", "mug"), "--objects"),
+        (("--to", "cameras", "--out", "a.json", "--plain"), "--plain"),
         (("--to", "ply", "--out", "a.ply", "--frames", "5:1"), "'5:1'"),
         (("--to", "ply", "--out", "a.ply", "--frames", "all"), "'all'"),
         (("--to", "ply", "--out", "a.ply", "--time", "nan"), "--time"),
