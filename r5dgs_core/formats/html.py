@@ -15,6 +15,7 @@ from . import glb, gltf, registry
 
 PAGE = Path(__file__).with_name("player.html")  # made by player/build.mjs
 NO_STILL = "data:,"
+NO_PICTURE = "the picture for browsers without WebGL"
 _PLACES = re.compile(r"\{\{(TITLE|STILL|SCENE)\}\}")
 
 
@@ -39,7 +40,8 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
 
 def losses(scene: Scene, options: registry.Options) -> list[str]:
     """Parts of this scene that the player does not show, as sentences."""
-    return [sentence for sentence in glb.losses(scene, options) if not sentence.endswith(glb.ELSEWHERE)]
+    found = [sentence for sentence in glb.losses(scene, options) if not sentence.endswith(glb.ELSEWHERE)]
+    return found if options.still is not None else [*found, NO_PICTURE]
 
 
 def _text(data: bytes) -> str:

@@ -41,4 +41,6 @@ def test_no_half_written_page_is_left(tmp_path):
 
 
 def test_losses_of_other_programs_are_not_those_of_the_page():
-    assert html.losses(scenes.make_scene(n=50, identities=False), OPTIONS) == []
+    scene = scenes.make_scene(n=50, identities=False)
+    assert html.losses(scene, dataclasses.replace(OPTIONS, still=b"png")) == []
+    assert html.losses(scene, OPTIONS) == [html.NO_PICTURE]
