@@ -74,7 +74,8 @@ def try_file(path: Path) -> Iterator[bool]:
         yield False
         return
     except OSError as error:
-        raise CheckpointError(f"{path}: cannot be created: {error}; choose another --out") from error
+        reason = error.strerror or error
+        raise CheckpointError(f"{path.parent}: no file can be created: {reason}; choose another --out") from error
     try:
         yield True
     finally:
