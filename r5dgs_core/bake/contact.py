@@ -48,6 +48,8 @@ def _rows(found: Prediction) -> list[dict[str, Any]]:
     for name, material in found.taken.items():
         value, threshold = found.penetrations.get(name, 0.0), scene_future.PENETRATION
         reason = "without contacts, it passes into others, in sizes" if value else "is pushed or hit by another body"
+        if name == found.leaving:
+            reason = "moves off the edge of its support"
         if (compared := found.compared.get(name)) is not None:
             value, threshold = compared.smooth - compared.contact, held_out.BETTER
             reason = f"no smooth law explains its last motion; {compared.text()}"

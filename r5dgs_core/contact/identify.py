@@ -22,6 +22,7 @@ LAST = 4  # poses that determine the state at t_max
 _STEPS = np.repeat([0.002, 0.003, 0.002, 0.003, 0.03, 0.1], [3, 3, 3, 3, 1, 1])  # of differences
 _OUTLIER = 9.0  # squared residual of a pose whose weight is one half
 _FRICTIONS, _RESTITUTIONS = (0.1, 0.18, 0.3, 0.5), (0.1, 0.3, 0.6)  # first guesses
+_LEARNED = np.array([0.1, 0.5])  # least deviations of log friction and logit of restitution from the whole track
 _CLOSE = 0.04  # gap, as a share of the size, below which a pose may be in contact
 _EARLY, _FULL = 5, 8  # iterations
 
@@ -115,11 +116,14 @@ class Fitter:
         first = self._whole(prior)
         rows = slice(max(len(self.track) - LAST, 0), None)
         start = self.at(first, float(self.track.times[rows][0]))
-        narrow = Prior(first.material, min(0.1, prior.friction), min(0.5, prior.restitution))
         if not self._touched():  # nothing was learned about the material
             return first
-        last = self.fit(start, first.material, self.track.rows(rows), narrow, _FULL)
-        return dataclasses.replace(last, assumed=np.zeros(PARAMETERS))  # its prior comes from poses
+        wide, learned = np.array([prior.friction, prior.restitution]), np.sqrt(np.diag(first.covariance)[12:])
+        kept = np.minimum(np.maximum(_LEARNED, learned), wide)
+        last = self.fit(start, first.material, self.track.rows(rows), Prior(first.material, *kept.tolist()), _FULL)
+        assumed = np.zeros(PARAMETERS)  # the prior of the last fit comes from poses, unless these told little
+        assumed[12:] = np.where(learned > _LEARNED, first.assumed[12:], 0.0)
+        return dataclasses.replace(last, assumed=assumed)
 
     def _touched(self) -> bool:
         return self._flight() < len(self.track)
@@ -197,12 +201,17 @@ class Fitter:
         return State(place[None], rotations.normalize(quat)[None], velocity[None], spin[None])
 
     def _flight(self) -> int:
-        """Number of poses before the first that is close to the plane."""
+        """Number of poses before the first that is close to the plane, or that follows an impact."""
         plane = self.simulation.world.plane
         if plane is None:
             return len(self.track)
         body = self.simulation.world.bodies[self.body]
-        close = worlds.gaps(body, plane, self.track.places, self.track.quats) < _CLOSE * self.size
+        gaps = worlds.gaps(body, plane, self.track.places, self.track.quats)
+        close = gaps < _CLOSE * self.size
+        if len(gaps) > 2:
+            steps, drop = np.diff(self.track.times), 0.5 * float(np.linalg.norm(self.simulation.world.gravity))
+            speeds = np.diff(gaps)[:-1] / steps[:-1] - drop * steps[:-1]
+            close[2:] |= gaps[1:-1] + speeds * steps[1:] - drop * steps[1:] ** 2 < 0
         return int(np.argmax(close)) if close.any() else len(self.track)
 
     def _linearized(self, state: State, prior: Prior, track: Track, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from . import recording, scene_bodies, scene_future, world
 from .recording import Recording
 from .scene_world import SceneWorld, Wishes
 
-_ABOVE = 0.1  # height over its plane, in sizes, above which a body has left it
+_ABOVE = 0.1  # height over or below its plane, in sizes, above which a body has left it
 
 
 @dataclass(frozen=True)
@@ -83,4 +83,4 @@ def _is_off(made: SceneWorld, number: int, future: Recording) -> bool:
     if plane is None:
         return False
     gap = world.gaps(body, plane, future.places[-1, number], future.quats[-1, number])
-    return bool(gap > _ABOVE * body.solid.size)
+    return bool(abs(gap) > _ABOVE * body.solid.size)

@@ -12,7 +12,7 @@ from ..motion import history, rotations, se3
 from ..scene import gravity, predictability, world_axes
 from ..scene.scene import MotionGroup, Scene
 from ..shapes import directions
-from . import futures, held_out, path_knots, recording, scene_bodies, scene_world, world
+from . import edges, futures, held_out, path_knots, recording, scene_bodies, scene_world, world
 from .held_out import Comparison
 from .recording import Recording
 from .scene_bodies import SceneBody
@@ -41,6 +41,7 @@ class Prediction:
         world: The simulated bodies.
         materials: Their materials.
         recording: The most likely future.
+        leaving: Name of the body that moves off its support, or "".
     """
 
     groups: tuple[MotionGroup, ...]
@@ -51,6 +52,7 @@ class Prediction:
     world: scene_world.SceneWorld | None = None
     materials: tuple[world.Material, ...] = ()
     recording: Recording | None = None
+    leaving: str = ""
 
 
 def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
@@ -79,13 +81,17 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     driven = [n for n in passing if bodies[n].reason and n not in pushed | doubtful]
     lines += [f"{bodies[n].name}: moves on without contacts: {bodies[n].reason}" for n in driven]
     tried = (set(passing) - set(driven)) | pushed | doubtful
+    free = [n for n, body in enumerate(bodies) if body.moves and not body.reason and n not in tried]
+    leave = None if up is None else edges.first(scene, bodies, free, end, up)
+    tried |= set() if leave is None else {leave.number}
     if not tried:
         return Prediction(scene.groups, depths, {}, tuple(lines))
     if pull is None or up is None:
         reason = "gravity is unknown: no body was seen to fall, and the scene has no up axis or no units"
         return Prediction(scene.groups, depths, {}, (*lines, f"no contacts are predicted: {reason}"))
-    made = scene_world.make(scene, bodies, tried, pushed, doubtful, pull, end).weighted(wishes.masses)
-    return _simulated(scene, made, wishes, end, depths, [*lines, *made.lines])
+    made = scene_world.make(scene, bodies, tried, pushed, doubtful, pull, end, leave).weighted(wishes.masses)
+    found = _simulated(scene, made, wishes, end, depths, [*lines, *made.lines])
+    return found if leave is None else dataclasses.replace(found, leaving=bodies[leave.number].name)
 
 
 def _simulated(

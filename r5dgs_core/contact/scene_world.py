@@ -12,7 +12,7 @@ from ..motion import models
 from ..scene import world_axes
 from ..scene.scene import Scene
 from ..shapes import solid
-from . import futures, held_out, restitution, scene_bodies, stepping, support, world
+from . import edges, floors, futures, held_out, restitution, scene_bodies, stepping, support, world
 from .held_out import Comparison
 from .identify import Estimate, Fitter
 from .scene_bodies import SceneBody
@@ -23,7 +23,6 @@ from .world import Body, Material, Plane, State, World
 SAMPLES = 32
 _LEAST_POSES = 3
 _MISFIT = 30.0  # mean squared residual in units of the noise above which contacts do not explain the poses
-_TOUCHED = 0.05  # lowest observed gap, in sizes, of a body that has touched the plane
 _STANDS = 0.15  # the same of a body that stands on it; others are held by something
 _ROUNDS = 6  # of shrinking bodies that overlap
 
@@ -162,6 +161,7 @@ def make(
     doubtful: set[int],
     gravity: np.ndarray,
     end: float,
+    leave: edges.Leave | None = None,
 ) -> SceneWorld:
     """Build the world of the bodies whose motion may be simulated.
 
@@ -173,12 +173,13 @@ def make(
         doubtful: Numbers of those among them that held-out poses decide about.
         gravity: Acceleration of a falling body. [3]
         end: Scene time up to which to simulate.
+        leave: A body that moves off its support, which then has an edge.
     """
     up = world_axes.UP_AXIS[scene.world_convention]
-    below = plane(scene, bodies, end, up)
+    below, edge = (plane(scene, bodies, end, up), None) if leave is None else (leave.plane, leave.edge)
     lines = [] if below is not None else ["no plane was found under the bodies"]
     kept = [n for n, body in enumerate(bodies) if not (body.moves and body.reason) or n in tried]
-    shapes = tuple(_body(scene, bodies[n], below, n in pushed) for n in kept)
+    shapes = tuple(_body(scene, bodies[n], below, n in pushed, gravity) for n in kept)
     made = apart(World(shapes, below, gravity))
     chosen, own, fits, comparisons = [], [], {}, {}
     for number, shape in zip(kept, made.bodies, strict=True):
@@ -200,7 +201,7 @@ def make(
                 continue
         chosen.append(body)
         own.append(shape)
-    return SceneWorld(tuple(chosen), World(tuple(own), below, gravity), fits, tuple(lines), comparisons)
+    return SceneWorld(tuple(chosen), World(tuple(own), below, gravity, edge), fits, tuple(lines), comparisons)
 
 
 def _misfit(estimate: Estimate | None) -> str:
@@ -210,16 +211,13 @@ def _misfit(estimate: Estimate | None) -> str:
     return "" if estimate.misfit <= _MISFIT else "contacts do not explain its poses"  # not a number is a misfit too
 
 
-def _body(scene: Scene, body: SceneBody, below: Plane | None, pushed: bool) -> Body:
+def _body(scene: Scene, body: SceneBody, below: Plane | None, pushed: bool, gravity: np.ndarray) -> Body:
     """Shape and floor of a body."""
     if below is None:
         return Body(body.solid, fixed=not (body.moves or pushed))
     own = Body(body.solid)
     if body.moves:
-        track = scene_bodies.track(scene, body)
-        lowest = float(world.gaps(own, below, track.places, track.quats).min(initial=np.inf))
-        touched = lowest < _TOUCHED * body.solid.size
-        return dataclasses.replace(own, floor=below.height + lowest if touched else None)
+        return dataclasses.replace(own, floor=floors.of(own, below, scene_bodies.track(scene, body), gravity))
     gap = float((body.solid.vertices @ below.normal).min()) - below.height
     stands = abs(gap) <= _STANDS * body.solid.size and body.group.id
     if not stands and not pushed:
@@ -273,7 +271,8 @@ def _stepping(made: World, state: State, duration: float, size: float, draft: bo
     g = float(np.linalg.norm(made.gravity))
     speed = float(np.linalg.norm(state.velocities, axis=1).max())
     if made.plane is not None:
-        drop = max(float((state.places @ made.plane.normal).max()) - made.plane.height, 0.0)
+        ground = made.plane if made.edge is None or made.edge.ground is None else made.edge.ground
+        drop = max(float((state.places @ ground.normal).max()) - ground.height, 0.0)
         speed = float(np.hypot(speed, np.sqrt(2 * g * drop)))
     else:
         speed += g * duration

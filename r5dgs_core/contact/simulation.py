@@ -66,9 +66,10 @@ class Simulation:
             model.geom_friction[self._geoms[i], 0] = friction
             model.geom_solref[self._geoms[i]] = reference
             if self.world.plane is not None and not self.world.bodies[i].fixed:
-                pair = self._moving.index(i)
-                model.pair_friction[pair, :2] = friction
-                model.pair_solref[pair] = reference
+                count = model.npair // len(self._moving)  # floor and ground
+                pairs = slice(count * self._moving.index(i), count * (self._moving.index(i) + 1))
+                model.pair_friction[pairs, :2] = friction
+                model.pair_solref[pairs] = reference
 
     def load(self, state: State) -> None:
         """Set the state at time 0."""
@@ -205,17 +206,29 @@ def _impedance(mass_ratio: float) -> list[float]:
 def _add_floor(
     mujoco: Any, spec: Any, number: int, body: Body, world: World, unit: float, impedance: list[float]
 ) -> None:
-    """Add the plane on which a body rests; it touches that body alone."""
+    """Add what a body rests on, which touches that body alone: a plane, or a prism over the ground."""
     assert world.plane is not None
     normal, height = world.plane.normal, world.plane.height if body.floor is None else body.floor
-    quat = rotations.between_vectors(np.array([0.0, 0.0, 1.0]), normal)
-    spec.worldbody.add_geom(
-        name=f"floor{number}",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0, 0, 0.05],
-        pos=height / unit * normal,
-        quat=quat,
-        contype=0,
-        conaffinity=0,
-    )
-    spec.add_pair(geomname1=f"floor{number}", geomname2=f"body{number}", condim=3, solimp=impedance)
+    shared = {"contype": 0, "conaffinity": 0}
+    levels = [(f"floor{number}", world.plane, height)]
+    if world.edge is not None:
+        ground = world.edge.ground
+        levels = [] if ground is None else [(f"ground{number}", ground, ground.height)]
+        top = world.edge.outline + (height - world.edge.outline @ normal)[:, None] * normal
+        depth = body.solid.size if ground is None else max(world.plane.height - ground.height, 0.1 * body.solid.size)
+        mesh = spec.add_mesh(name=f"floor{number}")
+        mesh.uservert = (np.concatenate([top, top - depth * normal]) / unit).ravel()
+        spec.worldbody.add_geom(
+            name=f"floor{number}", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"floor{number}", **shared
+        )
+        spec.add_pair(geomname1=f"floor{number}", geomname2=f"body{number}", condim=3, solimp=impedance)
+    for name, plane, level in levels:
+        spec.worldbody.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[0, 0, 0.05],
+            pos=level / unit * plane.normal,
+            quat=rotations.between_vectors(np.array([0.0, 0.0, 1.0]), plane.normal),
+            **shared,
+        )
+        spec.add_pair(geomname1=name, geomname2=f"body{number}", condim=3, solimp=impedance)

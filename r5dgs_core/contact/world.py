@@ -9,7 +9,8 @@ import numpy as np
 from ..motion import rotations
 from ..shapes.solid import Solid
 
-_ROUND = 0.1  # spread of the distances of a hull's vertices from its centre, over their mean, up to which it is a ball
+_ROUND = 0.045  # deviation of the distances of a ball's vertices from its centre, over their mean, at most
+_FULL = 0.8  # volume of a ball's hull over that of the ball through its vertices, at least
 
 
 @dataclass(frozen=True)
@@ -47,9 +48,9 @@ class Body:
     def ball_radius(self) -> float | None:
         """Radius of the ball of equal volume if the body is nearly a ball, whose facets would keep it from rolling."""
         distances = np.linalg.norm(self.solid.vertices - self.solid.center, axis=1)
-        if len(distances) < 12 or np.ptp(distances) > _ROUND * distances.mean():
-            return None
-        return float(np.cbrt(3 * self.solid.volume / (4 * np.pi)))
+        radius = float(np.cbrt(3 * self.solid.volume / (4 * np.pi)))
+        full = radius**3 > _FULL * distances.mean() ** 3
+        return radius if full and distances.std() < _ROUND * distances.mean() else None
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,19 @@ class Plane:
 
 
 @dataclass(frozen=True)
+class Edge:
+    """Border of a support, beyond which bodies fall.
+
+    Attributes:
+        outline: Corners of the convex support, on its plane. [V, 3]
+        ground: The plane below it, or None.
+    """
+
+    outline: np.ndarray
+    ground: Plane | None
+
+
+@dataclass(frozen=True)
 class World:
     """Bodies and their surroundings.
 
@@ -68,11 +82,13 @@ class World:
         bodies: B bodies.
         plane: The supporting plane, or None.
         gravity: Acceleration of a falling body. [3]
+        edge: Border of the plane; None if it has no end.
     """
 
     bodies: tuple[Body, ...]
     plane: Plane | None
     gravity: np.ndarray
+    edge: Edge | None = None
 
 
 @dataclass(frozen=True)

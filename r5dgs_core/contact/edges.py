@@ -1,0 +1,125 @@
+"""Edge of the support of a body, such as that of a table, over which the body moves, to fall to the ground below.
+
+Places are proven empty by rays: a pixel that shows something below the plane shows that the plane has a hole where the
+ray passes through it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage, spatial
+
+from ..motion import rotations
+from ..scene import splats
+from ..scene.scene import Scene
+from . import held_out, scene_bodies, support
+from .scene_bodies import SceneBody
+from .world import Edge, Plane
+
+_TIMES = 16  # at which a path is tested
+_UNDER = 0.4  # horizontal distance in sizes up to which a surface carries a body
+_DEEP = 0.3  # depth below a plane, in sizes, of what is not the plane
+_LAYER = 0.1  # distance from a plane, in sizes, of what is
+_CELL = 0.15  # edge length of a cell, in sizes
+_REACH = 12.0  # distance up to which a support is searched, in sizes
+_HOLES = 0.15  # share of empty cells above which a support is not convex
+_SEEN = 0.3  # opacity of a Gaussian that may carry a body
+
+
+@dataclass(frozen=True)
+class Leave:
+    """A body that moves off its support.
+
+    Attributes:
+        number: Number of the body.
+        plane: The plane of the support.
+        edge: Its edge.
+    """
+
+    number: int
+    plane: Plane
+    edge: Edge
+
+
+def first(scene: Scene, bodies: list[SceneBody], numbers: list[int], end: float, up: np.ndarray) -> Leave | None:
+    """Return the first of some bodies that moves off its support up to the scene time ``end``, or None."""
+    for number in numbers:
+        body = bodies[number]
+        path = scene_bodies.predicted(body, np.linspace(0, max(end - scene.t_max, 0.0), _TIMES))[1]
+        size = body.solid.size
+        if not _may_leave(scene, path, up, size):
+            continue
+        seen = scene_bodies.track(scene, body).places
+        plane = support.find(scene, up, seen[-3:], size, _UNDER * size)
+        if plane is None or not held_out.in_contact(scene, body, plane):
+            continue
+        edge = _find(scene, plane, path, size)
+        if edge is not None:
+            return Leave(number, plane, edge)
+    return None
+
+
+def _may_leave(scene: Scene, path: np.ndarray, up: np.ndarray, size: float) -> bool:
+    """Return True if Gaussians of the background carry a body now, and none does later. It needs no pictures. [T, 3]"""
+    found = scene.gaussians
+    rows = (found.object_ids == 0) & (found.motion_ids == 0) & (splats.to_opacities(found.opacity_logits) > _SEEN)
+    axes = rotations.quats_to_rotmats(found.quats[rows].astype(np.float64)) * np.exp(found.log_scales[rows])[:, None]
+    deviations = np.linalg.norm(axes, axis=2) @ np.abs(up), np.linalg.norm(axes, axis=2).max(axis=1)
+    apart = path[:, None] - found.means[rows]
+    heights = apart @ up
+    across = np.linalg.norm(apart - heights[..., None] * up, axis=-1)
+    under = (across < _UNDER * size + deviations[1]) & (np.abs(heights) < size + deviations[0])
+    carried = under.any(axis=1)
+    return bool(carried[0] and not carried.all())
+
+
+def _find(scene: Scene, plane: Plane, path: np.ndarray, size: float) -> Edge | None:
+    """Edge of the convex part of a plane on which a path begins, if the path leaves it where the plane is empty."""
+    normal = plane.normal
+    flat = np.linalg.svd(normal[None])[2][1:].T  # world to coordinates in the plane
+    surface, origins = support.surface(scene)
+    heights, above = surface @ normal - plane.height, origins @ normal - plane.height
+    near = np.linalg.norm((surface - path[0]) @ flat, axis=1) < _REACH * size
+    on = near & (np.abs(heights) < _LAYER * size)
+    through = (heights < -_DEEP * size) & (above > 0)
+    share = (above / np.maximum(above - heights, 1e-12))[through, None]
+    empty = (origins[through] + share * (surface - origins)[through]) @ flat
+    track, carried = path @ flat, surface[on] @ flat
+    corners = _part(carried, empty, track[0], size)
+    if corners is None:
+        return None
+    hull = spatial.ConvexHull(corners)
+    outside = (track @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1)
+    beyond = np.flatnonzero(outside > 0.5 * _UNDER * size)
+    if outside[0] > 0 or not len(beyond):
+        return None
+    place = track[beyond[0]]
+    holes, solid = (int((np.linalg.norm(x - place, axis=1) < _UNDER * size).sum()) for x in (empty, carried))
+    if holes < max(2 * solid, 4):
+        return None
+    outline = corners[hull.vertices] @ flat.T + plane.height * normal
+    low = surface[near & (heights < -_DEEP * size)]
+    return Edge(outline, support.level(low, normal, size))
+
+
+def _part(carried: np.ndarray, empty: np.ndarray, start: np.ndarray, size: float) -> np.ndarray | None:
+    """Points of a surface that are connected with a place and fill a convex part of the plane, or None. [P, 2]"""
+    half, cell = int(_REACH / _CELL) + 1, _CELL * size
+    bins = [start[k] + cell * (np.arange(2 * half + 2) - half - 0.5) for k in range(2)]
+    counts = [np.histogram2d(*points.T, bins=bins)[0] for points in (carried, empty)]
+    solid = counts[0] > counts[1]
+    labels, _ = ndimage.label(solid, np.ones((3, 3)))
+    middle = labels[half - 2 : half + 3, half - 2 : half + 3]
+    if not middle.any():
+        return None
+    part = labels == np.bincount(middle[middle > 0]).argmax()
+    cells = [np.clip(np.digitize(carried[:, k], bins[k]) - 1, 0, 2 * half) for k in range(2)]
+    points = carried[part[cells[0], cells[1]]]
+    if len(points) < support.LEAST:
+        return None
+    centers = np.stack(np.meshgrid(*[0.5 * (x[1:] + x[:-1]) for x in bins], indexing="ij"), -1)
+    inside = spatial.Delaunay(points[spatial.ConvexHull(points).vertices]).find_simplex(centers) >= 0
+    holes = inside & (counts[1] > counts[0])
+    return None if holes.sum() > _HOLES * inside.sum() else points

@@ -1,0 +1,66 @@
+"""Bodies that move off their support fall to the ground below, and others stay on it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.bake import contact
+from r5dgs_core.contact import edges, scene_bodies, scene_future, scene_world, simulation, stepping, support, world
+from r5dgs_core.contact.scene_world import Wishes
+from r5dgs_core.motion import models
+from tests.support import contact_scenes, contacts
+from tests.support.contact_scenes import SIZE
+
+pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
+UP = np.array([0.0, 0.0, 1.0])
+DEPTH = 0.8
+
+
+def table(speed, border=0.5, **options):
+    """A box that slides on a floor which is lower beyond a border in x."""
+    scene = contact_scenes.with_units(contact_scenes.scene(contact_scenes.sliding(speed), **options))
+    means = scene.gaussians.means.copy()
+    means[(scene.gaussians.object_ids == 0) & (means[:, 0] > border), 2] -= DEPTH
+    return dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, means=means))
+
+
+def test_a_box_that_slides_off_a_table_falls_to_the_ground_below():
+    scene = table(2.0)
+    found = scene_future.predict(scene, Wishes(samples=2))
+    assert found.leaving == "box 1" and list(found.taken) == ["box 1"]
+    outline, ground = found.world.world.edge.outline, found.world.world.edge.ground
+    assert outline[:, 0].max() == pytest.approx(0.5, abs=0.15 * SIZE)
+    assert ground.height == pytest.approx(-DEPTH, abs=0.1 * SIZE)
+    model = found.groups[1].model
+    assert abs(models.evaluate(model, 0.15)[1][2]) < 0.05 * SIZE  # still on the table
+    fallen = models.evaluate(model, np.array([1.0, 1.1, 1.2]))[1][:, 2]
+    assert (fallen < -DEPTH + SIZE).all() and (fallen > -DEPTH - 0.05 * SIZE).all()
+    assert contact.needs((), found)[0]["reason"].startswith("moves off the edge of its support")
+
+
+@pytest.mark.parametrize(("speed", "border"), [(1.0, 2.0), (0.2, 0.5), (-2.0, 0.5)], ids=["far", "slow", "away"])
+def test_a_body_that_does_not_reach_the_edge_keeps_its_motion(speed, border, monkeypatch):
+    monkeypatch.setattr(scene_world, "Simulation", None)
+    scene = table(speed, border)
+    found = scene_future.predict(scene)
+    assert found.groups is scene.groups and not found.leaving
+
+
+def test_no_picture_is_rendered_over_a_whole_floor(monkeypatch):
+    monkeypatch.setattr(support, "surface", None)
+    scene = contact_scenes.with_units(contact_scenes.scene(contact_scenes.sliding(0.8)))
+    (body,), _ = scene_bodies.of(scene)
+    assert edges.first(scene, [body], [0], 1.4, UP) is None
+
+
+@pytest.mark.parametrize("make", [contacts.box, contacts.ball], ids=["box", "ball"])
+def test_bodies_rest_on_a_support_with_an_edge_and_fall_beyond_it(make):
+    size = contacts.SIZE
+    outline = np.array([[-1, -1, 0], [0.3, -1, 0], [0.3, 1, 0], [-1, 1, 0]])
+    edge = world.Edge(outline, world.Plane(UP, -0.5))
+    place = contacts.on_plane(make([0, 0, 0.5 * size]), make([0.6, 0, 0.5 * size]))
+    runs = simulation.Simulation(dataclasses.replace(place, edge=edge), stepping.choose(3.0, size, contacts.G, 2.0))
+    quats, places = runs.poses(world.at_rest(place), np.array([1.5]))
+    np.testing.assert_allclose(places[0, :, 2], [0.5 * size, 0.5 * size - 0.5], atol=0.01 * size)
+    assert np.abs(quats[0, 0, 1:]).max() < 1e-3 and np.abs(places[0, 0, :2]).max() < 0.01 * size
