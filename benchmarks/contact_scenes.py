@@ -68,7 +68,9 @@ def materials(scene: Scene) -> dict[str, dict[str, float]]:
     """Fitted friction and restitution of each object, with deviations of log friction and of restitution."""
     predicted = scene_future.predict(scene_bodies.without_contacts(scene))
     made, found = predicted.world, {}
-    for number, (_, estimate) in made.fits.items() if made is not None else ():
+    if made is None:
+        return found
+    for number, (_, estimate) in made.fits.items():
         deviations = np.sqrt(np.diag(estimate.covariance)[12:])
         e = estimate.material.restitution
         found[made.bodies[number].name] = {

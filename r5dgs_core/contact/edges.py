@@ -14,9 +14,9 @@ from scipy import ndimage, spatial
 from ..motion import rotations
 from ..scene import splats
 from ..scene.scene import Scene
-from . import held_out, scene_bodies, support
+from . import held_out, scene_bodies, support, world
 from .scene_bodies import SceneBody
-from .world import Edge, Plane
+from .world import Body, Edge, Plane
 
 _TIMES = 16  # at which a path is tested
 _UNDER = 0.4  # horizontal distance in sizes up to which a surface carries a body
@@ -51,14 +51,25 @@ def first(scene: Scene, bodies: list[SceneBody], numbers: list[int], end: float,
         size = body.solid.size
         if not _may_leave(scene, path, up, size):
             continue
-        seen = scene_bodies.track(scene, body).places
-        plane = support.find(scene, up, seen[-3:], size, _UNDER * size)
+        plane = _plane(scene, body, up)
         if plane is None or not held_out.in_contact(scene, body, plane):
             continue
         edge = _find(scene, plane, path, size)
         if edge is not None:
             return Leave(number, plane, edge)
     return None
+
+
+def _plane(scene: Scene, body: SceneBody, up: np.ndarray) -> Plane | None:
+    """Plane below a body: that of the pictures, or a level one if the body's heights fit it better."""
+    track, size = scene_bodies.track(scene, body), body.solid.size
+    tilted = support.find(scene, up, track.places[-3:], size, _UNDER * size)
+    if tilted is None:
+        return None
+    place = track.places[-1]
+    below = place - (place @ tilted.normal - tilted.height) / (up @ tilted.normal) * up
+    planes = tilted, Plane(up, float(below @ up))
+    return min(planes, key=lambda one: float(world.gaps(Body(body.solid), one, track.places, track.quats).std()))
 
 
 def _may_leave(scene: Scene, path: np.ndarray, up: np.ndarray, size: float) -> bool:
@@ -96,7 +107,7 @@ def _find(scene: Scene, plane: Plane, path: np.ndarray, size: float) -> Edge | N
     if outside[0] > 0 or not len(beyond):
         return None
     place = track[beyond[0]]
-    holes, solid = (int((np.linalg.norm(x - place, axis=1) < _UNDER * size).sum()) for x in (empty, carried))
+    holes, solid = (np.count_nonzero(np.linalg.norm(x - place, axis=1) < _UNDER * size) for x in (empty, carried))
     if holes < max(2 * solid, 4):
         return None
     outline = corners[hull.vertices] @ flat.T + plane.height * normal
@@ -110,7 +121,8 @@ def _part(carried: np.ndarray, empty: np.ndarray, start: np.ndarray, size: float
     bins = [start[k] + cell * (np.arange(2 * half + 2) - half - 0.5) for k in range(2)]
     counts = [np.histogram2d(*points.T, bins=bins)[0] for points in (carried, empty)]
     solid = counts[0] > counts[1]
-    labels, _ = ndimage.label(solid, np.ones((3, 3)))
+    labels = np.zeros(solid.shape, np.int32)
+    ndimage.label(solid, np.ones((3, 3)), output=labels)
     middle = labels[half - 2 : half + 3, half - 2 : half + 3]
     if not middle.any():
         return None
