@@ -275,6 +275,7 @@ def without_numba(monkeypatch, tmp_path):
     return choose
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="the script is one of POSIX")
 def test_a_python_without_numba_is_named_with_the_remedy_and_the_next_choice_works(loaded, without_numba, tmp_path):
     pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")

@@ -11,6 +11,7 @@ from tests.support import benchmark_modules
 pytestmark = pytest.mark.heavy
 
 
+@pytest.mark.slow
 def test_a_scene_gets_rows_and_a_summary(tiny, trained, tmp_path, monkeypatch):
     data = tmp_path / "00"
     shutil.copytree(tiny.root, data)

@@ -20,6 +20,7 @@ def run(*arguments):
     return subprocess.run(command, capture_output=True, text=True, timeout=600)
 
 
+@pytest.mark.slow
 def test_passed_failed_and_torch_dependent_tests_are_distinguished(tmp_path):
     passing, wanting, drawing = (tmp_path / f"test_{name}.py" for name in ("passing", "wanting", "drawing"))
     passing.write_text(PASSING)

@@ -67,6 +67,7 @@ def assert_quiet(browser, url):
     assert seen["log"] == [] and [request.partition("?")[0] for request in seen["requests"]] == [url]
 
 
+@pytest.mark.slow
 @pytest.mark.default_cases("parts")
 @pytest.mark.parametrize("made", [rich_scene, arms.make_arm], ids=["bodies", "parts"])
 def test_pictures_are_those_of_the_rasterizer(made, browser, tmp_path):
@@ -84,6 +85,7 @@ def test_picking_finds_the_object_of_each_pixel(browser, scene, url):
     assert len(found) >= 3 and all(right == tried for right, tried in found.values())
 
 
+@pytest.mark.slow
 def test_all_pixels_of_a_fine_screen_are_drawn_and_picked(browser, scene, url, tmp_path):
     seen = dataclasses.replace(scene, cameras=scene.cameras[:1])
     found = player_checks.compare(browser, seen, url, SIDE, END, tmp_path, ratio=2)
@@ -133,6 +135,7 @@ def test_a_name_of_a_camera_wins_over_a_number(browser, scene, tmp_path):
     assert browser.eval("r5dgs.model.cameras.indexOf(r5dgs.views.captured)") == 0
 
 
+@pytest.mark.slow
 def test_vr_starts_at_the_camera_and_gives_it_back(browser, url):
     browser.open(f"{url}?t=0&camera=0")
     before = browser.eval("r5dgs.engine.picture()")
@@ -233,6 +236,7 @@ def test_it_fits_a_phone(browser, url, tmp_path):
     assert (tmp_path / "phone.png").stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_without_webgl_a_picture_and_a_message_are_shown(browser, url):
     browser.open(url, webgl=False)
     assert "WebGL 2 is missing" in browser.eval("document.getElementById('message').textContent")
@@ -243,6 +247,7 @@ def test_without_webgl_a_picture_and_a_message_are_shown(browser, url):
     assert_quiet(browser, url)
 
 
+@pytest.mark.slow
 def test_view_serves_the_page(browser, scene):
     pages = {"/": page_server.Page(html.page(scene, OPTIONS))}
     with page_server.serving(pages.get) as server:

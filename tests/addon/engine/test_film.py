@@ -17,6 +17,7 @@ pytest.importorskip("torch", reason="torch is not installed in this Python, whic
 SIZE = (160, 90)
 
 
+@pytest.mark.slow
 def test_a_frame_equals_that_of_f12(blender, tmp_path, monkeypatch):
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
     scene = scenes.make_scene(n=400, objects=3, sh_degree=2, seed=4, world_convention="colmap")

@@ -148,6 +148,7 @@ def test_stop_merging_undo_and_a_second_call_leave_nothing_behind(blender, scene
     assert not blender.ops.r5dgs.add_shadows.poll()
 
 
+@pytest.mark.slow
 def test_shadows_survive_saving(blender, scene, tmp_path):
     blender.ops.r5dgs.add_shadows()
     before = picture(blender, tmp_path / "before.png")

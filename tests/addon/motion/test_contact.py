@@ -116,6 +116,7 @@ def test_off_and_on_again_restores_the_former_keys_exactly(blender, stopped):
     )
 
 
+@pytest.mark.slow
 def test_undo_takes_back_the_prediction_and_the_switch(blender, boxes, worker):
     boxes.r5dgs_contact.obstacles = add_wall(blender)
     blender.ops.ed.undo_push(message="wall")

@@ -108,6 +108,7 @@ def test_a_single_switch_is_found_and_named(trained, tiny, switched, tmp_path, c
     assert summary["agreement"] > summary["agreement_before"]
 
 
+@pytest.mark.slow
 def test_an_object_that_was_missed_gets_its_pixels_back(scene_path, tiny, tmp_path, capsys):
     folder, out = tmp_path / "missed", tmp_path / "out"
     data = rewrite(

@@ -63,6 +63,7 @@ def test_a_baked_scene_renders_like_the_trained_state(baked, trained):
     assert_shows_what_was_trained(trained, baked)
 
 
+@pytest.mark.slow
 @pytest.mark.default_cases("overrides0")
 @pytest.mark.parametrize("overrides", [("train.sh_degree=2",), ("train.shading=false", "train.shadows=false")])
 def test_unfinished_runs_with_other_options_bake_to_their_current_state(tiny, tmp_path, monkeypatch, overrides):

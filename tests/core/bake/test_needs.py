@@ -113,6 +113,7 @@ def test_a_classifier_is_on_if_it_was_trained():
     assert decisions(classified=False)["classifier"] == "off"
 
 
+@pytest.mark.slow
 def test_disabled_parts_are_not_in_the_scene(baked):
     found = {row["name"]: row["decision"] for row in baked.needs if "object" not in row}
     assert (found["shading"] == "on") == (baked.shading is not None)

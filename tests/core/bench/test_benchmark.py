@@ -83,6 +83,7 @@ def test_the_cost_of_a_case_adds_up_over_its_sessions(resumed):
     assert found["train"]["peak_mb"] == max(first["peak_mb"], second["peak_mb"]) > 50
 
 
+@pytest.mark.slow
 def test_a_record_holds_the_results_of_evaluation_and_playback(made, tiny):
     plan, case, result = made
     (found,) = result["results"]
@@ -104,6 +105,7 @@ def test_a_record_holds_the_results_of_evaluation_and_playback(made, tiny):
     assert json.loads((plan.out / benchmark.RESULT_FILE).read_text()) == result
 
 
+@pytest.mark.slow
 def test_finished_runs_are_neither_trained_nor_measured_again(made, monkeypatch):
     plan, case, result = made
     before = contents(case.run)
@@ -175,6 +177,7 @@ def test_a_case_that_fails_is_reported_and_the_others_continue(made, tiny, capsy
         blocked.unlink()
 
 
+@pytest.mark.slow
 def test_a_fault_in_one_case_does_not_affect_the_others(tiny, tmp_path, monkeypatch, made):
     _, _, result = made
 
@@ -189,6 +192,7 @@ def test_a_fault_in_one_case_does_not_affect_the_others(tiny, tmp_path, monkeypa
     assert len(json.loads((tmp_path / benchmark.RESULT_FILE).read_text())["results"]) == 1
 
 
+@pytest.mark.slow
 def test_a_record_stores_the_machines_of_training_and_measurement(made):
     _, case, result = made
     (found,) = result["results"]
@@ -198,6 +202,7 @@ def test_a_record_stores_the_machines_of_training_and_measurement(made):
     assert cases.read_record(case)["measured"]["modes"]["rigid"]["machine"] == found["machine"]
 
 
+@pytest.mark.slow
 def test_results_measured_elsewhere_keep_their_machine(made, monkeypatch):
     plan, _, result = made
     monkeypatch.setattr(benchmark, "machine", lambda: {"processor": "another"})
@@ -205,6 +210,7 @@ def test_results_measured_elsewhere_keep_their_machine(made, monkeypatch):
     assert found["machine"] == result["results"][0]["machine"]
 
 
+@pytest.mark.slow
 def test_a_finished_run_of_other_data_is_refused_before_anything_is_done(made, tiny, tmp_path):
     plan, _, _ = made
     root = tmp_path / tiny.root.name
@@ -216,6 +222,7 @@ def test_a_finished_run_of_other_data_is_refused_before_anything_is_done(made, t
         cases.make(plan_for(tiny, plan.out, scenes=(root,)))
 
 
+@pytest.mark.slow
 def test_a_run_started_with_other_settings_is_refused_before_anything_is_done(made, tiny):
     plan, case, _ = made
     before = contents(plan.out)

@@ -52,7 +52,7 @@ def test_the_last_complete_line_of_the_log_is_shown(tmp_path):
     assert live_run.LiveRun(tmp_path, tmp_path).state()["log"] == {"iteration": 100, "loss": 0.5}
 
 
-@pytest.mark.heavy
+@pytest.mark.slow
 def test_a_checkpoint_is_baked_once_by_another_process(watched, monkeypatch):
     live, thread = watched
     (live.run / live_run.CURVES).write_bytes(b"\x89PNG")

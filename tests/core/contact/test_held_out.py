@@ -50,6 +50,7 @@ def dragged():
     return observed(rotations.identity(13), places + [0, 0.2, SIZE / 2])
 
 
+@pytest.mark.slow
 def test_a_tumbling_box_whose_law_is_that_of_a_driven_body_gets_contacts(tumbling):
     scene, place = tumbling
     assert scene_bodies.of(scene)[0][0].reason.startswith("its motion is that of a driven body")

@@ -105,6 +105,7 @@ def test_a_body_that_slides_on_a_board_does_not_pass_into_it(monkeypatch):
     assert not scene_future.predict(scene).penetrations
 
 
+@pytest.mark.slow
 def test_a_body_whose_poses_contacts_do_not_explain_moves_on_and_nothing_hits_it(monkeypatch):
     fit = scene_world._fit
 

@@ -192,6 +192,7 @@ def test_each_motion_model_is_right_about_its_own_motion(scene, data, monkeypatc
     assert band.error == 0 and math.isnan(band.ms) and not band.pareto
 
 
+@pytest.mark.slow
 def test_the_stored_band_is_compared_with_the_stored_motion(scene):
     truth = truth_of(scene)
     narrow = History(band=Band((scene.t_max, 2.0), (1e-6, 1e-6), (1e-6, 1e-6)))
@@ -243,6 +244,7 @@ def test_poses_and_matrices_are_inverse():
     np.testing.assert_allclose(back[1], displacement, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_larger_family_takes_longer_and_the_worst_object_is_named(scene, data):
     rows, _ = candidate_count_task.measure(scene, data.ground_truth)
     found = pick(rows, error_kind="position")
@@ -307,6 +309,7 @@ def report(field, data):
         return whole(field, data, splits=("test", "val"))
 
 
+@pytest.mark.slow
 def test_the_report_is_written_for_programs_and_people(report, field, tmp_path):
     paths = error_vs_time_report.write(report, tmp_path / "deep" / "out")
     by_name = {path.name: path for path in paths}
@@ -328,6 +331,7 @@ def test_the_report_is_written_for_programs_and_people(report, field, tmp_path):
     assert picture.ndim == 3 and picture.std() > 5
 
 
+@pytest.mark.slow
 def test_every_mode_is_shown_past_t_max_and_one_before(report, field):
     rows = report_rows.from_dicts(report["rows"])
     assert {row.mode for row in pick(rows, method="playback", error_kind="psnr")} == set(scene_player.modes(field))
@@ -339,12 +343,14 @@ def test_the_tasks_have_the_names_and_the_order_of_the_command_line():
     assert tuple(tasks.BY_NAME) == task_names.TASKS
 
 
+@pytest.mark.slow
 def test_every_task_has_a_front(report):
     rows = report_rows.from_dicts(report["rows"])
     for task, kind in (("dynamics", "rotation"), ("poses", "position"), ("images", "psnr"), ("raster", "difference")):
         assert 1 <= len([r for r in pick(rows, task=task, error_kind=kind) if r.pareto]) < len(pick(rows, task=task))
 
 
+@pytest.mark.slow
 def test_the_terminal_shows_the_tables_and_absent_tasks(report, capsys):
     tables.show(report)
     text = capsys.readouterr().out

@@ -243,6 +243,7 @@ def test_a_video_of_one_image_gets_its_segments(model, video, tmp_path):
     assert 1 < len(np.unique(ids)) <= 6
 
 
+@pytest.mark.slow
 def test_the_command_resumes_and_prints_the_next_step(tiny, folder, tmp_path, capsys, monkeypatch):
     options = {"backend": "sam2", "model": folder, "out": tmp_path / "m", "points": 2, "key_frames": 1}
     options |= {"score": 0.0, "stability": 0.0, "max_area": 1.0}

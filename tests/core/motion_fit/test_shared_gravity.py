@@ -45,6 +45,7 @@ def falls():
     return [observed(FALLING, rng) for _ in range(4)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("up", [None, np.array([0, 0, 2.0])])
 def test_bodies_that_fall_share_gravity_and_are_predicted_better(falls, up):
     alone, together, sharing = [], [], []

@@ -77,10 +77,12 @@ def test_every_costly_case_passes():
     assert len(COSTLY) == 7 and not failed(COSTLY)
 
 
+@pytest.mark.slow
 def test_every_case_passes(rows):
     assert [(row.topic, row.name, row.measured, row.message) for row in rows if not row.passed] == []
 
 
+@pytest.mark.slow
 def test_every_case_is_described_and_unique(rows):
     assert len({(row.topic, row.name) for row in rows}) == len(rows) == len(SHORT)
     for row in rows:
@@ -94,12 +96,14 @@ def test_every_named_function_exists(method):
         assert callable(pkgutil.resolve_name(f"r5dgs_core.{name}"))
 
 
+@pytest.mark.slow
 def test_rows_of_a_topic_are_adjacent(rows):
     topics = [row.topic for row in rows]
     starts = [topic for before, topic in zip(["", *topics], topics, strict=False) if topic != before]
     assert len(starts) == len(set(starts))
 
 
+@pytest.mark.slow
 def test_the_table_is_the_same_on_every_run(rows):
     again = stability.run([alone(case) for case in of("order", "twists of members", "keys")])
     first = {(row.topic, row.name): row.measured for row in rows}
@@ -107,6 +111,7 @@ def test_the_table_is_the_same_on_every_run(rows):
         assert row.measured == first[row.topic, row.name]
 
 
+@pytest.mark.slow
 def test_traces_integrator_shows_the_errors_predicted_by_theory(rows):
     by_name = {(row.topic, row.name): row for row in rows}
     assert by_name["growth", "one step of 1 rad"].trace_rk2 == pytest.approx(math.sqrt(1.25) - 1)
@@ -211,6 +216,7 @@ def test_short_trainings_on_extreme_data_stay_finite():
     assert [(row.name, row.measured, row.message) for row in rows if row.measured != 0] == []
 
 
+@pytest.mark.slow
 def test_the_table_fits_80_columns(rows):
     console = Console(width=80, file=io.StringIO())
     console.print(stability.make(rows))

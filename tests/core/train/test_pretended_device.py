@@ -88,6 +88,7 @@ GRAPHS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.default_cases("tracks")
 @pytest.mark.parametrize("name", GRAPHS)
 def test_steps_as_graphs_are_the_same_steps(tiny, name, monkeypatch):

@@ -60,6 +60,7 @@ def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.default_cases("kill")
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=["kill", "terminate"])
 def test_a_stopped_run_resumes_to_the_same_bits(tiny, unbroken, tmp_path, capsys, number):

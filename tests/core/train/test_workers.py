@@ -77,6 +77,7 @@ def together(tiny, tmp_path_factory):
     return out, in_two_processes(*arguments(tiny.root, out, *SHORT))
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one_with_two_views_per_step(alone, together):
     out, (first, second) = together
     assert (first.returncode, second.returncode) == (0, 0), first.stderr + second.stderr

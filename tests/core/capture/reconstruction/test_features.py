@@ -39,6 +39,7 @@ def solved(tmp_path_factory):
     return films, request, poses, found
 
 
+@pytest.mark.slow
 def test_fixed_cameras_are_found_behind_moving_things(solved):
     _, _, poses, found = solved
     shifts, angles = pose_errors([camera.camera_to_world for camera in found.cameras], poses)
@@ -68,6 +69,7 @@ def test_known_lenses_are_kept(tmp_path):
     assert found.cameras[0].lens.fx == LENS.fx and found.cameras[0].lens.coefficients[0] == -0.1
 
 
+@pytest.mark.slow
 def test_a_moving_camera_has_a_pose_for_each_frame(tmp_path):
     angles = np.linspace(-0.3, 0.3, 6)
     poses = [look_at((np.sin(a), -0.3, -np.cos(a)), (0.5 * np.sin(a), 0.1, 1.5)) for a in angles]

@@ -45,6 +45,7 @@ def test_detached_identities_do_not_change_the_geometry_and_joint_ones_do(tiny):
     assert not torch.equal(without.gaussians.means, joint.gaussians.means[: len(without.gaussians)])
 
 
+@pytest.mark.slow
 @pytest.mark.default_cases("joint")
 @pytest.mark.parametrize("training", ["joint", "detached", "off"])
 def test_the_identities_of_a_run_are_stored_in_the_scene(tiny, tmp_path, training):

@@ -104,6 +104,7 @@ def test_wrong_poses_are_found_and_corrected(tiny, wrong, refined):
     assert offsets(wrong[0], refined, truth).mean() < 0.7 * offsets(wrong[0], untouched, truth).mean()
 
 
+@pytest.mark.slow
 def test_right_cameras_are_left_alone_and_the_run_is_the_same(tiny):
     dataset = datasets.read(tiny.root)
     end = trial.steps(tiny_datasets.settings(*tiny_datasets.EXAMINED, *STEPS))[-1] + 1

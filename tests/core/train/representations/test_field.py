@@ -69,6 +69,7 @@ def test_times_are_normalised_to_the_unit_interval_unless_they_are_in_it():
     assert seconds(12.0) == 0 and seconds(20.0) == 1
 
 
+@pytest.mark.slow
 def test_training_brings_the_images_closer(made):
     trainer = Trainer(datasets.read(made.dataset_root), made.config)
     before = mean_loss(trainer)
@@ -170,6 +171,7 @@ def test_a_field_that_starts_from_tracks_has_their_motion(tiny):
     assert float((after - before).abs().mean()) < 0.03
 
 
+@pytest.mark.slow
 def test_the_baked_scene_is_valid_and_renders_like_the_trained_state(made, scene):
     validation.check(scene, "field")
     trainer = Trainer(datasets.read(made.dataset_root), made.config)
@@ -185,6 +187,7 @@ def test_the_baked_scene_is_valid_and_renders_like_the_trained_state(made, scene
         assert np.abs(shown.clip(0, 1) - expected.clip(0, 1)).mean() < 2e-3
 
 
+@pytest.mark.slow
 def test_mode_standard_follows_the_trained_dynamics(made, scene):
     trainer = Trainer(datasets.read(made.dataset_root), made.config)
     trainer.restore(checkpoint.load(made.folder))
@@ -365,6 +368,7 @@ def test_at_a_single_time_a_field_is_a_still_scene(tiny):
     assert torch.equal(early, late) and torch.isfinite(late).all()
 
 
+@pytest.mark.slow
 def test_disabled_motion_does_not_return_as_residuals(made, scene, tiny):
     def travel(scene) -> float:
         mine = scene.gaussians.object_ids == tiny_datasets.BRICK

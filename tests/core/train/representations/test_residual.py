@@ -283,6 +283,7 @@ def breathing(tmp_path_factory):
     return data, done, bake.bake(done)
 
 
+@pytest.mark.slow
 def test_only_the_deforming_object_gets_residuals(breathing):
     _, done, scene = breathing
     tensors = checkpoint.load(done.folder).tensors
@@ -314,6 +315,7 @@ def test_residuals_improve_the_images_of_a_breathing_object(breathing):
     assert error_on_the_ball(bent, data) < 0.7 * error_on_the_ball(rigid, data)
 
 
+@pytest.mark.slow
 def test_the_ball_grows_and_shrinks_as_in_the_data(breathing):
     data, _, scene = breathing
     rows = scene.residuals.rows
@@ -324,6 +326,7 @@ def test_the_ball_grows_and_shrinks_as_in_the_data(breathing):
     assert np.corrcoef(sizes, true)[0, 1] > 0.9
 
 
+@pytest.mark.slow
 def test_the_scene_shows_what_was_trained_and_then_keeps_its_last_shape(breathing):
     data, done, scene = breathing
     trainer = make(data, *SETTINGS)

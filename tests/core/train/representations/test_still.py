@@ -66,6 +66,7 @@ def test_training_a_scene_at_rest_loads_no_module_of_motion(baked_at_rest):
     assert not parts & set(MOVING_PARTS) and not [part for part in parts if part.startswith("field")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("representation", ["tracks", "field"])
 def test_the_file_of_a_scene_at_rest_has_nothing_that_moves(baked_at_rest, representation):
     path = baked_at_rest[0] / f"{representation}.r5dgs"

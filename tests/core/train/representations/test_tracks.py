@@ -165,6 +165,7 @@ def train(data, *overrides):
     return trainer
 
 
+@pytest.mark.slow
 def test_an_object_with_late_masks_is_tracked_in_earlier_images(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path)
     erase(data, tiny_datasets.BALL, 0.4)
