@@ -13,20 +13,26 @@ from .scene import Scene
 STANDARD = 9.80665  # m / s^2
 _FLIGHTS = ("translation", "ballistic_spin", "free_top", "bounce")  # kinds whose acceleration may be gravity
 _DOWNWARD = 0.94  # least cosine between the acceleration of a falling body and the downward axis: 20 degrees
+_AGREES = 0.1  # relative difference of observed motions from the gravity of the units up to which they agree with it
 
 
 def of(scene: Scene) -> np.ndarray | None:
     """Return the acceleration of falling bodies, or None if it is unknown: no body falls, and units are missing. [3]
 
-    It is vertical if the world has an up axis, as the tilt of a few observed poses is mostly noise, on which a ball
-    would roll for ever.
+    Units tell it exactly, a few observed poses to some per cent. Motions that differ more are believed: a scene may be
+    in slow motion. It is vertical if the world has an up axis, as the tilt of a few observed poses is mostly noise, on
+    which a ball would roll for ever.
     """
     up = cameras.WORLD_TO_BLENDER[scene.world_convention][2]
     found = of_motions((group.smooth or group.model for group in scene.groups if group.role == "body"), up)
-    if found is not None:
-        return (found @ up) * up if scene.world_convention in world_axes.UP_AXIS else found
     seconds, meters = scene.units.seconds_per_unit, scene.units.meters_per_unit
-    return None if seconds is None or meters is None else -STANDARD * seconds**2 / meters * up
+    known = None if seconds is None or meters is None else STANDARD * seconds**2 / meters
+    if found is None:
+        return None if known is None else -known * up
+    if scene.world_convention in world_axes.UP_AXIS:
+        found = (found @ up) * up
+    seen = float(np.linalg.norm(found))
+    return found if known is None or abs(seen - known) > _AGREES * known else known / seen * found
 
 
 def of_motions(models: Iterable[MotionModel], up: np.ndarray) -> np.ndarray | None:

@@ -51,3 +51,11 @@ def test_without_a_fall_it_is_the_earths_in_the_units_of_the_scene_or_unknown():
     orbit = MotionModel("translation", acceleration=[-3.0, 0, -1.0])
     np.testing.assert_allclose(gravity.of(with_motions(orbit, units=Units(2.0, 0.5))), [0, 0, -9.80665 * 4 / 0.5])
     assert gravity.of(with_motions(orbit, units=Units(meters_per_unit=1.0))) is None
+
+
+@pytest.mark.parametrize(
+    ("meters", "pull"), [(9.80665 / 3.2, 3.2), (9.80665 / 4.0, 3.0)], ids=["agrees", "slow motion"]
+)
+def test_units_tell_it_more_exactly_than_motions_that_agree_with_them(meters, pull):
+    scene = with_motions(THROWN, units=Units(1.0, meters))
+    np.testing.assert_allclose(gravity.of(scene), [0, 0, -pull], rtol=1e-9)
