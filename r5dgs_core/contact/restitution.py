@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+_GRIP = math.log(20) / (2 * math.pi)  # damping ratio of friction, at least: a bounce of time pi / w leaves 1 / 20
 LEAST, MOST = 0.05, 0.98  # range of e in which simulated impacts keep it to 0.01
 _HEAVY = 50.0  # damping ratio above which nothing bounces
 
@@ -44,3 +45,13 @@ def damping_of(e: float) -> float:
 def reference(e: float, frequency: float) -> tuple[float, float]:
     """MuJoCo's ``solref`` of a contact with a restitution and a frequency w: minus stiffness and minus damping."""
     return -(frequency**2), -2 * damping_of(e) * frequency
+
+
+def grip(normal: tuple[float, float]) -> tuple[float, float]:
+    """Return ``solreffriction`` for the ``solref`` of a contact.
+
+    Friction would stop the slip of a contact with the damping of its normal direction: the more a ball bounces, the
+    more slip a bounce would leave, however large its friction.
+    """
+    frequency = math.sqrt(-normal[0])
+    return normal[0], min(normal[1], -2 * _GRIP * frequency)

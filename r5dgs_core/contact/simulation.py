@@ -70,6 +70,7 @@ class Simulation:
                 pairs = slice(count * self._moving.index(i), count * (self._moving.index(i) + 1))
                 model.pair_friction[pairs, :2] = friction
                 model.pair_solref[pairs] = reference
+                model.pair_solreffriction[pairs] = restitution.grip(reference)
 
     def load(self, state: State) -> None:
         """Set the state at time 0."""

@@ -47,6 +47,20 @@ def test_a_ball_that_slides_goes_on_rolling_at_five_sevenths_of_its_speed():
     assert now.spins[0, 1] * runs.world.bodies[0].ball_radius == pytest.approx(now.velocities[0, 0], rel=0.01)
 
 
+@pytest.mark.parametrize("e", [0.1, 0.5, 0.9])
+def test_a_bounce_with_enough_friction_ends_the_slip_of_a_ball(e):
+    fall, speed = 0.2, 0.5
+    ball = contacts.ball([0, 0, fall + 0.5 * SIZE], friction=0.6, restitution=e)
+    runs, state = contacts.simulate(contacts.on_plane(ball, height=0.5 * SIZE - ball.ball_radius))
+    state.velocities[0, 0] = speed
+    runs.load(state)
+    runs.advance(np.sqrt(2 * fall / G) * (1 + 0.6 * e))
+    now = runs.state()
+    assert now.velocities[0, 2] > 0.0
+    assert now.velocities[0, 0] == pytest.approx(5 / 7 * speed, rel=0.03)
+    assert now.spins[0, 1] * ball.ball_radius == pytest.approx(now.velocities[0, 0], abs=0.1 * speed)
+
+
 def test_two_balls_exchange_momentum_and_keep_it():
     heavy = contacts.ball([0.3, 0.02, 0], restitution=0.9, density=3.0)
     light = contacts.ball([0, 0, 0], restitution=0.9)
