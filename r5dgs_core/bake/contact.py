@@ -50,7 +50,7 @@ def _rows(found: Prediction) -> list[dict[str, Any]]:
         reason = "without contacts, it passes into others, in sizes" if value else "is pushed or hit by another body"
         if name == found.leaving:
             reason = "moves off the edge of its support"
-        if (compared := found.compared.get(name)) is not None:
+        if (compared := found.compared.get(name)) is not None and compared.better:
             value, threshold = compared.smooth - compared.contact, held_out.BETTER
             reason = f"no smooth law explains its last motion; {compared.text()}"
         rows.append({"object": name, **Need(NAME, value, threshold, True, f"{reason}; {material}").row()})

@@ -43,6 +43,11 @@ class Comparison:
         """True if contacts predict the poses better by more than the noise."""
         return self.contact + BETTER < self.smooth
 
+    @property
+    def good(self) -> bool:
+        """True if contacts explain the poses."""
+        return self.better or self.contact < UNEXPLAINED
+
     def text(self) -> str:
         """Residuals in words."""
         return (
@@ -50,15 +55,17 @@ class Comparison:
         )
 
 
-def is_unexplained(scene: Scene, body: SceneBody) -> bool:
-    """Return True if the smooth law of a free body does not fit its last poses, and others can be held out."""
+def is_possible(scene: Scene, body: SceneBody) -> bool:
+    """Return True if a body moves by itself, and poses can be held out."""
     group = body.group
     if not body.moves or group.joint is not None or group.parent is not None or group.follows is not None:
         return False
-    track = scene_bodies.track(scene, body)
-    if len(track) < _LAST + _LEAST_HELD:
-        return False
-    last = track.rows(slice(-_LAST, None))
+    return len(scene_bodies.track(scene, body)) >= _LAST + _LEAST_HELD
+
+
+def is_unexplained(scene: Scene, body: SceneBody) -> bool:
+    """Return True if the smooth law of a body does not fit its last poses."""
+    group, last = body.group, scene_bodies.track(scene, body).rows(slice(-_LAST, None))
     quats, moved, _, _ = models.curve(body.smooth, last.times - scene.t_max)
     arms = rotations.rotate(quats, np.broadcast_to(body.solid.center - group.pivot, moved.shape))
     return _residual((quats, group.pivot + moved + arms), last) > UNEXPLAINED

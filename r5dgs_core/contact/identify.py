@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..motion import levenberg_marquardt, rotations, se3
+from ..motion import levenberg_marquardt, robust_weights, rotations, se3
 from . import world as worlds
 from .simulation import Simulation
 from .world import Material, State
@@ -23,6 +23,7 @@ _STEPS = np.repeat([0.002, 0.003, 0.002, 0.003, 0.03, 0.1], [3, 3, 3, 3, 1, 1]) 
 _OUTLIER = 9.0  # squared residual of a pose whose weight is one half
 _FRICTIONS, _RESTITUTIONS = (0.1, 0.18, 0.3, 0.5), (0.1, 0.3, 0.6)  # first guesses
 _LEARNED = np.array([0.1, 0.5])  # least deviations of log friction and logit of restitution from the whole track
+_LOST = 10.0  # residual, in units of the noise, of a pose that a guess misses
 _CLOSE = 0.04  # gap, as a share of the size, below which a pose may be in contact
 _EARLY, _FULL = 5, 8  # iterations
 
@@ -133,18 +134,24 @@ class Fitter:
         start = self.ballistic(track.rows(slice(0, flight)))
         if not self._touched():
             return self.fit(start, prior.material, track, prior, _FULL)
-        guess = min(
-            (Material(mu, e) for mu in _FRICTIONS for e in _RESTITUTIONS),
-            key=lambda material: self._truncated(start, material),
-        )
-        found, count = None, len(track)
-        for rows in sorted({min(count, flight + 2), min(count, (flight + 2 + count) // 2), count}):
-            near = (start, guess) if found is None else (found.state, found.material)
-            steps = _FULL if rows == count else _EARLY
-            found = self.fit(*near, track.rows(slice(0, rows)), prior, steps)
-        assert found is not None
-        again = self.fit(start, guess, track, prior, _FULL)
-        return min(found, again, key=lambda estimate: estimate.cost)
+        found, count = [], len(track)
+        for guess in self._guesses(start):
+            near, grown = (start, guess), []
+            for rows in sorted({min(count, flight + 2), min(count, (flight + 2 + count) // 2), count}):
+                steps = _FULL if rows == count else _EARLY
+                grown.append(self.fit(*near, track.rows(slice(0, rows)), prior, steps))
+                near = grown[-1].state, grown[-1].material
+            found += [grown[-1], self.fit(start, guess, track, prior, _FULL)]
+        return min(found, key=lambda estimate: estimate.cost)
+
+    def _guesses(self, start: State) -> list[Material]:
+        """First guesses of the material: the one that follows most poses, and the one that misses none by much."""
+        materials = [Material(mu, e) for mu in _FRICTIONS for e in _RESTITUTIONS]
+        missed = [np.nan_to_num(self._residuals(start, material, self.track), nan=1e9) for material in materials]
+        squares = (np.array(missed) ** 2).sum(axis=-1)
+        losses = np.minimum(np.sqrt(squares), _LOST), robust_weights.cauchy_losses(squares, _OUTLIER)
+        best = [int(np.argmin(loss.sum(axis=1))) for loss in losses]
+        return [materials[k] for k in dict.fromkeys(best)]
 
     def fit(self, state: State, material: Material, track: Track, prior: Prior, steps: int) -> Estimate:
         """Fit from a state at the time of the first pose of a track."""
@@ -225,10 +232,6 @@ class Fitter:
         found = self.poses(state, material, track.times - track.times[0])
         missed = se3.differences(found, (track.quats, track.places), 1.0, 1.0)
         return np.concatenate([missed[:, :3] / track.place_noise[:, None], missed[:, 3:] / track.turn_noise[:, None]])
-
-    def _truncated(self, state: State, material: Material) -> float:
-        missed = self._residuals(state, material, self.track)
-        return float(np.minimum(np.linalg.norm(np.nan_to_num(missed, nan=1e9), axis=1), 10).sum())
 
     def _materials(self, material: Material) -> Sequence[Material]:
         bodies = self.simulation.world.bodies

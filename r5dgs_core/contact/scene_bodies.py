@@ -16,6 +16,7 @@ from ..shapes import solid
 from .identify import Track
 
 _PLACE_NOISE, _TURN_NOISE = 0.003, 0.004  # of poses without known errors: in sizes, and rad
+_STILL = 0.05  # motion, in sizes, in the last three poses before a body set off; a law that misses more is wrong there
 _FREE = ("translation", "ballistic_spin", "free_top", "drag", "bounce", "friction")
 
 
@@ -98,11 +99,13 @@ def track(scene: Scene, body: SceneBody, center: np.ndarray | None = None) -> Tr
     known = group.history.errors
     if known is not None:
         place, turn = np.maximum(place, known.place), np.maximum(turn, known.turn)
-    begins = [event.time for event in group.history.events if event.kind in ("start", "change")]
+    places = group.pivot + poses[:, 4:] + arms
+    begins = [event.time for event in group.history.events if event.kind == "change"]
+    starts = (event.time for event in group.history.events if event.kind == "start")
+    begins += [time for time in starts if np.ptp(places[times <= time][-3:], axis=0).max(initial=0.0) < _STILL * size]
     rows = np.isfinite(place) & (times > max(begins, default=-np.inf))
     if group.seen is not None:
         rows &= (times >= group.seen[0] - 1e-9) & (times <= group.seen[1] + 1e-9)
-    places = group.pivot + poses[:, 4:] + arms
     return Track(times[rows], poses[rows, :4], places[rows], place[rows], turn[rows])
 
 

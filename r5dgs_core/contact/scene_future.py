@@ -89,7 +89,8 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     if pull is None or up is None:
         reason = "gravity is unknown: no body was seen to fall, and the scene has no up axis or no units"
         return Prediction(scene.groups, depths, {}, (*lines, f"no contacts are predicted: {reason}"))
-    made = scene_world.make(scene, bodies, tried, pushed, doubtful, pull, end, leave).weighted(wishes.masses)
+    judged = {n: n in passing and not held_out.is_unexplained(scene, bodies[n]) for n in doubtful}
+    made = scene_world.make(scene, bodies, tried, pushed, judged, pull, end, leave).weighted(wishes.masses)
     found = _simulated(scene, made, wishes, end, depths, [*lines, *made.lines])
     return found if leave is None else dataclasses.replace(found, leaving=bodies[leave.number].name)
 
@@ -197,12 +198,15 @@ def _passing(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray |
 def _doubtful(
     scene: Scene, bodies: list[SceneBody], passing: Mapping[int, float], end: float, up: np.ndarray | None
 ) -> set[int]:
-    """Numbers of bodies in contact whose last poses no smooth law explains, unless their need for contacts is sure.
+    """Numbers of bodies in contact that held-out poses decide about, because their need for contacts is not sure.
 
-    If its law is that of a driven body, the body is in doubt too: a law that fits nothing proves no hand or motor.
+    No smooth law explains the last poses of some, also if they pass through something by the law of a driven body: a
+    law that fits nothing proves no hand or motor. Others pass through something by such a law, but contacts may explain
+    the same poses.
     """
     asked = [n for n, body in enumerate(bodies) if n not in passing or body.reason]
-    found = [n for n in asked if held_out.is_unexplained(scene, bodies[n])]
+    tested = [n for n in asked if held_out.is_possible(scene, bodies[n])]
+    found = [n for n in tested if n in passing or held_out.is_unexplained(scene, bodies[n])]
     if not found or up is None:
         return set()
     plane = scene_world.plane(scene, bodies, end, up)

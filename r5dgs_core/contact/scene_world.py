@@ -11,7 +11,7 @@ import numpy as np
 from ..motion import models
 from ..scene import world_axes
 from ..scene.scene import Scene
-from ..shapes import solid
+from ..shapes import boxes, solid
 from . import edges, floors, futures, held_out, restitution, scene_bodies, stepping, support, world
 from .held_out import Comparison
 from .identify import Estimate, Fitter
@@ -158,7 +158,7 @@ def make(
     bodies: list[SceneBody],
     tried: set[int],
     pushed: set[int],
-    doubtful: set[int],
+    doubtful: Mapping[int, bool],
     gravity: np.ndarray,
     end: float,
     leave: edges.Leave | None = None,
@@ -170,7 +170,8 @@ def make(
         bodies: Its bodies.
         tried: Numbers of those to fit. Without a fit, they are left out, as driven bodies are.
         pushed: Numbers of those among them that the user pushes; they are kept and not fixed.
-        doubtful: Numbers of those among them that held-out poses decide about.
+        doubtful: Numbers of those among them that held-out poses decide about, and True if it is enough that contacts
+            explain these; otherwise, contacts must predict them better than a smooth law.
         gravity: Acceleration of a falling body. [3]
         end: Scene time up to which to simulate.
         leave: A body that moves off its support, which then has an edge.
@@ -179,6 +180,7 @@ def make(
     below, edge = (plane(scene, bodies, end, up), None) if leave is None else (leave.plane, leave.edge)
     lines = [] if below is not None else ["no plane was found under the bodies"]
     kept = [n for n, body in enumerate(bodies) if not (body.moves and body.reason) or n in tried]
+    bodies = [_as_box(body) if n in kept else body for n, body in enumerate(bodies)]
     shapes = tuple(_body(scene, bodies[n], below, n in pushed, gravity) for n in kept)
     made = apart(World(shapes, below, gravity))
     chosen, own, fits, comparisons = [], [], {}, {}
@@ -189,7 +191,8 @@ def make(
             reason, compared = _misfit(estimate), None
             if not reason and number in doubtful:
                 compared = held_out.compare(fitter, up)
-                reason = "" if compared.better else f"contacts are not clearly better: {compared.text()}"
+                enough = compared.good if doubtful[number] else compared.better
+                reason = "" if enough else f"contacts are not clearly better: {compared.text()}"
             if estimate is not None and not reason:
                 fits[len(chosen)] = fitter, estimate
                 comparisons |= {} if compared is None else {len(chosen): compared}
@@ -202,6 +205,12 @@ def make(
         chosen.append(body)
         own.append(shape)
     return SceneWorld(tuple(chosen), World(tuple(own), below, gravity, edge), fits, tuple(lines), comparisons)
+
+
+def _as_box(body: SceneBody) -> SceneBody:
+    """The body with the shape of a box if its hull is nearly one; the user's obstacles stay as they are."""
+    corners = boxes.of(body.solid.vertices) if body.group.id else None
+    return body if corners is None else dataclasses.replace(body, solid=solid.of(corners))
 
 
 def _misfit(estimate: Estimate | None) -> str:

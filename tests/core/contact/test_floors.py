@@ -45,14 +45,15 @@ def test_a_body_that_rests_is_as_high_as_its_ground_and_one_in_flight_tells_noth
     assert floors.of(box, plane, above, GRAVITY) is None
 
 
-def test_friction_and_restitution_are_fitted_if_no_pose_is_close_to_the_ground():
+@pytest.mark.parametrize("noise", [1e-3, 1e-4], ids=["noisy", "exact"])
+def test_friction_and_restitution_are_fitted_if_no_pose_is_close_to_the_ground(noise):
     pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
     times = np.arange(0.0, 0.45, 0.04)
     place = contacts.on_plane(contacts.ball([0, 0, 0]))
     radius = place.bodies[0].ball_radius
     fitter = identify.Fitter(
         simulation.Simulation(place, stepping.choose(2.5, SIZE, G, 0.5, draft=True)),
-        track(bounce(times) + radius, times),
+        track(bounce(times) + radius, times, noise),
     )
     found = fitter.run()
     assert found.material.restitution == pytest.approx(0.6, abs=0.04)

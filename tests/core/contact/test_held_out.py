@@ -90,3 +90,24 @@ def test_explained_or_flying_bodies_are_not_in_doubt(tumbling, monkeypatch):
     smooth = contact_scenes.scene(contact_scenes.sliding(0.4))
     assert not held_out.is_unexplained(smooth, scene_bodies.of(smooth)[0][0])
     assert not scene_future.predict(smooth).taken
+
+
+def test_a_body_that_passes_through_another_is_simulated_if_contacts_predict_its_slide_as_well_as_its_law():
+    model, place = contact_scenes.sliding(1.6)
+    law = models.MotionModel("translation", velocity=model.velocity, acceleration=model.velocity * -0.25)
+    still = models.STATIC, place + [0.8, 0, 0]
+    scene = contact_scenes.with_units(contact_scenes.scene((law, place), still))
+    body = scene_bodies.of(scene)[0][0]
+    assert body.reason.startswith("it accelerates otherwise") and not held_out.is_unexplained(scene, body)
+    found = scene_future.predict(scene, Wishes(samples=1))
+    assert set(found.taken) == {"box 1", "box 2"}
+    compared = found.compared["box 1"]
+    assert compared.good and not compared.better
+
+
+def test_a_body_that_accelerates_over_the_floor_by_itself_keeps_its_motion():
+    model, place = contact_scenes.sliding(1.6)
+    law = models.MotionModel("translation", velocity=model.velocity, acceleration=2.0 * model.velocity)
+    scene = contact_scenes.with_units(contact_scenes.scene((law, place), (models.STATIC, place + [1.0, 0, 0])))
+    found = scene_future.predict(scene, Wishes(samples=1))
+    assert found.penetrations and not found.taken and found.groups is scene.groups

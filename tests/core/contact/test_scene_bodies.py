@@ -30,11 +30,23 @@ def test_a_body_that_came_to_rest_does_not_move_unless_another_carries_it():
 
 def test_a_body_that_was_not_seen_since_it_set_off_moves_on_with_the_reason():
     scene = contact_scenes.scene(contact_scenes.falling())
-    past = dataclasses.replace(history.EMPTY, events=(history.Event(scene.t_max, "start", 0.0),))
+    past = dataclasses.replace(history.EMPTY, events=(history.Event(scene.t_max, "change", 0.0),))
     groups = (scene.groups[0], dataclasses.replace(scene.groups[1], history=past))
     found = scene_future.predict(dataclasses.replace(scene, groups=groups), Wishes(samples=1))
     assert found.lines == ("box 1: moves on without contacts: it was not seen since it set off",)
     assert found.penetrations["box 1"] > 1 and not found.taken
+
+
+@pytest.mark.parametrize(("speed", "count"), [(0.0, 6), (1.0, 13)], ids=["still", "moving"])
+def test_a_track_begins_when_the_body_set_off_if_it_was_still_before(speed, count):
+    scene = contact_scenes.scene(contact_scenes.sliding(1.0))
+    poses = scene.tracks.poses.copy()
+    before = scene.tracks.times < 0.32
+    poses[1, before, 4] = poses[1, before, 4][-1] + speed * (scene.tracks.times[before] - 0.3)
+    past = dataclasses.replace(history.EMPTY, events=(history.Event(0.32, "start", 0.0),))
+    groups = (scene.groups[0], dataclasses.replace(scene.groups[1], history=past))
+    scene = dataclasses.replace(scene, groups=groups, tracks=dataclasses.replace(scene.tracks, poses=poses))
+    assert len(scene_bodies.track(scene, scene_bodies.of(scene)[0][0])) == count
 
 
 def test_the_places_of_a_track_are_those_of_the_given_centre():
