@@ -81,15 +81,17 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     driven = [n for n in passing if bodies[n].reason and n not in pushed | doubtful]
     lines += [f"{bodies[n].name}: moves on without contacts: {bodies[n].reason}" for n in driven]
     tried = (set(passing) - set(driven)) | pushed | doubtful
-    free = [n for n, body in enumerate(bodies) if body.moves and not body.reason and n not in tried]
+    free = [n for n, body in enumerate(bodies) if n not in tried and _is_free(scene, body)]
     leave = None if up is None else edges.first(scene, bodies, free, end, up)
-    tried |= set() if leave is None else {leave.number}
+    leaving = set() if leave is None else {leave.number}
+    tried |= leaving
+    doubtful |= {n for n in leaving if bodies[n].reason}
     if not tried:
         return Prediction(scene.groups, depths, {}, tuple(lines))
     if pull is None or up is None:
         reason = "gravity is unknown: no body was seen to fall, and the scene has no up axis or no units"
         return Prediction(scene.groups, depths, {}, (*lines, f"no contacts are predicted: {reason}"))
-    judged = {n: n in passing and not held_out.is_unexplained(scene, bodies[n]) for n in doubtful}
+    judged = {n: n in leaving or n in passing and not held_out.is_unexplained(scene, bodies[n]) for n in doubtful}
     made = scene_world.make(scene, bodies, tried, pushed, judged, pull, end, leave).weighted(wishes.masses)
     found = _simulated(scene, made, wishes, end, depths, [*lines, *made.lines])
     return found if leave is None else dataclasses.replace(found, leaving=bodies[leave.number].name)
@@ -211,6 +213,11 @@ def _doubtful(
         return set()
     plane = scene_world.plane(scene, bodies, end, up)
     return {n for n in found if held_out.in_contact(scene, bodies[n], plane)}
+
+
+def _is_free(scene: Scene, body: SceneBody) -> bool:
+    """Return True if a body moves without a hand or a motor, or if held-out poses can show that."""
+    return held_out.is_possible(scene, body) if body.reason else body.moves
 
 
 def _sinks(scene: Scene, body: SceneBody, path: se3.Pose, up: np.ndarray) -> bool:

@@ -17,9 +17,11 @@ UP = np.array([0.0, 0.0, 1.0])
 DEPTH = 0.8
 
 
-def table(speed, border=0.5, **options):
+def table(speed, border=0.5, acceleration=0.0, **options):
     """A box that slides on a floor which is lower beyond a border in x."""
-    scene = contact_scenes.with_units(contact_scenes.scene(contact_scenes.sliding(speed), **options))
+    model, place = contact_scenes.sliding(speed)
+    model = dataclasses.replace(model, acceleration=np.array([acceleration, 0, 0]))
+    scene = contact_scenes.with_units(contact_scenes.scene((model, place), **options))
     means = scene.gaussians.means.copy()
     means[(scene.gaussians.object_ids == 0) & (means[:, 0] > border), 2] -= DEPTH
     return dataclasses.replace(scene, gaussians=dataclasses.replace(scene.gaussians, means=means))
@@ -37,6 +39,14 @@ def test_a_box_that_slides_off_a_table_falls_to_the_ground_below():
     fallen = models.evaluate(model, np.array([1.0, 1.1, 1.2]))[1][:, 2]
     assert (fallen < -DEPTH + SIZE).all() and (fallen > -DEPTH - 0.05 * SIZE).all()
     assert contact.needs((), found)[0]["reason"].startswith("moves off the edge of its support")
+
+
+@pytest.mark.parametrize(("acceleration", "leaves"), [(-0.4, True), (4.0, False)], ids=["braked", "driven"])
+def test_a_body_whose_law_is_no_free_motion_falls_off_the_edge_if_contacts_explain_its_poses(acceleration, leaves):
+    scene = table(2.0, acceleration=acceleration)
+    assert scene_bodies.of(scene)[0][0].reason
+    found = scene_future.predict(scene, Wishes(samples=1))
+    assert found.leaving == "box 1" and bool(found.taken) == leaves
 
 
 @pytest.mark.parametrize(("speed", "border"), [(1.0, 2.0), (0.2, 0.5), (-2.0, 0.5)], ids=["far", "slow", "away"])
