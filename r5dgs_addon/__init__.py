@@ -2,7 +2,7 @@
 
 from . import panels, preferences
 from .clean_up import criteria, overlay
-from .engine import engine, live_preview, mesh_merge, render_notes, render_stats
+from .engine import engine, live_preview, mesh_merge, render_command, render_notes, render_stats
 from .language import prompt_state
 from .motion import contact_fields, event_markers, exact_mode, extrapolate, motion_fields, pivot
 from .scene import (
@@ -38,6 +38,7 @@ MODULES = (
     render_notes,
     mesh_merge,
     engine,
+    render_command,
     viewport_splats,
     criteria,
     overlay,

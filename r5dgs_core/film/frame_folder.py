@@ -1,9 +1,7 @@
-"""Folders of frames that several processes fill together, without losing or repeating a frame.
+"""Folders of frames that several processes may fill together (`shared_frames`).
 
-A process holds a locked placeholder beside a frame while it draws it. The system releases the lock when the process
-ends in any way, so the frames of a process that was killed are drawn by the others. All processes must have the same
-settings: the first one writes them to ``render.json``, the others compare. Frames are removed only from folders that
-have this file.
+All processes must have the same settings: the first one writes them to ``render.json``, the others compare. Frames are
+removed only from folders that have this file.
 """
 
 from __future__ import annotations
@@ -12,18 +10,16 @@ import json
 import os
 import re
 import secrets
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from .. import atomic_files, errors, folder_lock, strict_json
+from .. import atomic_files, errors, shared_frames, strict_json
 from .schedule import Shot
 
 SETTINGS = "render.json"
 KEYS = {"scene", "camera", "gaussians"}  # by which the file is known to be of a film
 _FRAME = re.compile(r"frame_\d{4,}\.(png|exr)")
-POLL_S = 0.5  # interval between two checks for frames of other processes
 
 
 def path_of(folder: Path, number: int, suffix: str) -> Path:
@@ -54,22 +50,13 @@ def fill(
     Yields:
         Each frame when it is complete, and True if this process has drawn it.
     """
-    waiting = list(shots)
-    while waiting:
-        left = []
-        for shot in waiting:
-            path, drawn = path_of(folder, shot.number, suffix), True
-            if share:
-                drawn = _draw_once(path, shot, draw)
-            else:
-                draw(shot, path)
-            if drawn is None:
-                left.append(shot)
-            else:
-                yield shot, drawn
-        if len(left) == len(waiting):
-            time.sleep(POLL_S)
-        waiting = left
+    frames = [(shot, path_of(folder, shot.number, suffix)) for shot in shots]
+    if share:
+        yield from shared_frames.fill(frames, draw)
+        return
+    for shot, path in frames:
+        draw(shot, path)
+        yield shot, True
 
 
 def claim(folder: Path, settings: dict[str, Any], *, overwrite: bool = False) -> None:
@@ -124,19 +111,4 @@ def _create_settings(path: Path, settings: dict[str, Any]) -> bool:
         os.replace(temporary, path)  # on file systems without hard links
     finally:
         temporary.unlink(missing_ok=True)
-    return True
-
-
-def _draw_once(path: Path, shot: Shot, draw: Callable[[Shot, Path], None]) -> bool | None:
-    """Draw a frame unless it exists (False) or another process draws it (None)."""
-    if path.exists():
-        return False
-    with folder_lock.try_file(path.with_name(f".{path.name}.placeholder")) as held:
-        if not held:
-            return None
-        if path.exists():
-            return False
-        for left in path.parent.glob(f".{path.name}.*{path.suffix}"):  # of a process that was killed while it wrote
-            left.unlink(missing_ok=True)
-        draw(shot, path)
     return True

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r5dgs_core import errors, folder_lock
+from r5dgs_core import errors, folder_lock, shared_frames
 from r5dgs_core.cli import main
 from r5dgs_core.data import images
 from r5dgs_core.film import frame_folder
@@ -64,10 +64,10 @@ def test_a_frame_of_another_holder_is_waited_for(tmp_path, monkeypatch):
         (tmp_path / "frame_0001.png").write_text("theirs")
         held.__exit__(None, None, None)
 
-    monkeypatch.setattr(frame_folder.time, "sleep", sleep)
+    monkeypatch.setattr(shared_frames.time, "sleep", sleep)
     found = frame_folder.fill(tmp_path, shots, ".png", lambda shot, path: path.write_text("own"), share=True)
     assert [(shot.number, own) for shot, own in found] == [(2, True), (1, False)]
-    assert waits == [frame_folder.POLL_S] and (tmp_path / "frame_0001.png").read_text() == "theirs"
+    assert waits == [shared_frames.POLL_S] and (tmp_path / "frame_0001.png").read_text() == "theirs"
 
 
 SETTINGS = {"scene": "0f", "camera": "()", "gaussians": "all", "fps": "24"}
