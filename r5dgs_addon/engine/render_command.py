@@ -68,7 +68,8 @@ def render(scene: bpy.types.Scene, frames: Sequence[int]) -> tuple[int, int]:
     """
     if scene.render.engine != engine.ENGINE:
         raise errors.ConfigError(
-            f"scene {scene.name!r}: rendered by {scene.render.engine}; choose the render engine R5DGS, or use blender -a"
+            f"scene {scene.name!r}: rendered by {scene.render.engine}; choose the render engine R5DGS, or use "
+            "blender -a"
         )
     if scene.render.is_movie_format:
         raise errors.ConfigError(
