@@ -162,7 +162,10 @@ def test_scenes_without_an_origin_are_measured_in_their_own_world(baked, tiny, t
     data = made(tmp_path / "data", 1.0, 0.2 * FAR)
     older = dataclasses.replace(
         baked.with_arrays(means=(baked.gaussians.means.astype(np.float64) + 0.2 * FAR).astype(np.float32)),
-        groups=tuple(dataclasses.replace(group, pivot=group.pivot + 0.2 * FAR) for group in baked.groups),
+        groups=tuple(
+            dataclasses.replace(group, pivot=group.pivot + 0.2 * FAR, model=group.smooth or group.model, smooth=None)
+            for group in baked.groups
+        ),
         cameras=tuple(cameras.translated(camera, 0.2 * FAR) for camera in baked.cameras),
         hulls=(),
     )
