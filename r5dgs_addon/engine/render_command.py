@@ -16,6 +16,7 @@ from pathlib import Path
 import bpy
 
 from ...r5dgs_core import errors, shared_frames
+from ..ui import plural
 from . import engine
 
 NAME = "r5dgs_render"
@@ -41,7 +42,7 @@ def run(arguments: Sequence[str]) -> int:
     except errors.R5dgsError as error:
         print(f"{NAME}: {error}", file=sys.stderr, flush=True)
         return FAILED
-    print(f"{NAME}: {rendered} frames rendered, {existing} left that existed or that other processes rendered")
+    print(f"{NAME}: {plural.of(rendered, 'frame')} rendered, {existing} existed or were rendered by other processes")
     return 0
 
 
