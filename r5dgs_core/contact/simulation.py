@@ -85,13 +85,18 @@ class Simulation:
 
     def state(self) -> State:
         """Present state; fixed bodies are at rest."""
-        count = len(self.world.bodies)
-        places = np.array([body.solid.center for body in self.world.bodies]).reshape(count, 3)
-        quats, velocities, spins = rotations.identity(count), np.zeros((count, 3)), np.zeros((count, 3))
-        poses, rates = self.data.qpos.reshape(-1, 7), self.data.qvel.reshape(-1, 6)
-        places[self._moving], quats[self._moving] = self.unit * poses[:, :3], poses[:, 3:]
-        velocities[self._moving] = self.unit * rates[:, :3]
-        spins[self._moving] = rotations.rotate(poses[:, 3:], rates[:, 3:])
+        return self._unpacked(self.data.qpos, self.data.qvel)
+
+    def _unpacked(self, positions: np.ndarray, rates: np.ndarray) -> State:
+        """State from MuJoCo's positions [..., 7 M] and rates [..., 6 M] of the M bodies that are not fixed."""
+        shape = (*positions.shape[:-1], len(self.world.bodies))
+        places, quats = np.empty((*shape, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (*shape, 1))
+        velocities, spins = np.zeros((*shape, 3)), np.zeros((*shape, 3))
+        places[:] = np.array([body.solid.center for body in self.world.bodies]).reshape(-1, 3)
+        positions, rates = positions.reshape(*shape[:-1], -1, 7), rates.reshape(*shape[:-1], -1, 6)
+        places[..., self._moving, :], quats[..., self._moving, :] = self.unit * positions[..., :3], positions[..., 3:]
+        velocities[..., self._moving, :] = self.unit * rates[..., :3]
+        spins[..., self._moving, :] = rotations.rotate(positions[..., 3:], rates[..., 3:])
         return State(places, quats, velocities, spins)
 
     def advance(self, time: float) -> None:
@@ -103,9 +108,9 @@ class Simulation:
     def state_at(self, time: float) -> State:
         """Simulate up to a time, the rest after the last whole step at constant rates, and return the state there."""
         self.advance(time)
-        now, rest = self.state(), time - self.data.time
-        quats = rotations.multiply(rotations.rotvecs_to_quats(rest * now.spins), now.quats)
-        return State(now.places + rest * now.velocities, quats, now.velocities, now.spins)
+        now = self.state()
+        quats, places = _moved(now, time - self.data.time)
+        return State(places, quats, now.velocities, now.spins)
 
     @property
     def failed(self) -> bool:
@@ -126,10 +131,12 @@ class Simulation:
             simulation has failed.
         """
         self.load(state)
-        quats, places = np.empty((len(times), len(state.places), 4)), np.empty((len(times), len(state.places), 3))
+        positions, rates = (np.empty((len(times), len(now))) for now in (self.data.qpos, self.data.qvel))
+        rest = np.empty(len(times))
         for row, time in enumerate(times):
-            now = self.state_at(float(time))
-            quats[row], places[row] = now.quats, now.places
+            self.advance(float(time))
+            positions[row], rates[row], rest[row] = self.data.qpos, self.data.qvel, time - self.data.time
+        quats, places = _moved(self._unpacked(positions, rates), rest[:, None, None])
         if self.failed:
             places[:], quats[:] = np.nan, np.nan
         return quats, places
@@ -163,6 +170,12 @@ class Simulation:
             int(np.flatnonzero(self._geoms == g)[0]) if g in self._geoms else -1 for g in contact.geom
         )
         return first, second
+
+
+def _moved(now: State, rest: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations and places after a time at constant rates. [..., B, 4], [..., B, 3]"""
+    quats = rotations.multiply(rotations.rotvecs_to_quats(rest * now.spins), now.quats)
+    return quats, now.places + rest * now.velocities
 
 
 def _specification(mujoco: Any, world: World, stepping: Stepping, unit: float) -> Any:
