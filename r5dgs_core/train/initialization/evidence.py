@@ -9,7 +9,8 @@ Notation: M objects, S observed times.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,7 @@ CLEARER = 0.03  # maximum mean colour difference due to noise
 DISC = 0.6  # radius of the compared disc / radius of the body
 HIDDEN = 0.1  # share of the disc covered by other objects above which a view is ignored
 MIN_FRAMES, MAX_FRAMES = 2, 15  # frames of a camera for the colours without the object
+ENOUGH = 5  # images of a body at one time that show its texture, in captures of more than `MAX_SAMPLE` images
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,8 @@ def turn_stiffness(views: Sequence[TrainView], places: ObjectPositions, times: n
     """Return the smoothness of rotations about each axis, in world axes: the identity if texture determines rotation.
 
     The change of the image with rotation is estimated for a ball in the body's place, with the texture inside its mask.
-    Smooth shading (a quadratic over the mask) is removed first, as it does not turn with the body.
+    Smooth shading (a quadratic over the mask) is removed first, as it does not turn with the body. Of captures with
+    more than `MAX_SAMPLE` images, each time reads only as many images as show each visible body `ENOUGH` times.
 
     Args:
         views: Training views.
@@ -78,23 +81,48 @@ def turn_stiffness(views: Sequence[TrainView], places: ObjectPositions, times: n
     m, count = places.measured.shape
     change = np.zeros((m, count, 3, 3))
     pixels = np.zeros((m, count))
-    for view in in_turn([view for view in views if view.has_mask], IMAGE, MASK):
-        s, image, mask = nearest_knot(times, view.t), view.image, view.mask
-        assert mask is not None
-        known = np.where(mask == masks.UNKNOWN, 0, mask).astype(np.int32)
-        boxes = ndimage.find_objects(known)
-        for row, object_id in enumerate(places.object_ids):
-            box = boxes[object_id - 1] if object_id <= len(boxes) else None
-            found = None if box is None else _change_per_turn(image[box], mask[box] == object_id)
-            if found is not None:
-                axes = view.camera.T_cam_world[:3, :3]
-                change[row, s] += axes.T @ found[0] @ axes
-                pixels[row, s] += found[1]
+    masked = [view for view in views if view.has_mask]
+    long = len(masked) > MAX_SAMPLE
+    for s, group in _by_knot(masked, times).items():
+        shown = np.zeros(m, int)
+        for view in in_turn(_apart(group) if long else group, IMAGE, MASK):
+            for row, turned, size in _textures(view, places.object_ids):
+                change[row, s] += turned
+                pixels[row, s] += size
+                shown[row] += 1
+            if long and (shown >= ENOUGH)[places.evidence[:, s] > 0].all():
+                break
     eye = np.eye(3)
     seen = change / np.maximum(pixels, 1)[..., None, None]
     loose = np.linalg.inv(eye + seen / TEXTURE**2)
     stiff = eye + STIFFEST * loose @ loose
     return stiff * shift_stiffness(places.evidence)[..., None, None]
+
+
+def _by_knot(views: Sequence[TrainView], times: np.ndarray) -> dict[int, list[TrainView]]:
+    """Group views by their nearest knot, in their order."""
+    groups: dict[int, list[TrainView]] = {}
+    for view in views:
+        groups.setdefault(nearest_knot(times, view.t), []).append(view)
+    return groups
+
+
+def _apart(views: Sequence[TrainView]) -> list[TrainView]:
+    """Return the views in an order in which successive ones are far apart: multiples of the golden ratio, modulo 1."""
+    return [views[k] for k in np.argsort(np.arange(len(views)) * (math.sqrt(5) - 1) / 2 % 1)]
+
+
+def _textures(view: TrainView, object_ids: np.ndarray) -> Iterator[tuple[int, np.ndarray, int]]:
+    """Yield the row, the squared colour change per radian, world axes [3, 3], and the pixels of each body shown."""
+    image, mask = view.image, view.mask
+    assert mask is not None
+    boxes = ndimage.find_objects(np.where(mask == masks.UNKNOWN, 0, mask).astype(np.int32))
+    axes = view.camera.T_cam_world[:3, :3]
+    for row, object_id in enumerate(object_ids):
+        box = boxes[object_id - 1] if object_id <= len(boxes) else None
+        found = None if box is None else _change_per_turn(image[box], mask[box] == object_id)
+        if found is not None:
+            yield row, axes.T @ found[0] @ axes, found[1]
 
 
 def _change_per_turn(part: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, int] | None:

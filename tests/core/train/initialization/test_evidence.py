@@ -61,6 +61,27 @@ def test_texture_leaves_rotations_free_and_its_absence_makes_them_stiff():
             assert np.linalg.eigvalsh(matrix)[0] > 30
 
 
+@pytest.mark.parametrize("paint", [checkered, banded, plain])
+def test_long_captures_read_a_part_of_their_images(monkeypatch, paint):
+    seen = [ball_view(c, t, [0, 0, 0.3], paint) for t in TIMES for c in ring(12)]
+    places = triangulation.locate(seen, TIMES, 5e-4)
+    expected = evidence.turn_stiffness(seen, places, TIMES)
+    calls, change = [], evidence._change_per_turn
+    monkeypatch.setattr(evidence, "_change_per_turn", lambda *a: calls.append(1) or change(*a))
+    monkeypatch.setattr(evidence, "MAX_SAMPLE", 0)
+    found = evidence.turn_stiffness(seen, places, TIMES)
+    assert len(calls) == evidence.ENOUGH * len(TIMES)
+    np.testing.assert_allclose(np.linalg.eigvalsh(found), np.linalg.eigvalsh(expected), rtol=0.2)
+
+
+def test_a_body_that_few_cameras_of_a_long_capture_show_is_found_in_them(monkeypatch):
+    seen = [ball_view(c, t, [0, 0, 0.3], checkered, shown=k in (3, 8)) for t in TIMES for k, c in enumerate(ring(12))]
+    places = triangulation.locate(seen, TIMES, 5e-4)
+    expected = evidence.turn_stiffness(seen, places, TIMES)
+    monkeypatch.setattr(evidence, "MAX_SAMPLE", 0)
+    np.testing.assert_allclose(evidence.turn_stiffness(seen, places, TIMES), expected, rtol=1e-9)
+
+
 def test_an_invisible_rotation_is_stiff_only_about_its_own_axis():
     for matrix in stiffness(banded):
         values, axes = np.linalg.eigh(matrix)
