@@ -75,7 +75,7 @@ def try_file(path: Path) -> Iterator[bool]:
         return
     except OSError as error:
         reason = error.strerror or error
-        raise CheckpointError(f"{path.parent}: no file can be created: {reason}; choose another --out") from error
+        raise CheckpointError(f"{path.parent}: no file can be created: {reason}; choose another folder") from error
     try:
         yield True
     finally:
