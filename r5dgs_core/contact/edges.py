@@ -1,4 +1,4 @@
-"""Edge of the support of a body, such as that of a table, over which the body moves, to fall to the ground below.
+"""Edges of supports, such as tables, over which bodies fall to the ground below.
 
 Places are proven empty by rays: a pixel that shows something below the plane shows that the plane has a hole where the
 ray passes through it.

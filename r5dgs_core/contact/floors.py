@@ -22,7 +22,7 @@ _SMOOTH = 3.0  # residual of a path, in units of the noise
 
 
 def of(body: Body, below: Plane, track: Track, gravity: np.ndarray) -> float | None:
-    """Return the height of a moving body's ground along the normal of a plane, or None if its poses do not tell."""
+    """Return the height of a moving body's ground along the normal of a plane, or None if its poses do not show it."""
     size = body.solid.size
     lowest = float(world.gaps(body, below, track.places, track.quats).min(initial=np.inf))
     impact = _impact(body, below, track, float(np.linalg.norm(gravity)))

@@ -19,9 +19,9 @@ _AGREES = 0.1  # relative difference of observed motions from the gravity of the
 def of(scene: Scene) -> np.ndarray | None:
     """Return the acceleration of falling bodies, or None if it is unknown: no body falls, and units are missing. [3]
 
-    Units tell it exactly, a few observed poses to some per cent. Motions that differ more are believed: a scene may be
-    in slow motion. It is vertical if the world has an up axis, as the tilt of a few observed poses is mostly noise, on
-    which a ball would roll for ever.
+    The units give its exact value; a few observed poses give it within some per cent. If they differ by more, the
+    observed motions count, as a scene may be in slow motion. It is vertical if the world has an up axis, as the tilt of
+    a few observed poses is mostly noise, on which a ball would roll for ever.
     """
     up = cameras.WORLD_TO_BLENDER[scene.world_convention][2]
     found = of_motions((group.smooth or group.model for group in scene.groups if group.role == "body"), up)

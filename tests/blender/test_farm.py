@@ -14,7 +14,7 @@ import pytest
 
 from r5dgs_core.data import images
 from r5dgs_core.scene import scene_file
-from tests.support import patience, scenes
+from tests.support import patience, player, scenes
 
 ROOT = Path(__file__).resolve().parents[2]
 ARRAY = ROOT / "examples" / "farm" / "render_array.sh"
@@ -205,9 +205,6 @@ def test_the_job_type_of_flamenco_refuses_a_job_without_output_or_frames():
 
 def flamenco(given):
     """Compile a job with the stand-in."""
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("Node is not installed; it is a package of Debian and Ubuntu, nodejs")
-    command = [node, Path(__file__).with_name("flamenco_stand_in.mjs"), JOB_TYPE]
+    command = [player.node_alone(), Path(__file__).with_name("flamenco_stand_in.mjs"), JOB_TYPE]
     done = subprocess.run(command, input=json.dumps(given), capture_output=True, text=True, check=True)
     return json.loads(done.stdout)

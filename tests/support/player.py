@@ -15,11 +15,17 @@ FOLDER = Path(__file__).resolve().parents[2] / "player"
 MODULES = FOLDER / "node_modules"
 
 
-def node() -> str:
-    """Path of Node; skips the test if it or the player's packages are missing."""
+def node_alone() -> str:
+    """Path of Node; skips the test if it is missing."""
     found = shutil.which("node")
     if found is None:
         pytest.skip("Node is not installed; it is a package of Debian and Ubuntu, nodejs")
+    return found
+
+
+def node() -> str:
+    """Path of Node; skips the test if it or the player's packages are missing."""
+    found = node_alone()
     if not (MODULES / "puppeteer-core").is_dir():
         pytest.skip("the player's packages are not installed; remedy: npm --prefix player ci --ignore-scripts")
     return found
