@@ -46,6 +46,11 @@ def splat_transform() -> Path:
     return MODULES / ".bin"
 
 
+def put_splat_transform_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Add the folder of splat-transform to the PATH; skips the test without the player's packages."""
+    monkeypatch.setenv("PATH", f"{splat_transform()}{os.pathsep}{os.environ['PATH']}")
+
+
 class Browser:
     """Headless Chromium with software WebGL, driven by ``player/tests/drive.mjs``."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 
 import numpy as np
@@ -29,7 +28,7 @@ Y_DOWN = np.diag([1.0, -1, -1]) @ Y_UP
 
 @pytest.fixture
 def program(monkeypatch):
-    monkeypatch.setenv("PATH", f"{player.splat_transform()}{os.pathsep}{os.environ['PATH']}")
+    player.put_splat_transform_on_path(monkeypatch)
 
 
 def colors(sh, axes, direction):

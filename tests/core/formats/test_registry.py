@@ -8,10 +8,10 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.cli import main
-from r5dgs_core.formats import ply, registry
+from r5dgs_core.formats import ply, registry, sog
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
-from tests.support import pages
+from tests.support import pages, player
 from tests.support.command_line import complaint
 
 POSES = ("poses", "poses_csv", "tum")  # which hold the motion of an object without Gaussians
@@ -51,8 +51,10 @@ def test_a_format_without_its_package_is_refused_with_the_remedy(scene, tmp_path
 
 
 @pytest.mark.parametrize("name", registry.MODULES)
-def test_folders_and_selections_that_do_not_suit_give_one_error_and_no_file(scene, tmp_path, name):
+def test_folders_and_selections_that_do_not_suit_give_one_error_and_no_file(scene, tmp_path, name, monkeypatch):
     found = registry.get(name)
+    if found.program == sog.PROGRAM:
+        player.put_splat_transform_on_path(monkeypatch)
     if (reason := found.why_unavailable()) is not None:
         pytest.skip(reason)
     missing = tmp_path / "missing" / f"a{found.suffix}"
