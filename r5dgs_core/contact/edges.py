@@ -45,11 +45,15 @@ class Leave:
 
 def first(scene: Scene, bodies: list[SceneBody], numbers: list[int], end: float, up: np.ndarray) -> Leave | None:
     """Return the first of some bodies that moves off its support up to the scene time ``end``, or None."""
+    if not numbers:
+        return None
+    ground = _Ground.of(scene, up)
     for number in numbers:
         body = bodies[number]
         path = scene_bodies.predicted(body, np.linspace(0, max(end - scene.t_max, 0.0), _TIMES))[1]
         size = body.solid.size
-        if not _may_leave(scene, path, up, size):
+        carried = [ground.carries(place, size) for place in path]
+        if not carried[0] or all(carried):  # no picture has to be drawn
             continue
         plane = _plane(scene, body, up)
         if plane is None or not held_out.in_contact(scene, body, plane):
@@ -72,18 +76,39 @@ def _plane(scene: Scene, body: SceneBody, up: np.ndarray) -> Plane | None:
     return min(planes, key=lambda one: float(world.gaps(Body(body.solid), one, track.places, track.quats).std()))
 
 
-def _may_leave(scene: Scene, path: np.ndarray, up: np.ndarray, size: float) -> bool:
-    """Return True if Gaussians of the background carry a body now, and none does later. It needs no pictures. [T, 3]"""
-    found = scene.gaussians
-    rows = (found.object_ids == 0) & (found.motion_ids == 0) & (splats.to_opacities(found.opacity_logits) > _SEEN)
-    axes = rotations.quats_to_rotmats(found.quats[rows].astype(np.float64)) * np.exp(found.log_scales[rows])[:, None]
-    deviations = np.linalg.norm(axes, axis=2) @ np.abs(up), np.linalg.norm(axes, axis=2).max(axis=1)
-    apart = path[:, None] - found.means[rows]
-    heights = apart @ up
-    across = np.linalg.norm(apart - heights[..., None] * up, axis=-1)
-    under = (across < _UNDER * size + deviations[1]) & (np.abs(heights) < size + deviations[0])
-    carried = under.any(axis=1)
-    return bool(carried[0] and not carried.all())
+@dataclass(frozen=True)
+class _Ground:
+    """Gaussians of the background that may carry bodies.
+
+    Attributes:
+        up: Unit vector against gravity. [3]
+        means: Their centres. [N, 3]
+        upwards: Deviations along the up axis. [N]
+        largest: Largest deviations along their own axes. [N]
+    """
+
+    up: np.ndarray
+    means: np.ndarray
+    upwards: np.ndarray
+    largest: np.ndarray
+
+    @classmethod
+    def of(cls, scene: Scene, up: np.ndarray) -> _Ground:
+        """Return those of a scene."""
+        found = scene.gaussians
+        rows = (found.object_ids == 0) & (found.motion_ids == 0) & (splats.to_opacities(found.opacity_logits) > _SEEN)
+        axes = (
+            rotations.quats_to_rotmats(found.quats[rows].astype(np.float64)) * np.exp(found.log_scales[rows])[:, None]
+        )
+        lengths = np.linalg.norm(axes, axis=2)
+        return cls(up, found.means[rows], lengths @ np.abs(up), lengths.max(axis=1))
+
+    def carries(self, place: np.ndarray, size: float) -> bool:
+        """Return True if some Gaussians are under a body of a size at a place. [3]"""
+        apart = place - self.means
+        heights = apart @ self.up
+        across = np.linalg.norm(apart - heights[:, None] * self.up, axis=-1)
+        return bool(((across < _UNDER * size + self.largest) & (np.abs(heights) < size + self.upwards)).any())
 
 
 def _find(scene: Scene, plane: Plane, path: np.ndarray, size: float) -> Edge | None:
