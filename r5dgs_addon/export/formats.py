@@ -45,9 +45,11 @@ def steps(
         The outcome, with a warning for each part of the scene that the format loses.
 
     Raises:
-        ConfigError: Nothing to export is visible at the current frame, or a point cloud has lost its points.
+        ConfigError: Nothing to export is visible at the current frame, a point cloud has lost its points, or the path
+            is the source of a loaded scene.
         SceneFileError: The scene's own file is missing, or a file cannot be written.
     """
+    scene.refuse_sources(path)
     wanted, times = gaussians.chosen(context, which), timeline.of_collection(collection)
     clouds = {one.object for one in gaussians.shown(context.evaluated_depsgraph_get(), wanted)}
     clouds &= set(collection.all_objects)
@@ -79,7 +81,7 @@ def _by_worker(
 ) -> Iterator[Step]:
     """Write a scene in the worker, whose Python may have the format's package. Stopping it stops the worker."""
     with tempfile.TemporaryDirectory() as folder:
-        source = scene_file.write(edited.scene, Path(folder) / "scene.r5dgs", exact=True)
+        source = scene_file.write(edited.scene, Path(folder) / "scene.r5dgs", precision="exact")
         arguments = {"format": format.name, "times": list(options.times), "frames": options.frames}
         where = {"scene": str(source), "path": os.path.abspath(path)}
         job = jobs.start([(f"writing {path.name}", "export", arguments | where)])

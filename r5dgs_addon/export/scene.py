@@ -81,11 +81,11 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
         ConfigError: The path is the source of a loaded scene, or a point cloud has lost its points.
         SceneFileError: The scene's own file is missing, or the new one cannot be written.
     """
-    _refuse_sources(path)
+    refuse_sources(path)
     edited = yield from edited_steps(context, collection, further=1)
     result, what = edited.scene, plural.of(len(edited.scene.gaussians.means), "Gaussian")
     yield Step(edited.done, edited.done + 1, f"packing {what} into {path.name}", slow=True)
-    scene_file.write(result, path, exact=exact)
+    scene_file.write(result, path, precision="exact" if exact else "compact")
     named = sum(item.id > 0 for item in result.objects)
     return Outcome(f"{path.name}: {what}, {plural.of(named, 'object')}", edited.notes)
 
@@ -168,7 +168,8 @@ def _lost_points(members: list[_Member], source: Scene, extended: Scene) -> list
     return notes
 
 
-def _refuse_sources(path: Path) -> None:
+def refuse_sources(path: Path) -> None:
+    """Raise ConfigError if a path is the scene file of a loaded scene."""
     for collection in loaded_scenes.scene_collections():
         try:
             own = render_request.scene_path(collection)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 MODULES = {  # module of this room that defines `FORMAT`, by the name of the format
     "ply": "ply",
     "cameras": "camera_files",
+    "r5dgs": "quantised_scene",
     "glb": "glb",
     "html": "html",
     "usd": "usd",
@@ -73,6 +74,7 @@ class Format:
         has_objects: True if a file holds objects, so that `Options.object_ids` applies.
         has_motion: True if a file holds the motion up to `Options.until`; `Options.times` then do not apply.
         has_still: True if a file holds `Options.still`.
+        whole: True if a file holds the scene at all times, so that `Options.times` and `Options.until` do not apply.
         has_columns: True if files have columns of our own, so that `Options.plain` applies.
         losses: Returns sentences about what a file loses of the exported objects.
         extra: Extra of ``pip install r5dgs[extra]`` that it needs, or None.
@@ -94,6 +96,7 @@ class Format:
     has_objects: bool = True
     has_motion: bool = False
     has_still: bool = False
+    whole: bool = False
     has_columns: bool = False
     losses: Callable[[Scene, Options], list[str]] = lambda scene, options: []
     extra: str | None = None

@@ -4,8 +4,7 @@
 
     "features": [{"name": "origin", "required": true, "since": "0.2.0"}]
 
-A reader rejects a file with a required feature that it does not support, and skips an optional one. Names reserved for
-later releases: quantised.
+A reader rejects a file with a required feature that it does not support, and skips an optional one.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from .. import __version__, errors
-from . import hull_json, scene_json
+from . import hull_json, quantised_arrays, scene_json
 from .scene import Scene
 
 VERSIONS = (1, 2)  # format versions that this release reads
@@ -44,32 +43,40 @@ EVENTS = Feature("events", required=False, since="0.2.0")
 PARTS = Feature("parts", required=False, since="0.2.0")
 HULLS = Feature("hulls", required=False, since="0.2.0")
 TRAJECTORY = Feature("trajectory", required=False, since="0.2.0")
-_KNOWN_NAMES = {ORIGIN.name, MOTIONS.name, EVENTS.name, PARTS.name, HULLS.name, TRAJECTORY.name}
+QUANTISED = Feature("quantised", required=True, since="0.2.0")
+_KNOWN_NAMES = {one.name for one in (ORIGIN, MOTIONS, EVENTS, PARTS, HULLS, TRAJECTORY, QUANTISED)}
 
 
-def _used(scene: Scene) -> list[Feature]:
-    """Features that a scene needs."""
+def _used(scene: Scene, quantised: bool) -> list[Feature]:
+    """Features that a scene and its stored form need."""
     found = [ORIGIN] if scene.origin.any() else []
     found += [MOTIONS] if any(not (group.smooth or group.model).is_basic for group in scene.groups) else []
     found += [EVENTS] if any(group.history.events for group in scene.groups) else []
     found += [PARTS] if any(group.joint is not None for group in scene.groups) else []
     found += [HULLS] if scene.hulls else []
-    return found + ([TRAJECTORY] if any(group.smooth is not None for group in scene.groups) else [])
+    found += [TRAJECTORY] if any(group.smooth is not None for group in scene.groups) else []
+    return found + ([QUANTISED] if quantised else [])
 
 
-def version(scene: Scene) -> int:
-    """Lowest format version that can store a scene."""
-    return 2 if _used(scene) else 1
+def version(scene: Scene, quantised: bool = False) -> int:
+    """Lowest format version that can store a scene, or its quantised form."""
+    return 2 if _used(scene, quantised) else 1
 
 
-def to_json(scene: Scene) -> dict[str, Any]:
-    """Features of a scene and their entries in ``scene.json``; empty if version 1 suffices."""
-    used = _used(scene)
+def to_json(scene: Scene, steps: quantised_arrays.Steps | None = None) -> dict[str, Any]:
+    """Features of a scene and their entries in ``scene.json``; empty if version 1 suffices.
+
+    Args:
+        scene: The scene.
+        steps: Steps of its quantised form; None for the other precisions.
+    """
+    used = _used(scene, steps is not None)
     if not used:
         return {}
     origin = {"origin": scene.origin.tolist()} if ORIGIN in used else {}
     hulls = {"hulls": hull_json.to_json(scene)} if HULLS in used else {}
-    return {"features": [asdict(feature) for feature in used], **origin, **hulls}
+    quantised = {} if steps is None else {"quantised": steps.to_json()}
+    return {"features": [asdict(feature) for feature in used], **origin, **hulls, **quantised}
 
 
 def fields(top: scene_json.Row) -> dict[str, Any]:
@@ -77,6 +84,11 @@ def fields(top: scene_json.Row) -> dict[str, Any]:
     names = _names(top.data)
     origin = {"origin": top.numbers("origin", (3,))} if ORIGIN.name in names else {}
     return origin | ({"hulls": top.each("hulls", hull_json.read)} if HULLS.name in names else {})
+
+
+def is_quantised(data: dict[str, Any]) -> bool:
+    """True if a checked file stores its arrays in quantised form."""
+    return QUANTISED.name in _names(data)
 
 
 def skipped(data: dict[str, Any]) -> list[str]:

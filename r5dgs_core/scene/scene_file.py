@@ -1,8 +1,7 @@
 """Reading and writing `.r5dgs`: one zip of `.npy` arrays and a `scene.json` (docs/reference/scene_format.md).
 
 Members have the content and the names of the fields of `Scene`. Some are stored with fewer bits and restored to float32
-on reading: quats, log_scales and opacity_logits as int16 fixed point, sh, shading and residuals as float16 (rotations
-of residuals as int16).
+on reading (`array_encoding`, `quantised_arrays`).
 """
 
 from __future__ import annotations
@@ -12,12 +11,12 @@ import logging
 import zipfile
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal, get_args
 
 import numpy as np
 
 from .. import atomic_files, errors, findings, strict_json
-from . import array_shapes, format_features, scene_json, validation
+from . import array_encoding, array_shapes, format_features, quantised_arrays, scene_json, validation
 from .archive import Archive, Header, max_content_bytes
 from .array_types import DTYPES, EMBEDDINGS
 from .scene import Scene, grouped
@@ -26,29 +25,28 @@ from .stored_embeddings import StoredEmbeddings
 FORMAT = "r5dgs scene"
 JSON_MEMBER = "scene.json"
 
-# Fixed point: a stored int16 i represents i / scale.
-FIXED_POINT = {"quats": 32767.0, "residual_quats": 32767.0, "log_scales": 2048.0, "opacity_logits": 1024.0}
-_QUATS = ("quats", "residual_quats")
-_READ_BEFORE = 1e-7  # float32 rounding error of decoded components
-_QUATS_AT_ONCE = 1 << 15  # rows per block, sized for the CPU cache
-_HALF = ("sh", "shading", "residual_offsets", "residual_log_scales")
 _TRACKS = ("track_times", "track_poses")  # omitted if nothing moves
 _REQUIRED = ("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids", "background_sh")
 _STORED_DTYPES = {name: {np.dtype(dtype).newbyteorder("<").str} for name, dtype in DTYPES.items()}
-for _name in FIXED_POINT:
+for _name in array_encoding.FIXED_POINT:
     _STORED_DTYPES[_name].add("<i2")
-for _name in _HALF:
+for _name in array_encoding.HALF:
     _STORED_DTYPES[_name].add("<f2")
+_QUANTISED_DTYPES = {
+    name: {*own, *quantised_arrays.FURTHER_DTYPES.get(name, ())} for name, own in _STORED_DTYPES.items()
+}
+Precision = Literal["exact", "compact", "quantised"]
 _log = logging.getLogger(__name__)
 
 
-def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
+def write(scene: Scene, path: str | Path, *, precision: Precision = "compact") -> Path:
     """Write a scene atomically: the old file is kept until the new one is complete and on disk.
 
     Args:
         scene: The scene; validated first.
         path: Target file in an existing folder.
-        exact: Store all arrays in their in-memory precision instead of the compact one.
+        precision: "exact" stores all arrays as they are in memory, "compact" with errors that no picture shows, and
+            "quantised" at half the size of "compact", with the errors in docs/reference/scene_format.md.
 
     Returns:
         The path written.
@@ -59,7 +57,7 @@ def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
         raise errors.SceneFileError(f"{path}: expected an existing folder, found none; create {path.parent} first")
     try:
         with atomic_files.replacing(path) as stream:
-            _write_zip(scene, stream, exact)
+            _write_zip(scene, stream, precision)
     except OSError as error:
         raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
     return path
@@ -81,14 +79,17 @@ def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Scene:
     return scene
 
 
-def is_exact(path: str | Path) -> bool:
-    """Return True if a file stores any array more precisely than the compact form.
+def precision_of(path: str | Path) -> Precision:
+    """Return the precision with which to write a scene that was read from a file, to lose nothing.
 
-    After reading such a file, write with ``exact`` to avoid losses.
+    It is "exact" if the file stores any array more precisely than its compact form.
     """
     with Archive(Path(path)) as archive:
-        headers = _read_headers(archive, _read_json(archive), (*FIXED_POINT, *_HALF))
-    return any(header.dtype == "<f4" for header in headers.values())
+        top = _read_json(archive)
+        headers = _read_headers(archive, top, (*array_encoding.FIXED_POINT, *array_encoding.HALF))
+    if format_features.is_quantised(top.data):
+        return "quantised"
+    return "exact" if any(header.dtype == "<f4" for header in headers.values()) else "compact"
 
 
 def read_embeddings(path: str | Path) -> StoredEmbeddings | None:
@@ -101,7 +102,7 @@ def read_embeddings(path: str | Path) -> StoredEmbeddings | None:
         vocabulary = top.words("vocabulary")
         table = scene_json.table(top)
         array_shapes.check_embeddings(_shapes(headers), len(ids), len(vocabulary), table, place)
-        arrays = _read_arrays(archive, headers, EMBEDDINGS)
+        arrays = _read_arrays(archive, top, headers, EMBEDDINGS)
     validation.check_embeddings(arrays, table, place)
     objects, words = arrays["embeddings"], arrays["vocabulary_embeddings"]
     if objects is None or words is None:
@@ -129,35 +130,49 @@ def _warn_of_lost_detail(scene: Scene, path: str | Path) -> None:
         )
 
 
-def _write_zip(scene: Scene, stream: BinaryIO, exact: bool) -> None:
-    if not _write_members(scene, stream, exact, zipfile.ZIP_DEFLATED):  # synthetic scenes with many equal rows
+def _write_zip(scene: Scene, stream: BinaryIO, precision: Precision) -> None:
+    if not _write_members(scene, stream, precision, zipfile.ZIP_DEFLATED):  # synthetic scenes with many equal rows
         stream.seek(0)
         stream.truncate()
-        _write_members(scene, stream, exact, zipfile.ZIP_STORED)
+        _write_members(scene, stream, precision, zipfile.ZIP_STORED)
 
 
-def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int) -> bool:
+def _write_members(scene: Scene, stream: BinaryIO, precision: Precision, compression: int) -> bool:
     """Write the zip; returns False if it compresses so well that readers would reject it as a zip bomb."""
     with zipfile.ZipFile(stream, "w") as archive:
         still = _TRACKS if len(scene.tracks.times) == 1 else ()  # every pose is then the identity
-        arrays = {name: array for name, array in scene.arrays().items() if name in DTYPES and name not in still}
+        given = scene.arrays()
+        arrays = {
+            name: np.ascontiguousarray(given[name], DTYPES[name]) for name in DTYPES if name in given.keys() - {*still}
+        }
+        stored, steps = _stored(scene, arrays, precision)
         head = {
             "format": FORMAT,
-            "format_version": format_features.version(scene),
-            "arrays": [name for name in DTYPES if name in arrays],
-            **format_features.to_json(scene),
+            "format_version": format_features.version(scene, steps is not None),
+            "arrays": list(stored),
+            **format_features.to_json(scene, steps),
         }
         text = scene_json.dump(scene, head)
         _add(archive, JSON_MEMBER, text, compression)
-        for name in head["arrays"]:
-            array, dtype = arrays[name], DTYPES[name]
+        for name, array in stored.items():
             buffer = io.BytesIO()
-            stored = np.ascontiguousarray(array, dtype) if exact else _encode(name, np.ascontiguousarray(array, dtype))
-            np.lib.format.write_array(buffer, stored, version=(1, 0), allow_pickle=False)
+            np.lib.format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
             _add(archive, f"{name}.npy", buffer.getvalue(), compression)
         content = sum(info.file_size for info in archive.infolist())
         packed = archive.getinfo(JSON_MEMBER).compress_size
     return content <= max_content_bytes(stream.tell()) and strict_json.memory_of(text) <= max_content_bytes(packed)
+
+
+def _stored(
+    scene: Scene, arrays: dict[str, np.ndarray], precision: Precision
+) -> tuple[dict[str, np.ndarray], quantised_arrays.Steps | None]:
+    """Arrays as they are stored, and the steps of quantised ones. Raises ValueError for an unknown precision."""
+    if precision == "quantised":
+        return quantised_arrays.encode(arrays, [item.count for item in scene.objects])
+    if precision not in ("exact", "compact"):
+        raise ValueError(f"precision: expected one of {', '.join(get_args(Precision))}, got {precision!r}")
+    exact = precision == "exact"
+    return {name: array if exact else array_encoding.encode(name, array) for name, array in arrays.items()}, None
 
 
 def _add(archive: zipfile.ZipFile, name: str, data: bytes, compression: int) -> None:
@@ -166,49 +181,6 @@ def _add(archive: zipfile.ZipFile, name: str, data: bytes, compression: int) -> 
     entry.compress_type = compression
     entry.external_attr = 0o644 << 16
     archive.writestr(entry, data, compresslevel=6)
-
-
-def _encode(name: str, array: np.ndarray) -> np.ndarray:
-    """Compact form of an array, or the array itself if the compact form cannot represent it."""
-    if name in FIXED_POINT:
-        scaled = _whole_units(array) if name in _QUATS else np.rint(array.astype(np.float64) * FIXED_POINT[name])
-        fits = len(array) == 0 or np.abs(scaled).max() <= 32767
-        return scaled.astype("<i2") if fits else array
-    if name in _HALF and (array.size == 0 or np.abs(array).max() < 6e4):
-        return array.astype("<f2")
-    return array
-
-
-def _whole_units(quats: np.ndarray) -> np.ndarray:
-    """Quantised quaternions; for decoded ones, the stored integers that they were decoded from.
-
-    Decoding normalises, so the stored integers may be slightly longer or shorter than a unit quaternion. Rounding the
-    decoded values directly could then give neighbouring integers.
-    """
-    unit = FIXED_POINT["quats"]
-    result = np.empty(quats.shape)
-    for start in range(0, len(quats), _QUATS_AT_ONCE):
-        wide = np.ascontiguousarray(
-            quats[start : start + _QUATS_AT_ONCE].T, np.float64
-        )  # by column, because numpy is slow on rows of four
-        best = np.rint(wide * unit)
-        for radius in (unit - 0.75, unit + 0.75):
-            other = np.clip(np.rint(wide * radius), -unit, unit)
-            norms = np.sqrt((other * other).sum(0))
-            read = (np.abs(other - wide * norms) <= _READ_BEFORE * norms).all(0)
-            best = np.where(read, other, best)
-        result[start : start + _QUATS_AT_ONCE] = best.T
-    return result
-
-
-def _decode(name: str, array: np.ndarray) -> np.ndarray:
-    if array.dtype == np.int16:
-        values = array.astype(np.float64) / FIXED_POINT[name]
-        if name in _QUATS:
-            norms = np.linalg.norm(values, axis=-1, keepdims=True)
-            values = np.divide(values, norms, out=values, where=np.abs(norms - 1) < 1e-3)
-        return values.astype(np.float32)
-    return array.astype(DTYPES[name])
 
 
 def _read_zip(archive: Archive, guard: findings.Guard) -> Scene:
@@ -238,7 +210,7 @@ def _read_zip(archive: Archive, guard: findings.Guard) -> Scene:
             )
     objects, groups, vocabulary, table = (fields[name] for name in ("objects", "groups", "vocabulary", "lookup"))
     sound = array_shapes.check(shapes, objects, groups, vocabulary, table, place, guard)
-    arrays = _read_arrays(archive, headers.keys() & sound, DTYPES, guard)
+    arrays = _read_arrays(archive, top, headers.keys() & sound, DTYPES, guard)
     arrays |= dict.fromkeys(headers.keys() - sound, findings.UNREAD)
     if still:
         arrays["track_times"] = findings.attempt(guard, lambda: np.array([fields["t_max"]], np.float64))
@@ -289,6 +261,7 @@ def _read_headers(
     if listed is findings.UNREAD:
         listed = [name for name in names if f"{name}.npy" in archive]
     wanted = [name for name in names if name in listed or name in _REQUIRED]
+    dtypes = _dtypes(top)
     headers: dict[str, Header] = {}
     for name in wanted:
         with guard():
@@ -297,9 +270,7 @@ def _read_headers(
                 raise errors.SceneFileError(f"{archive.place}: {name}.npy: expected in a .r5dgs file, not found")
     for name in wanted:
         if name not in headers:
-            headers[name] = findings.attempt(
-                guard, lambda name=name: archive.header(f"{name}.npy", _STORED_DTYPES[name])
-            )
+            headers[name] = findings.attempt(guard, lambda name=name: archive.header(f"{name}.npy", dtypes[name]))
     return headers
 
 
@@ -307,13 +278,31 @@ def _shapes(headers: dict[str, Header]) -> dict[str, tuple[int, ...]]:
     return {name: findings.UNREAD if header is findings.UNREAD else header.shape for name, header in headers.items()}
 
 
+def _dtypes(top: scene_json.Row) -> dict[str, set[str]]:
+    """Dtypes that stored arrays may have, by name."""
+    quantised = top.data is findings.UNREAD or format_features.is_quantised(top.data)
+    return _QUANTISED_DTYPES if quantised else _STORED_DTYPES
+
+
 def _read_arrays(
-    archive: Archive, there: Collection[str], names: Iterable[str], guard: findings.Guard = findings.STRICT
+    archive: Archive,
+    top: scene_json.Row,
+    there: Collection[str],
+    names: Iterable[str],
+    guard: findings.Guard = findings.STRICT,
 ) -> dict[str, np.ndarray | None]:
     """Arrays in their in-memory dtypes, None for those that the file lacks."""
+    dtypes, place = _dtypes(top), archive.place
+    steps = findings.UNREAD
+    if top.data is not findings.UNREAD:
+        quantised = format_features.is_quantised(top.data)
+        steps = findings.attempt(guard, lambda: quantised_arrays.read(top) if quantised else None)
 
     def read_one(name: str) -> np.ndarray:
-        return _decode(name, archive.array(f"{name}.npy", _STORED_DTYPES[name]))
+        array = archive.array(f"{name}.npy", dtypes[name])
+        if steps is None or (steps is findings.UNREAD and array.dtype.str in _STORED_DTYPES[name]):
+            return array_encoding.decode(name, array)
+        return findings.UNREAD if steps is findings.UNREAD else quantised_arrays.decode(name, array, steps, place)
 
     return {
         name: findings.attempt(guard, lambda name=name: read_one(name)) if name in there else None for name in names

@@ -20,7 +20,7 @@ PLAY, TRAIN, RASTERIZE = pages.blocks(PAGE)
 
 def test_the_page_plays_a_scene(scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    scene_file.write(scene, tmp_path / "demo.r5dgs", exact=True)
+    scene_file.write(scene, tmp_path / "demo.r5dgs", precision="exact")
     names: dict = {}
     exec(PLAY, names)
     camera, image = scene.cameras[0], names["image"]
@@ -30,7 +30,7 @@ def test_the_page_plays_a_scene(scene, tmp_path, monkeypatch):
 def test_the_readme_predicts_a_scene(scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demo").mkdir()
-    scene_file.write(scene, tmp_path / "demo" / "demo.r5dgs", exact=True)
+    scene_file.write(scene, tmp_path / "demo" / "demo.r5dgs", precision="exact")
     (code,) = pages.blocks("README.md")
     names: dict = {}
     exec(code, names)

@@ -119,8 +119,9 @@ def scene_reader() -> Reader:
     with tempfile.TemporaryDirectory() as folder:
         plain = scenes.make_scene(n=COUNT, objects=2, shadows=False)
         far = {"origin": np.array([5e6, 0.0, 1.0])} if hasattr(plain, "origin") else {}
-        for number, (scene, exact) in enumerate([(rich_scene(), False), (rich_scene(1, **far), True), (plain, False)]):
-            path = scene_file.write(scene, Path(folder, f"{number}.r5dgs"), exact=exact)
+        scenes_of = {"compact": rich_scene(), "exact": rich_scene(1, **far), "quantised": rich_scene(2)}
+        for precision, scene in (*scenes_of.items(), ("compact", plain)):
+            path = scene_file.write(scene, Path(folder, "scene.r5dgs"), precision=precision)
             with zipfile.ZipFile(path) as file:
                 bases.append((path.read_bytes(), {name: file.read(name) for name in file.namelist()}))
 
@@ -132,7 +133,7 @@ def scene_reader() -> Reader:
 
     def read(folder: Path) -> None:
         path = folder / "scene.r5dgs"
-        for part in (scene_file.read_embeddings, scene_file.is_exact):
+        for part in (scene_file.read_embeddings, scene_file.precision_of):
             with contextlib.suppress(errors.R5dgsError):
                 part(path)
         use_scene(scene_file.read(path), folder / "again.r5dgs")

@@ -166,6 +166,9 @@ def _check_arguments(
     if chosen.has_motion and not (times is None and frames is None):
         option = "--frames" if times is None else "--time"
         raise errors.UsageError(f"{option}: files of format {chosen.name} hold the motion; give its end with --until")
+    if chosen.whole and not (times is None and frames is None and until is None):
+        option = "--until" if until is not None else "--frames" if times is None else "--time"
+        raise errors.UsageError(f"{option}: files of format {chosen.name} hold all times; leave it out")
     if until is not None and not chosen.has_motion:
         raise errors.UsageError(f"--until: files of format {chosen.name} hold no motion; leave it out")
     if frames is not None and frames[1] - frames[0] >= MOST_FRAMES:

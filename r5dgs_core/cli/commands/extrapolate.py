@@ -107,7 +107,7 @@ def run_extrapolate(
     wishes = scene_world.Wishes(**changes, until=until, samples=samples, seed=seed)
     found = scene_future.predict(scene, wishes)
     changed = dataclasses.replace(scene, groups=found.groups, needs=contact.needs(scene.needs, found))
-    scene_file.write(changed, out, exact=scene_file.is_exact(path))
+    scene_file.write(changed, out, precision=scene_file.precision_of(path))
     for line in (*found.lines, *(f"{name}: moves with contacts; {text}" for name, text in found.taken.items())):
         print(line)
     print(f"written: {out}" + ("" if found.taken else "; all motions are smooth"))

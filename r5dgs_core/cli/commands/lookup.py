@@ -91,7 +91,7 @@ def run_lookup(
                 {"event": f"look up {what}", "done": done, "total": total, "unit": what}
             ),
         )
-        target = scene_file.write(made.scene, out or path, exact=scene_file.is_exact(path))
+        target = scene_file.write(made.scene, out or path, precision=scene_file.precision_of(path))
         if progress_kind == "json":
             notes = {"notes": list(made.notes), "words": len(made.scene.vocabulary)}
             progress({"event": "written", "path": str(target), "encoder": opened.card.kind, **notes})

@@ -62,7 +62,7 @@ def run_name(
     change |= {} if name is None else {"name": name}
     change |= {} if caption is None else {"caption": caption}
     named = object_captions.apply(scene, {str(item.id): change}, str(path))
-    scene_file.write(named, path, exact=scene_file.is_exact(path))
+    scene_file.write(named, path, precision=scene_file.precision_of(path))
     fresh = named.object(item.id)
     print(f"{path}: object {fresh.id} is {fresh.name!r}" + (f", also {', '.join(fresh.aliases)}" * bool(fresh.aliases)))
     if named.lookup is not None and not named.lookup.encoder.sees:

@@ -86,6 +86,17 @@ def test_formats_with_motion_or_poses_are_written_and_losses_reported(blender, l
     assert ("Warning: Lost in this format: identity encodings" in said) == (name in ("glb", "usd"))
 
 
+def test_a_quantised_scene_is_written_and_loaded_but_never_over_a_loaded_scene(blender, loaded, tmp_path):
+    with pytest.raises(RuntimeError, match="plays from this file"):
+        blender.ops.r5dgs.export_format(format="r5dgs", filepath=str(tmp_path / "scene.r5dgs"))
+    path = tmp_path / "small.r5dgs"
+    assert blender.ops.r5dgs.export_format(format="r5dgs", filepath=str(path), frames="RANGE") == {"FINISHED"}
+    assert scene_file.precision_of(path) == "quantised"
+    assert blender.ops.r5dgs.load_scene(filepath=str(path)) == {"FINISHED"}
+    clouds = [one for one in blender.data.objects if one.type == "POINTCLOUD" and one not in loaded.all_objects[:]]
+    assert sum(len(one.data.points) for one in clouds) == len(scene_file.read(path).gaussians.means) == 300
+
+
 def test_without_the_format_there_is_no_button(blender, loaded, tmp_path, monkeypatch):
     monkeypatch.delitem(registry.MODULES, "csv", raising=False)
     said = drawn(blender)

@@ -745,7 +745,7 @@ def test_all_faults_of_a_scene_are_listed(tmp_path, monkeypatch):
         scene.with_arrays(means=means, quats=3 * scene.gaussians.quats), groups=tuple(groups), frames_per_unit=-1.0
     )
     monkeypatch.setattr(scene_file.validation, "check", lambda *_: None)
-    path = scene_file.write(broken, tmp_path / "s.r5dgs", exact=True)
+    path = scene_file.write(broken, tmp_path / "s.r5dgs", precision="exact")
     monkeypatch.undo()
     found = check.check(path)
     assert {finding.code for finding in found} == {"S01"}

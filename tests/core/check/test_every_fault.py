@@ -19,7 +19,7 @@ from tests.fuzz.readers import rich_scene
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory):
     """A scene file with every member."""
-    return scene_file.write(rich_scene(), tmp_path_factory.mktemp("sound") / "s.r5dgs", exact=True)
+    return scene_file.write(rich_scene(), tmp_path_factory.mktemp("sound") / "s.r5dgs", precision="exact")
 
 
 def array(path, name):

@@ -18,7 +18,7 @@ from tests.support.command_line import complaint
 
 @pytest.fixture
 def path(scene, tmp_path):
-    return scene_file.write(scene, tmp_path / "scene.r5dgs", exact=True)
+    return scene_file.write(scene, tmp_path / "scene.r5dgs", precision="exact")
 
 
 def export(path, *arguments):
@@ -51,6 +51,19 @@ def test_each_frame_of_a_range_is_a_file(path, scene, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["paths"] == paths
     means = scene_player.Player(scene).frame(9 / scene.frames_per_unit).means
     np.testing.assert_array_equal(ply.read(paths[1]).means, means)
+
+
+def test_a_quantised_scene_stays_one_when_its_objects_are_named(path, tmp_path, capsys):
+    out = tmp_path / "small.r5dgs"
+    assert export(path, "--to", "r5dgs", "--out", out) == 0
+    assert "not kept: the precision of the scene file" in capsys.readouterr().out
+    assert out.stat().st_size < path.stat().st_size
+    before = scene_file.read(out)
+    assert main.main(["name", str(out), "2", "big apple"]) == 0
+    after = scene_file.read(out)
+    assert scene_file.precision_of(out) == "quantised" and after.object(2).name == "big apple"
+    for name, array in before.arrays().items():
+        np.testing.assert_array_equal(after.arrays()[name], array)
 
 
 @pytest.mark.parametrize("words", ["", " , ", "not", "everything but"])
@@ -110,6 +123,8 @@ def test_files_are_replaced_only_on_demand(path, tmp_path, capsys):
         (("--to", "ply", "--out", "a.json"), ".ply"),
         (("--to", "cameras", "--out", "a.json", "--objects", "mug"), "--objects"),
         (("--to", "cameras", "--out", "a.json", "--plain"), "--plain"),
+        (("--to", "r5dgs", "--out", "a.r5dgs", "--time", "1"), "--time: files of format r5dgs hold all times"),
+        (("--to", "r5dgs", "--out", "a.r5dgs", "--until", "9"), "--until: files of format r5dgs hold all times"),
         (("--to", "ply", "--out", "a.ply", "--frames", "5:1"), "'5:1'"),
         (("--to", "ply", "--out", "a.ply", "--frames", "all"), "'all'"),
         (("--to", "ply", "--out", "a.ply", "--time", "nan"), "--time"),

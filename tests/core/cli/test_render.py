@@ -21,7 +21,7 @@ from tests.support.command_line import complaint
 
 @pytest.fixture
 def path(scene, tmp_path):
-    return scene_file.write(scene, tmp_path / "scene.r5dgs", exact=True)
+    return scene_file.write(scene, tmp_path / "scene.r5dgs", precision="exact")
 
 
 def film(path, *arguments):
@@ -110,7 +110,7 @@ def test_the_captured_image_is_shown_on_the_left(tiny, path, scene, tmp_path, ca
     dataset = datasets.read(tiny.root)
     view = dataset.train[3]
     seen = dataclasses.replace(scene, cameras=(view.camera,))
-    path = scene_file.write(seen, tmp_path / "seen.r5dgs", exact=True)
+    path = scene_file.write(seen, tmp_path / "seen.r5dgs", precision="exact")
     out = tmp_path / "a.png"
     assert film(path, "--out", out, "--beside", tiny.root, "--time", view.t, "--camera", view.camera.name) == 0
     found = images.read(out)

@@ -57,7 +57,7 @@ def test_tracks_move_the_gaussians_as_playback_does(scene, tmp_path):
 
 def test_import_gives_the_scene_back(tmp_path, capsys):
     scene = arms.make_arm("hinge", n=400, objects=4, sh_degree=2)
-    source = scene_file.write(scene, tmp_path / "a.r5dgs", exact=True)
+    source = scene_file.write(scene, tmp_path / "a.r5dgs", precision="exact")
     assert main.main(["export", str(source), "--to", "4dgs", "--out", str(tmp_path / "a.4dgs")]) == 0
     assert "lost here: colours other than those of t_max" in capsys.readouterr().out
     assert main.main(["import", str(tmp_path / "a.4dgs"), "--out", str(tmp_path / "b.r5dgs")]) == 0

@@ -98,7 +98,7 @@ def test_each_frame_is_a_file_and_clipped_colours_are_told(tmp_path, capsys):
     scene = scenes.make_scene(n=100, objects=1)
     sh = scene.gaussians.sh.copy()
     sh[:5, 0] = 9
-    source = scene_file.write(scene.with_arrays(sh=sh), tmp_path / "a.r5dgs", exact=True)
+    source = scene_file.write(scene.with_arrays(sh=sh), tmp_path / "a.r5dgs", precision="exact")
     arguments = ["export", str(source), "--to", "spz", "--out", str(tmp_path / "a.spz"), "--frames", "3:4"]
     assert main.main(arguments) == 0
     assert "5 Gaussians have colours beyond the range of SPZ" in capsys.readouterr().out

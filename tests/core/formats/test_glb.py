@@ -240,7 +240,7 @@ def test_captured_cameras_are_cameras(scene, tmp_path):
 
 def test_import_gives_the_scene_back(tmp_path, capsys):
     scene = arms.make_arm("hinge", n=400, objects=4, sh_degree=2)
-    source = scene_file.write(scene, tmp_path / "a.r5dgs", exact=True)
+    source = scene_file.write(scene, tmp_path / "a.r5dgs", precision="exact")
     assert main.main(["export", str(source), "--to", "glb", "--out", str(tmp_path / "a.glb")]) == 0
     said = capsys.readouterr().out
     assert "not kept: bending" in said and "lost here: identity encodings" in said
@@ -273,7 +273,7 @@ def test_an_origin_far_away_is_kept(tmp_path):
 
 
 def test_selected_objects_alone_are_written_and_read(scene, tmp_path, capsys):
-    source = scene_file.write(scene, tmp_path / "a.r5dgs", exact=True)
+    source = scene_file.write(scene, tmp_path / "a.r5dgs", precision="exact")
     arguments = ["export", str(source), "--to", "glb", "--out", str(tmp_path / "a.glb"), "--objects", "cup and toy car"]
     assert main.main(arguments) == 0
     again = glb_reader.read(tmp_path / "a.glb")

@@ -31,7 +31,7 @@ def with_band(scene):
 
 
 def write(scene, tmp_path, to, out, *arguments):
-    source = scene_file.write(scene, tmp_path / "a.r5dgs", exact=True)
+    source = scene_file.write(scene, tmp_path / "a.r5dgs", precision="exact")
     return main.main(["export", str(source), "--to", to, "--out", str(tmp_path / out), *arguments])
 
 

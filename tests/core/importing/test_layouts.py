@@ -53,7 +53,7 @@ def imported(folder, tmp_path, **options):
     """Import, write and read back without loss."""
     options.setdefault("still", 0.0)
     scene = importer.import_run(folder, importer.Options(**options))
-    return scene_file.read(scene_file.write(scene, tmp_path / "scene.r5dgs", exact=True))
+    return scene_file.read(scene_file.write(scene, tmp_path / "scene.r5dgs", precision="exact"))
 
 
 def test_a_run_of_gaussian_splatting_is_static(tmp_path):

@@ -292,7 +292,7 @@ def by_name(where):
 def content(tmp_path_factory):
     """A scene file with a table by the encoder "plain"."""
     path = tmp_path_factory.mktemp("words") / "named.r5dgs"
-    before = scene_file.read(scene_file.write(named("lemon", "apple", "donut", "hammer"), path, exact=True))
+    before = scene_file.read(scene_file.write(named("lemon", "apple", "donut", "hammer"), path, precision="exact"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(registry, "open_encoder", by_name)
         lookup.run_lookup(path, "plain")

@@ -278,7 +278,7 @@ def test_a_mode_without_data_is_refused():
 
 def test_residuals_and_dynamics_survive_the_file(bending, tmp_path):
     scene = twisting(bending)
-    exact = scene_file.read(scene_file.write(scene, tmp_path / "exact.r5dgs", exact=True))
+    exact = scene_file.read(scene_file.write(scene, tmp_path / "exact.r5dgs", precision="exact"))
     small = scene_file.read(scene_file.write(scene, tmp_path / "small.r5dgs"))
     for name in ("residual_rows", "residual_offsets", "residual_log_scales", "dynamics", "canonical_means"):
         np.testing.assert_array_equal(exact.arrays()[name], scene.arrays()[name])

@@ -15,7 +15,7 @@ from tests.support.scenes import make_scene
 
 pytestmark = pytest.mark.heavy
 
-READERS = (scene_file.read, scene_file.read_embeddings, scene_file.is_exact)
+READERS = (scene_file.read, scene_file.read_embeddings, scene_file.precision_of)
 SPENT = 24 << 20  # bytes that a refusal may take
 
 

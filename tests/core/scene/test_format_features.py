@@ -106,12 +106,12 @@ def test_an_origin_makes_version_2_and_comes_back_bit_for_bit(path, tmp_path):
 def test_a_missing_required_feature_is_named_with_its_release(path, tmp_path):
     listed = [
         {"name": "origin", "required": True, "since": "0.2.0"},
-        {"name": "quantised", "required": True, "since": "0.9.1"},
+        {"name": "ragdolls", "required": True, "since": "0.9.1"},
         {"name": "colliders", "required": True, "since": "0.10.0"},
     ]
     newer = with_features(path, tmp_path / "newer.r5dgs", listed, origin=[0, 0, 1e7])
-    for reader in (scene_file.read, scene_file.read_embeddings, scene_file.is_exact):
-        with pytest.raises(errors.SceneFileError, match=r"'quantised' .*0\.9\.1.*update R5DGS to 0\.10\.0") as caught:
+    for reader in (scene_file.read, scene_file.read_embeddings, scene_file.precision_of):
+        with pytest.raises(errors.SceneFileError, match=r"'ragdolls' .*0\.9\.1.*update R5DGS to 0\.10\.0") as caught:
             reader(newer)
         assert "'origin'" not in str(caught.value) and str(newer) in str(caught.value)
 

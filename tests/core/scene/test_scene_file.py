@@ -9,7 +9,7 @@ import pytest
 from r5dgs_core import atomic_files, errors
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_info, scene_player
-from r5dgs_core.scene import scene_file
+from r5dgs_core.scene import array_encoding, scene_file
 from r5dgs_core.scene.scene import GROUPS
 from r5dgs_core.scene.units import Units
 from tests.support.scenes import make_scene
@@ -72,7 +72,7 @@ def test_reading_restores_the_written_scene(scene, path):
 
 
 def test_exact_files_restore_every_bit(scene, tmp_path):
-    assert_equal_scenes(scene, scene_file.read(scene_file.write(scene, tmp_path / "a.r5dgs", exact=True)), {})
+    assert_equal_scenes(scene, scene_file.read(scene_file.write(scene, tmp_path / "a.r5dgs", precision="exact")), {})
 
 
 def test_optional_members_may_be_absent_or_present(tmp_path):
@@ -160,7 +160,7 @@ def test_equal_scenes_are_equal_files(scene, path, tmp_path):
 
 
 def test_a_scene_that_was_read_is_written_byte_for_byte(tmp_path, monkeypatch):
-    monkeypatch.setattr(scene_file, "_QUATS_AT_ONCE", 700)
+    monkeypatch.setattr(array_encoding, "_QUATS_AT_ONCE", 700)
     path = scene_file.write(make_scene(n=3000, sh_degree=1), tmp_path / "a.r5dgs")
     again = scene_file.write(scene_file.read(path), tmp_path / "b.r5dgs")
     assert again.read_bytes() == path.read_bytes()
@@ -441,7 +441,7 @@ def test_unplayable_scenes_are_rejected_on_reading(path, tmp_path, change, messa
     [("means", 3e38), ("log_scales", 80.0), ("sh", 1e30), ("track_poses", 1e200), ("track_times", -1e300)],
 )
 def test_numbers_beyond_the_range_of_pictures_are_refused(scene, tmp_path, member, value):
-    exact = scene_file.write(scene, tmp_path / "exact.r5dgs", exact=True)
+    exact = scene_file.write(scene, tmp_path / "exact.r5dgs", precision="exact")
     array = scene.arrays()[member].copy()
     array.reshape(len(array), -1)[0, -1] = value
     broken = rewrite(exact, tmp_path / "broken.r5dgs", replace={f"{member}.npy": npy(array)})

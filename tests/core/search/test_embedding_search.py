@@ -238,5 +238,9 @@ def test_rows_of_a_table_are_chosen_like_those_of_objects(rich):
 
 
 def test_the_precision_of_a_file_is_read_from_it(rich, tmp_path):
-    assert not scene_file.is_exact(scene_file.write(rich, tmp_path / "compact.r5dgs"))
-    assert scene_file.is_exact(scene_file.write(rich, tmp_path / "exact.r5dgs", exact=True))
+    for precision in ("exact", "compact", "quantised"):
+        path = scene_file.write(rich, tmp_path / f"{precision}.r5dgs", precision=precision)
+        assert scene_file.precision_of(path) == precision
+    assert scene_file.precision_of(scene_file.write(rich, path)) == "compact"
+    with pytest.raises(ValueError, match="expected one of exact, compact, quantised, got 'lossy'"):
+        scene_file.write(rich, path, precision="lossy")

@@ -10,7 +10,7 @@ from tests.support import scenes
 
 @pytest.fixture
 def path(tmp_path):
-    return scene_file.write(scenes.make_scene(n=60, objects=2), tmp_path / "scene.r5dgs", exact=True)
+    return scene_file.write(scenes.make_scene(n=60, objects=2), tmp_path / "scene.r5dgs", precision="exact")
 
 
 def request(source, target, **changes):
