@@ -55,7 +55,7 @@ def after_step(trainer: Trainer) -> None:
     examinations, iteration = steps(trainer.config), trainer.iteration
     if iteration in examinations:
         decide(trainer, _possible(trainer))
-    elif trainer.refinement.active and examinations[0] < iteration < examinations[-1]:
+    elif examinations and trainer.refinement.active and examinations[0] < iteration < examinations[-1]:
         begin, full = trainer.config.curriculum.steps(trainer.config.train.iterations)
         if (iteration - begin) % max(1, (full - begin) // FOLLOW_UPS) == 0:
             decide(trainer, [part for part in _possible(trainer) if part in trainer.refinement.parts])

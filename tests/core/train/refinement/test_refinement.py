@@ -1,6 +1,7 @@
 """Corrections of cameras: their gradients, their gauge, and a run that recovers wrong cameras and resumes exactly."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -207,6 +208,11 @@ def test_cameras_are_never_examined_if_everything_is_switched_off():
     assert trial.steps(config) == ()
     assert trial.steps(tiny_datasets.settings("train.iterations=99")) == ()
     assert all(0 < step < 160 for step in trial.steps(tiny_datasets.settings(*tiny_datasets.EXAMINED, *STEPS)))
+
+
+def test_a_run_without_examinations_keeps_the_colours_that_it_began_with():
+    config = tiny_datasets.settings("train.iterations=99")
+    trial.after_step(SimpleNamespace(config=config, iteration=10, refinement=SimpleNamespace(active=True)))
 
 
 def test_a_part_set_on_is_refined_without_need(tiny):
