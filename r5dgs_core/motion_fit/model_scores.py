@@ -22,6 +22,7 @@ NEAR = 6.0  # maximum difference of scores within which the simplest law is chos
 _MIN_LEVEL = 0.05
 _MAX_LAG = 0.8
 _RHOS = np.linspace(0.0, 0.9, 19)  # tried correlations of neighbouring poses
+_OUTLYING = 0.5  # robust weight of a pose, relative to the median, below which it is an outlier
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,8 @@ def covariance_factor(solution: FittedCandidate, track: PoseTrack, noise: Noise,
     """Factor of the parameters' covariance for noise of an unknown correlation, at least that of the evidence.
 
     It is the mean of s2 (1 + rho) / (1 - rho), weighted by the restricted likelihood of rho, the correlation of
-    neighbouring poses. Unlike rho in `_inflation`, this one also includes slow noise that the fit follows.
+    neighbouring poses. Unlike rho in `_inflation`, this one also includes slow noise that the fit follows. Outliers are
+    left out: beside them, the small weight of one pose would look like correlated noise.
 
     Args:
         solution: The chosen solution, fitted to the track.
@@ -82,11 +84,14 @@ def covariance_factor(solution: FittedCandidate, track: PoseTrack, noise: Noise,
         noise_level: Noise level of the track.
     """
     misses, slopes = families.linearized(solution.candidate, solution.theta, track, noise)
-    weights = np.sqrt(solution.robust * solution.weights)[:, None]
+    kept = solution.robust >= _OUTLYING * np.median(solution.robust)
+    kept = kept if 6 * kept.sum() > len(slopes) else np.ones(len(track), bool)
+    misses, slopes, tau = misses[kept], slopes[:, kept], track.tau[kept]
+    weights = np.sqrt(solution.robust * solution.weights)[kept, None]
     free = misses.size - len(slopes)
     if free <= 0:
         return noise_level.variance
-    steps = np.diff(track.tau) / np.median(np.diff(track.tau))
+    steps = np.diff(tau) / np.median(np.diff(tau))
     phi = _RHOS[:, None, None] ** steps[:, None]  # [R, S - 1, 1]
     rest = np.sqrt(1 - phi**2)
     values = weights * np.concatenate([misses[None], slopes])  # [1 + P, S, 6]

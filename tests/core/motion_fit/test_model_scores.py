@@ -47,6 +47,21 @@ def test_the_variance_covers_uneven_times_and_is_never_below_that_of_the_evidenc
     assert model_scores.covariance_factor(solution, track, noise, large) == large.variance
 
 
+@pytest.mark.parametrize("outlier", [3, 7, 13])
+def test_one_outlier_changes_the_covariance_factor_as_little_as_a_missing_pose(outlier):
+    times = np.linspace(0, 1, 15)
+    quats, d, _, _ = problems.observe(TRUTH, times, np.random.default_rng(5), SIGMA, SIGMA)
+    noise, least = candidates.Noise(SIGMA, SIGMA), model_scores.NoiseLevel(15, 1e-6, 1.0)
+    factors = []
+    for shift, kept in ((15 * SIGMA, times >= 0), (0.0, np.arange(15) != outlier)):
+        moved = d + shift * (np.arange(15) == outlier)[:, None]
+        track = PoseTrack(times[kept] - 1, quats[kept], moved[kept], np.ones(kept.sum()))
+        law = dataclasses.replace(candidates.BY_NAME["translation + spin"], window=track.window)
+        solution = candidates.solve(law, track, noise)
+        factors.append(model_scores.covariance_factor(solution, track, noise, least))
+    assert factors[0] == pytest.approx(factors[1], rel=0.1)
+
+
 def test_two_poses_have_the_variance_of_the_evidence():
     times = np.array([0.0, 1.0])
     quats, d, _, _ = problems.observe(TRUTH, times, np.random.default_rng(0), SIGMA, SIGMA)
