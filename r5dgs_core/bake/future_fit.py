@@ -16,6 +16,8 @@ from ..scene.splats import to_opacities
 from ..scene.world_axes import UP_AXIS
 from . import pose_errors
 
+SCATTER = 0.5  # share of the usual errors of the poses below which laws do not differ, chosen on simulated tracks
+
 
 def share_gravity(
     fits: dict[int, tuple[shared_gravity.BodyTrack, model_selection.Fit]], convention: str
@@ -44,7 +46,8 @@ def fit(
 ) -> tuple[shared_gravity.BodyTrack, model_selection.Fit]:
     """Fit a body's motion past t_max and return its track and the fit.
 
-    ``noise`` holds lower bounds of the noise of displacements and of rotations.
+    ``noise`` holds lower bounds of the noise of displacements and of rotations. Errors of the poses raise them, because
+    a law must not follow errors that change slowly.
     """
     members = scene.gaussians.motion_ids == group
     opacities = to_opacities(scene.gaussians.opacity_logits[members])
@@ -53,6 +56,7 @@ def fit(
     weights, drift = observed.astype(np.float64), (0.0, 0.0)
     if errors is not None:
         weights, drift = pose_errors.weights(errors, observed, radius, turns), pose_errors.drift(errors, observed)
+        noise = max(noise[0], SCATTER * drift[0]), max(noise[1], SCATTER * drift[1])
     track = shared_gravity.BodyTrack(scene.tracks.times, poses[:, :4], poses[:, 4:], weights)
     found = model_selection.fit(
         track.times,
