@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from ...data import masks
+from ...data import masks, temporal_median
 from ...scene import cameras
 from ...scene.sampling import spread
 from ..train_views import IMAGE, MASK, TrainView, by_camera, in_turn
 
 MAX_CAMERAS = 24
 MAX_FRAMES = 31  # frames per camera for the median
-MEDIAN_VALUES = 1 << 23  # colours per sorted band
 
 
 @dataclass(frozen=True)
@@ -33,36 +32,8 @@ def compute(views: Sequence[TrainView]) -> list[BackgroundImage]:
     for group in by_camera(views, MAX_CAMERAS):
         frames = spread(group, MAX_FRAMES)
         free = _free(frames)
-        image = _median([v.image for v in in_turn(frames, IMAGE)], free)
+        image = temporal_median.median([v.image for v in in_turn(frames, IMAGE)], free)
         result.append(BackgroundImage(group[0].camera, image, np.asarray(free.any(0))))
-    return result
-
-
-def _median(images: Sequence[np.ndarray], free: np.ndarray) -> np.ndarray:
-    """Return the median of the free pixels, 0 if a pixel is never free; computed in bands to save memory.
-
-    Args:
-        images: F images. [H, W, 3] uint8
-        free: Mask of the pixels that count. [F, H, W] bool
-
-    Returns:
-        Colours in [0, 1]. [H, W, 3] float32
-    """
-    count, height, width = free.shape
-    result = np.zeros((height, width, 3), np.float32)
-    rows = max(1, MEDIAN_VALUES // (3 * count * width))
-    for top in range(0, height, rows):
-        band = slice(top, top + rows)
-        values = np.stack([image[band] for image in images]).astype(np.int16)
-        values[~free[:, band]] = 256  # sorts after all colours
-        values.sort(axis=0)
-        free_count = free[:, band].sum(0)
-        low, high = (
-            np.take_along_axis(values, np.broadcast_to(k[None, ..., None], (1, *values.shape[1:])), 0)[0]
-            for k in (np.maximum(free_count - 1, 0) // 2, np.minimum(free_count // 2, count - 1))
-        )
-        middle = (low + high).astype(np.float32) / np.float32(510)
-        result[band] = np.where((free_count > 0)[..., None], middle, np.float32(0))
     return result
 
 

@@ -174,20 +174,6 @@ def test_too_few_points_support_nothing():
     assert not support(np.zeros((2, 3))).any()
 
 
-@pytest.mark.parametrize("count", [1, 2, 5, 8])
-def test_a_background_image_is_the_median_of_the_free_pixels_for_any_number_of_bands(monkeypatch, count):
-    rng = np.random.default_rng(count)
-    images = rng.integers(0, 256, (count, 11, 7, 3)).astype(np.uint8)
-    free = rng.random((count, 11, 7)) < 0.6
-    found = background_images._median(list(images), free)
-    for y, x in np.ndindex(11, 7):
-        seen = images[free[:, y, x], y, x]
-        expected = np.median(seen, axis=0) / 255 if len(seen) else np.zeros(3)
-        np.testing.assert_allclose(found[y, x], expected, atol=1e-7)
-    monkeypatch.setattr(background_images, "MEDIAN_VALUES", 1)
-    assert (background_images._median(list(images), free) == found).all()
-
-
 def test_depths_do_not_depend_on_the_number_of_bands(floor, monkeypatch):
     whole = plane_sweep.Sweep(background_images.compute(floor), 150, 48)
     monkeypatch.setattr(plane_sweep, "COST_VALUES", 1)
