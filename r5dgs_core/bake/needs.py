@@ -7,13 +7,17 @@ training (`training_needs.resolve`) and in baking (`decide`, `simplify_motion`).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from torch import Tensor
 
+from ..config.config import Config
 from ..config.sections.needs import NeedsSection
+from ..data import unexplained
 from ..motion import rotations
 from ..scene.scene import Classifier, MotionGroup
+from ..train import checkpoint_content
 from ..train.observed_motion import RegroupCounts
 from . import camera_needs
 from .draft import Context, Draft, Need
@@ -53,7 +57,8 @@ def apply(draft: Draft, context: Context) -> Draft:
     )
     on = {need.name: need.on for need in table}
     cameras = camera_needs.rows(context.cameras(scene.gaussians.means), context.config)
-    scene = dataclasses.replace(scene, needs=(*(need.row() for need in (*table, *cameras)), *draft.parts))
+    rows = (*table, *cameras, left_out(context.tensors, context.config))
+    scene = dataclasses.replace(scene, needs=(*(need.row() for need in rows), *draft.parts))
     if not on["shading"]:
         scene = dataclasses.replace(scene, shading=None)
     if cloud.identities is not None and on["classifier"]:
@@ -119,6 +124,21 @@ def decide(
         Need("regrouping", moved_over, 1, moved_over > 0, _summary(moves), moved_over > 0),
     )
     return tuple(need.overridden(getattr(wanted, need.name)) for need in rows)
+
+
+def left_out(tensors: Mapping[str, Tensor], config: Config) -> Need:
+    """Return the row for regions that move although no mask names them, which training has decided.
+
+    Args:
+        tensors: Tensors of a checkpoint.
+        config: The run's configuration.
+    """
+    found = tensors.get(checkpoint_content.UNEXPLAINED)
+    share, on = (0.0, False) if found is None else (float(found[0]), bool(found[1]))
+    reason = "not examined" if found is None else "share of the pixels that move although no mask names them"
+    wanted = config.needs.unexplained_regions
+    reason = reason if wanted == "auto" else f"set {wanted} by the user; {reason}"
+    return Need(unexplained.NEED, share, config.init.unexplained, on, reason, on)
 
 
 def _summary(moves: RegroupCounts | None) -> str:

@@ -25,7 +25,7 @@ _KEYS_BY_UNIT = {
     "share": """
         losses.ssim field.trd_share curriculum.newest densify.share densify_mcmc.grow
     """,
-    "share of the image": "init.min_mask_pixels",
+    "share of the image": "init.min_mask_pixels init.unexplained",
     "share of the images": "data.min_registered",
     "GB": "data.memory",
     "share of the image width": "densify.prune_width",

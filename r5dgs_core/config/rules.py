@@ -124,6 +124,7 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "init.sweep_depths": (lambda value: value >= 2, "at least 2"),
     "init.opacity": _INSIDE,
     "init.min_mask_pixels": (lambda value: value < 1, "less than 1"),
+    "init.unexplained": _SHARE,
     "rates.decay": (lambda value: 0 < value <= 1, "more than 0, at most 1"),
     "rates.decay_floor_appearance": _SHARE,
     "rates.decay_from": _SHARE,

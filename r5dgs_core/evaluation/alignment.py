@@ -7,11 +7,12 @@ its own images while the scene is fixed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from ..data import dataset as datasets
+from ..data.unexplained import UsualColors
 from ..playback import scene_player
 from ..render import camera_fit, scene_renderer
 from ..scene import camera_correction, cameras
@@ -19,6 +20,7 @@ from ..scene.camera_correction import Correction
 from ..scene.cameras import Camera
 from ..scene.sampling import spacing, spread
 from ..scene.scene import Scene
+from . import explained
 
 IMAGES = 6  # maximum number of images of a camera for the fit
 TIME = 0.1  # change of time in the fit, as a share of the spacing of the observed times
@@ -29,6 +31,7 @@ def corrections(
     views: Sequence[datasets.View],
     background: np.ndarray | None,
     backend: str = "auto",
+    usual: Mapping[str, UsualColors] | None = None,
 ) -> dict[str, Correction]:
     """Return a correction for each camera of some views by its name.
 
@@ -40,6 +43,7 @@ def corrections(
         views: Held-out views.
         background: Colour behind transparent pixels. [3]
         backend: Rasterizer.
+        usual: Usual colours of cameras, whose unexplained regions are left out.
     """
     stored = scene.provenance.get("cameras", {}).get("corrections", {})
     found = {name: camera_correction.from_dict(values) for name, values in stored.items()}
@@ -53,15 +57,27 @@ def corrections(
         if name not in found:
             mine = [view for view in views if view.camera.name == name]
             early = [view for view in mine if view.t <= scene.t_max] or mine
-            found[name] = _fitted(scene, spread(early, IMAGES), background, draw)
+            found[name] = _fitted(scene, spread(early, IMAGES), background, draw, usual or {})
     return found
 
 
 def _fitted(
-    scene: Scene, views: Sequence[datasets.View], background: np.ndarray | None, draw: camera_fit.Draw
+    scene: Scene,
+    views: Sequence[datasets.View],
+    background: np.ndarray | None,
+    draw: camera_fit.Draw,
+    usual: Mapping[str, UsualColors],
 ) -> Correction:
     """Return the correction that explains the images of a camera best."""
-    shots = [camera_fit.Shot(view.camera, view.t, datasets.load_image(view, background)) for view in views]
+    shots = [
+        camera_fit.Shot(
+            view.camera,
+            view.t,
+            datasets.load_image(view, background),
+            explained.explained(usual, view, background),
+        )
+        for view in views
+    ]
     times = scene.tracks.times
     units = camera_fit.Units(_depth(scene, views[0].camera), TIME * spacing(times))
     which = camera_fit.columns(pose=True, focal=True, time=len(times) > 1, color=True)

@@ -19,6 +19,7 @@ import numpy as np
 from .. import atomic_files, timing
 from ..data import dataset as datasets
 from ..data import images
+from ..data.unexplained import UsualColors
 from ..errors import ConfigError
 from ..playback import scene_player
 from ..render import scene_renderer
@@ -26,11 +27,12 @@ from ..scene import predictability
 from ..scene.camera_correction import Correction
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
-from . import alignment, ground_truth_poses, lpips, metrics, miou
+from . import alignment, explained, ground_truth_poses, lpips, metrics, miou
 
 METRICS = (
     "psnr",
     "psnr_aligned",
+    "psnr_explained",
     "psnr_pooled",
     "psnr_objects",
     "ssim",
@@ -99,10 +101,10 @@ def evaluate(
     count = counter(progress, sum(len(dataset.views(split)) for split in splits) * len(modes))
     result: dict[str, Any] = {"scene": scene.name, "splits": {}, "objects": object_errors(scene, dataset.ground_truth)}
     result["horizon"] = predictability.horizon(scene)
-    corrections = None
+    corrections, usual = None, explained.usual_colors(scene, dataset, background)
     if align or (align is None and scene.provenance.get("cameras", {}).get("refined")):
         held_out = [view for split in splits for view in dataset.views(split)]
-        corrections = alignment.corrections(scene, held_out, background, backend)
+        corrections = alignment.corrections(scene, held_out, background, backend, usual)
     for split in splits:
         result["splits"][split] = {}
         views = dataset.views(split)
@@ -114,6 +116,7 @@ def evaluate(
                 background=background,
                 backend=backend,
                 corrections=corrections,
+                usual=usual,
                 perceptual=perceptual,
                 measured=count,
             )
@@ -147,6 +150,7 @@ def measure_views(
     background: np.ndarray | None = None,
     backend: str = "auto",
     corrections: Mapping[str, Correction] | None = None,
+    usual: Mapping[str, UsualColors] | None = None,
     perceptual: lpips.Lpips | None = None,
     measured: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
@@ -159,6 +163,7 @@ def measure_views(
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
         backend: Rasterizer.
         corrections: Correction of each camera by its name, for ``psnr_aligned``; None leaves that out.
+        usual: Usual colours of each training camera by its name, for ``psnr_explained``.
         perceptual: Network for ``lpips``, or None.
         measured: Called after each image.
 
@@ -167,17 +172,19 @@ def measure_views(
     """
     background = truth_background(scene) if background is None else background
     tally = _Tally([item.id for item in scene.objects if item.id > 0], perceptual)
-    for view in (views[0], views[-1]) if views else ():
-        render_timed(
-            scene, view.camera, view.t, move, backend=backend
-        )  # compiles kernels and fills caches before timing
+    for view in (views[0], views[-1]) if views else ():  # compiles kernels and fills caches before timing
+        render_timed(scene, view.camera, view.t, move, backend=backend)
     for view in views:
         rendering = render_timed(scene, view.camera, view.t, move, backend=backend)
-        later = is_later(scene, view.t)
         truth = datasets.load_image(view, background)
-        tally.add(rendering, truth, datasets.load_mask(view), later)
+        tally.add(rendering, truth, datasets.load_mask(view), is_later(scene, view.t))
+        picture = rendering.color
         if corrections is not None:
-            tally.add_aligned(_aligned(scene, view, corrections[view.camera.name], move, backend), truth)
+            picture = _aligned(scene, view, corrections[view.camera.name], move, backend)
+            tally.values["psnr_aligned"].append(metrics.psnr(picture, truth))
+        where = explained.explained(usual or {}, view, background)
+        if where is not None:
+            tally.values["psnr_explained"].append(metrics.psnr(picture, truth, where))
         if measured is not None:
             measured()
     return tally.result()
@@ -325,12 +332,9 @@ class _Tally:
         self.values["ms_motion"].append(rendering.ms_motion)
         self.values["ms_raster"].append(rendering.ms_raster)
 
-    def add_aligned(self, picture: np.ndarray, truth: np.ndarray) -> None:
-        self.values["psnr_aligned"].append(metrics.psnr(picture, truth))
-
     def result(self) -> dict[str, Any]:
         out: dict[str, Any] = dict.fromkeys(METRICS)
-        for name in ("psnr", "psnr_aligned", "psnr_objects", "ssim", "ssim_objects", "flip", "lpips"):
+        for name in ("psnr", "psnr_aligned", "psnr_explained", "psnr_objects", "ssim", "ssim_objects", "flip", "lpips"):
             out[name] = _mean(self.values[name])
         for name in ("ms_motion", "ms_raster"):
             out[name] = float(np.median(self.values[name])) if self.values[name] else None

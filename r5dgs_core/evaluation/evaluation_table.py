@@ -16,6 +16,7 @@ from . import miou
 _SHOWN = (
     ("psnr", "PSNR, mean over images (dB)", "PSNR", "{:.2f}"),
     ("psnr_aligned", "PSNR with aligned cameras (dB)", "aligned", "{:.2f}"),
+    ("psnr_explained", "PSNR of explained regions (dB)", "explained", "{:.2f}"),
     ("psnr_pooled", "PSNR of the pooled error (dB)", "", "{:.2f}"),
     ("psnr_objects", "PSNR on object pixels (dB)", "objects", "{:.2f}"),
     ("ssim", "SSIM", "SSIM", "{:.4f}"),

@@ -19,6 +19,7 @@ FROZEN = "held"  # name of a tensor: mask of the Gaussians whose centres are fro
 DISCOVERED_MASKS = "discovery.masks"  # name of a tensor: packed masks of the training views
 DISCOVERED_LABELS = "discovery.labels"  # name of a tensor: labels that were found after the run instead of masks
 TRAIN_PSNR = "train_psnr"  # name of a tensor: `view_psnr.training_psnr` of a finished run, dB
+UNEXPLAINED = "unexplained"  # name of a tensor: `unexplained_views.Decision`
 TENSORS = (*(f"gaussians.{name}" for name in (*PARAMETERS, "motion_ids")), "object_ids", "background", "generator")
 
 _WHOLE = (torch.int64, torch.int32)
@@ -41,6 +42,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "generator": ("bytes",),
     "light": (3,),
     TRAIN_PSNR: (),
+    UNEXPLAINED: (2,),
     "labels": ("N",),
     "identities": ("N", "D"),
     "classifier.weight": ("C", "D"),

@@ -95,6 +95,7 @@ class StepGraphs:
             and config.train.graphs
             and trainer.gaussians.params["sh_rest"].shape[1] == 0
             and trainer.identity is None
+            and all(view.load_unexplained is None for view in trainer.given_views)
             and len({(view.camera.width, view.camera.height) for view in trainer.views}) == 1
         )
         self._graphs: dict[tuple, CapturedWork] = {}

@@ -38,6 +38,7 @@ class TrainView:
         load_image: Returns the image. [H, W, 3] uint8
         load_mask: Returns the object ids; None without a mask. [H, W] uint8 if they fit, else uint16
         load_alpha: Returns the opacity of the pixels; None if the image has no alpha. [H, W] uint8
+        load_unexplained: Returns the region that is left out of training; None without one. [H, W] bool
     """
 
     name: str
@@ -46,6 +47,7 @@ class TrainView:
     load_image: Callable[[], np.ndarray]
     load_mask: Callable[[], np.ndarray] | None = None
     load_alpha: Callable[[], np.ndarray] | None = None
+    load_unexplained: Callable[[], np.ndarray] | None = None
 
     @property
     def image(self) -> np.ndarray:
@@ -61,6 +63,11 @@ class TrainView:
     def alpha(self) -> np.ndarray | None:
         """Opacity of the pixels, or None. [H, W] uint8"""
         return None if self.load_alpha is None else self.load_alpha()
+
+    @property
+    def unexplained(self) -> np.ndarray | None:
+        """Mask of the pixels that are left out of training (`unexplained_views`), or None. [H, W] bool"""
+        return None if self.load_unexplained is None else self.load_unexplained()
 
     @property
     def has_mask(self) -> bool:

@@ -31,6 +31,7 @@ from . import (
     step_graphs,
     train_views,
     trainer_state,
+    unexplained_views,
     view_batch,
 )
 from . import optimizer as optimizers
@@ -80,7 +81,8 @@ class Trainer:
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         self.behind = train_views.behind(dataset, config)
         self._memory = memory.for_images(config.data.memory)
-        self.given_views = train_views.load(dataset, self.normalization, self.behind, self._memory)
+        views = train_views.load(dataset, self.normalization, self.behind, self._memory)
+        self.given_views, self.unexplained = unexplained_views.decide(views, config)
         self.discovered_masks, shown = None, self.given_views
         if discovered_masks is not None:
             self.discovered_masks = packed_masks.pack(discovered_masks)
@@ -210,7 +212,8 @@ class Trainer:
             ) from error
         self.refinement.watch(splats)
         image = self.refinement.shade(image, inputs.target, inputs.index)
-        loss, identity = losses.photometric(image, inputs.target, self.config.losses.ssim), None
+        compared = _without(self.given_views[inputs.index].unexplained, image, inputs.target)
+        loss, identity = losses.photometric(*compared, self.config.losses.ssim), None
         if self.identity is not None:
             identity = self.identity.loss(self.gaussians, splats, inputs.view, self.iteration, features)
         return loss, identity, splats
@@ -310,6 +313,14 @@ class Trainer:
         """Restore a `state` of a trainer with the same data set and configuration."""
         trainer_state.restore(self, state)
         self._loss = RunningLoss(state.running_loss)
+
+
+def _without(region: np.ndarray | None, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a picture and its target [H, W, 3] so that they are equal and constant in a region [H, W], if any."""
+    if region is None:
+        return image, target
+    inside, constant = torch.from_numpy(region).to(image.device)[..., None], image.detach()
+    return torch.where(inside, constant, image), torch.where(inside, constant, target)
 
 
 def _rasterized(

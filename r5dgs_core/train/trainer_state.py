@@ -25,6 +25,8 @@ def of(trainer: Any) -> Checkpoint:
         tensors |= trainer.identity.tensors(trainer.gaussians)
     if trainer.discovered_masks is not None:
         tensors[checkpoint_content.DISCOVERED_MASKS] = trainer.discovered_masks
+    if trainer.unexplained is not None:
+        tensors[checkpoint_content.UNEXPLAINED] = trainer.unexplained.tensor()
     tensors["background"] = trainer.background.params["background"].detach()
     tensors["object_ids"] = torch.from_numpy(np.asarray(trainer.object_ids, np.int64))
     tensors["generator"] = trainer.generator.get_state()

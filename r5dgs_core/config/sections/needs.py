@@ -28,6 +28,7 @@ class NeedsSection:
         focal_lengths: Refinement of their focal lengths.
         time_offsets: Refinement of the offsets of their clocks.
         camera_colours: Refinement of the gain and offset of their colours.
+        unexplained_regions: Leaving out of regions that move although no mask names them.
         contact: Contacts between bodies past t_max; needs the extra "contact". "on" equals "auto".
     """
 
@@ -44,4 +45,5 @@ class NeedsSection:
     focal_lengths: str = "auto"
     time_offsets: str = "auto"
     camera_colours: str = "auto"
+    unexplained_regions: str = "auto"
     contact: str = "auto"

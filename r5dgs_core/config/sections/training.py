@@ -91,6 +91,7 @@ class InitSection:
         shading: Length of the shading vectors of objects with tracks until all times take part; they point outwards, as
             on a lit ball.
         min_mask_pixels: Minimum size of a mask that is used to locate an object, as a share of the image's pixels.
+        unexplained: Share of the pixels that move although no mask names them, above which they are left out.
     """
 
     placement: str = "scene"
@@ -101,6 +102,7 @@ class InitSection:
     opacity: float = 0.25
     shading: float = 0.3
     min_mask_pixels: float = 5e-4
+    unexplained: float = 0.03
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ def compute(views: Sequence[TrainView]) -> list[BackgroundImage]:
 def _free(frames: Sequence[TrainView]) -> np.ndarray:
     """Mask of the background pixels in each frame of a camera. [F, H, W] bool
 
-    Pixels that are unknown in all masks of the camera count as background.
+    Pixels that are unknown in all masks of the camera count as background, unless they are unexplained.
     """
     free = np.ones((len(frames), frames[0].camera.height, frames[0].camera.width), bool)
     told = np.zeros(free.shape[1:], bool)
@@ -55,4 +55,7 @@ def _free(frames: Sequence[TrainView]) -> np.ndarray:
     for k, view in enumerate(frames):
         if view.alpha is not None:
             free[k] &= view.alpha > 127
+        left_out = view.unexplained
+        if left_out is not None:
+            free[k] &= ~left_out
     return free

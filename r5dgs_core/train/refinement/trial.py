@@ -125,7 +125,9 @@ def _tiles(trainer: Trainer, row: int, parts: Sequence[str]) -> list[Normal] | N
         def draw(camera: Camera, t: float, given: Camera = view.camera) -> np.ndarray:
             return to_host(trainer.render(camera, t, behind=given))
 
-        shot = Shot(view.camera, view.t, view.image.astype(np.float32) / 255)
+        left_out = view.unexplained
+        valid = None if left_out is None else ~left_out
+        shot = Shot(view.camera, view.t, view.image.astype(np.float32) / 255, valid)
         views.append(camera_fit.normal_tiles(draw, shot, refinement.correction(row), _units(trainer), which))
     return [camera_fit.added(tile) for tile in zip(*views, strict=True)]
 

@@ -1,0 +1,132 @@
+"""Training leaves out what moves although no mask names it, and nothing else."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from r5dgs_core.bake import needs
+from r5dgs_core.config import config
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.data import masks, unexplained
+from r5dgs_core.evaluation import evaluate, explained
+from r5dgs_core.raster import RasterStats
+from r5dgs_core.train import checkpoint_content, train_views, unexplained_views
+from r5dgs_core.train.initialization import background_images
+from r5dgs_core.train.normalization import Normalization
+from r5dgs_core.train.step_graphs import StepInputs
+from r5dgs_core.train.trainer import Trainer
+from tests.support import passers_by, tiny_datasets
+
+
+@pytest.fixture(scope="module")
+def crossed(tiny, tmp_path_factory):
+    """The tiny data set with a body that no mask names."""
+    return passers_by.add(tiny.root, tmp_path_factory.mktemp("crossed") / "data")
+
+
+def decided(dataset, *overrides):
+    views = train_views.load(dataset, Normalization(np.zeros(3), 1.0), None)
+    return views, *unexplained_views.decide(views, tiny_datasets.settings(*overrides))
+
+
+def hidden(dataset, index):
+    """The pixels of a training view that show the body. [H, W]"""
+    view = dataset.train[index]
+    shown = np.zeros((view.camera.height, view.camera.width), bool)
+    shown[passers_by.place(view, passers_by.numbers(dataset)[index])] = True
+    return shown & (datasets.load_mask(view) == 0)
+
+
+def test_regions_of_a_body_without_a_mask_are_left_out(crossed):
+    given, views, decision = decided(crossed)
+    assert decision.on and decision.share > 0.03
+    found = true = 0
+    for index, (before, view) in enumerate(zip(given, views, strict=True)):
+        assert (view.mask[view.unexplained] == masks.UNKNOWN).all()
+        assert np.array_equal(view.mask[~view.unexplained], before.mask[~view.unexplained])
+        assert view.image is before.image
+        body = hidden(crossed, index)
+        found, true = found + (view.unexplained & body).sum(), true + body.sum()
+        assert not view.unexplained[~ndimage.binary_dilation(body, iterations=3)].any()
+    assert found > 0.5 * true  # places that the objects mostly cover have no usual colours
+
+
+def test_views_stay_the_same_if_masks_explain_what_moves(tiny):
+    given, views, decision = decided(datasets.read(tiny.root))
+    assert decision == unexplained_views.Decision(0.0, False)
+    assert all(one is other for one, other in zip(given, views, strict=True))
+
+
+def test_the_user_decides_before_the_measurement(tiny, crossed):
+    assert decided(crossed, "needs.unexplained_regions=off")[2] is None
+    assert not decided(crossed, "init.unexplained=0.5")[2].on
+    assert decided(datasets.read(tiny.root), "needs.unexplained_regions=on")[2].on
+
+
+def test_cameras_without_masks_or_with_few_frames_are_no_evidence(crossed):
+    bare = dataclasses.replace(crossed, train=tuple(dataclasses.replace(v, mask_path=None) for v in crossed.train))
+    assert decided(bare)[2] is None
+    few = dataclasses.replace(crossed, train=crossed.train[:12])
+    assert decided(few)[2] is None
+
+
+def test_pixels_that_are_always_left_out_are_no_background(crossed):
+    _, views, _ = decided(crossed)
+    everything = np.ones(views[0].unexplained.shape, bool)
+    mine = [dataclasses.replace(view, load_unexplained=lambda: everything) for view in views[::6]]
+    assert not background_images.compute(mine)[0].known.any()
+
+
+@pytest.mark.heavy
+def test_pixels_of_the_regions_have_no_effect_on_a_step(crossed):
+    trainer = Trainer(crossed, tiny_datasets.settings("train.iterations=10"))
+    view, region = trainer.views[0], trainer.given_views[0].unexplained
+    path = trainer.motion.path(view.t, trainer.generator)
+    target = trainer.targets.of(0)
+    changed = torch.where(torch.from_numpy(region)[..., None], 1 - target, target)
+    outside = torch.where(torch.from_numpy(~region)[..., None], 1 - target, target)
+    found = []
+    for one in (target, changed, outside):
+        loss, _, _ = trainer.compare(StepInputs(0, view, path, one), RasterStats(), "")
+        found.append((float(loss.detach()), torch.autograd.grad(loss, trainer.gaussians.params["means"])[0]))
+    assert found[0][0] == found[1][0] and torch.equal(found[0][1], found[1][1])
+    assert found[0][0] != found[2][0]
+
+
+@pytest.mark.heavy
+def test_the_decision_is_kept_in_checkpoints_and_in_the_table_of_needs(crossed):
+    settings = tiny_datasets.settings("train.iterations=10")
+    trainer = Trainer(crossed, settings)
+    tensors = trainer.state().tensors
+    assert unexplained_views.Decision.of(tensors[checkpoint_content.UNEXPLAINED]) == trainer.unexplained
+    row = needs.left_out(tensors, settings).row()
+    assert (row["name"], row["decision"], row["threshold"]) == (unexplained.NEED, "on", 0.03)
+    assert row["value"] == trainer.unexplained.share
+    assert needs.left_out({}, config.Config()).row()["reason"] == "not examined"
+
+
+def test_the_evaluation_measures_the_explained_regions_on_their_own(crossed):
+    scene = tiny_datasets.make_truth()
+    seen = dataclasses.replace(crossed, val=crossed.train[:12], test=())
+    plain = evaluate.evaluate(scene, seen, splits=("val",))["splits"]["val"]["rigid"]
+    assert plain["psnr_explained"] is None
+    need = {"name": unexplained.NEED, "decision": "on", "value": 0.06, "threshold": 0.03, "reason": ""}
+    left_out = dataclasses.replace(scene, needs=(need,))
+    found = evaluate.evaluate(left_out, seen, splits=("val",))["splits"]["val"]["rigid"]
+    assert found["psnr"] == plain["psnr"]
+    assert found["psnr_explained"] > found["psnr"] + 2
+    unknown = dataclasses.replace(seen, val=tuple(dataclasses.replace(v, mask_path=None) for v in seen.val))
+    assert evaluate.evaluate(left_out, unknown, splits=("val",))["splits"]["val"]["rigid"]["psnr_explained"] is None
+
+
+def test_training_and_evaluation_find_the_same_regions(crossed):
+    need = {"name": unexplained.NEED, "decision": "on"}
+    scene = dataclasses.replace(tiny_datasets.make_truth(), needs=(need,))
+    usual = explained.usual_colors(scene, crossed, np.ones(3))
+    _, views, _ = decided(crossed)
+    for view, given in zip(views, crossed.train, strict=True):
+        found = explained.explained(usual, given, np.ones(3))
+        assert np.array_equal(view.unexplained, ~found)
