@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+GAP = 1.5  # interval / median interval above which frames are missing
+
 
 @dataclass(frozen=True)
 class Offset:
@@ -21,6 +23,24 @@ class Offset:
     seconds: float
     sigma: float | None
     method: str
+
+
+def irregularity(times: np.ndarray) -> float:
+    """Return the standard deviation of the times of a camera from even intervals, seconds.
+
+    Cameras expose evenly, but a table often holds the times at which a computer received the frames. Their deviations
+    are those of successive intervals, whose difference has six times the variance of a time. Intervals of more than
+    `GAP` times the median are gaps and do not count.
+
+    Args:
+        times: Times of the frames, increasing. [F]
+    """
+    steps = np.diff(times)
+    if len(steps) < 2:
+        return 0.0
+    even = steps <= GAP * np.median(steps)
+    changes = np.diff(steps)[even[1:] & even[:-1]]
+    return float(np.sqrt(np.mean(changes**2) / 6)) if len(changes) else 0.0
 
 
 def solve_pairs(count: int, pairs: Sequence[tuple[int, int, float, float]], method: str) -> list[Offset] | None:

@@ -15,7 +15,7 @@ import numpy as np
 from .. import errors
 from ..capture.calibration.calibration import CalibratedCamera, Calibration
 from ..data import mask_notes, masks
-from . import audio_offsets, frame_masks, motion_offsets, motion_tracks
+from . import audio_offsets, clock, frame_masks, motion_offsets, motion_tracks
 from .camera_source import TABLE, CameraSource
 from .clock import Offset
 from .motion_tracks import MotionTrack
@@ -59,7 +59,7 @@ def offsets(
     if len(sources) < 2 or method == "none":
         return none, []
     if method == "auto" and all(source.timing == TABLE for source in sources):
-        return [Offset(0.0, 0.0, TABLE) for _ in sources], []
+        return [Offset(0.0, clock.irregularity(source.times), TABLE) for source in sources], []
     if method in ("auto", "audio"):
         if all(source.sound for source in sources):
             progress({"event": "sync", "text": "sound"})

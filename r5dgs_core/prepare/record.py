@@ -18,7 +18,7 @@ from ..data.splits import SPLITS
 from ..scene.cameras import OPENGL_TO_OPENCV
 from . import capture_file
 from .cameras import Camera
-from .clock import Offset
+from .clock import GAP, Offset
 from .plan import Plan, Request
 
 _EDGE_BYTES = 1 << 16  # bytes at each end of a file that enter its fingerprint
@@ -98,7 +98,7 @@ def _camera(plan: Plan, number: int, lost: Mapping[str, list[int]]) -> dict[str,
     lens = plan.cameras[number].calibrated.lens
     steps = np.diff(source.times)
     interval = source.interval
-    long = np.flatnonzero(steps > 1.5 * interval)
+    long = np.flatnonzero(steps > GAP * interval)
     return {
         "name": source.name,
         "files": [path.name for path in source.paths] if source.videos else [f"{len(source.paths)} frames"],

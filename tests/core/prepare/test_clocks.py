@@ -237,3 +237,24 @@ def test_masks_of_the_frames_replace_the_largest_moving_region(swinging, tmp_pat
         tmp_path,
     )
     np.testing.assert_allclose([one.seconds for one in found], CLOCKS, atol=1e-3)
+
+
+def test_the_uncertainty_of_a_table_is_the_irregularity_of_its_times():
+    rng = np.random.default_rng(0)
+    even = 3.0 + np.arange(2000) / 6
+    assert clock.irregularity(even) == pytest.approx(0, abs=1e-9)
+    noisy = even + 0.004 * rng.normal(size=len(even))
+    assert clock.irregularity(noisy) == pytest.approx(0.004, rel=0.1)
+    assert clock.irregularity(np.delete(noisy, slice(500, 520))) == pytest.approx(0.004, rel=0.1)
+    assert clock.irregularity(even[:2]) == 0.0
+
+
+def test_cameras_of_a_table_keep_their_times_and_get_its_irregularity(tmp_path):
+    even = np.arange(20) / 10
+    jitter = 0.003 * np.random.default_rng(1).normal(size=len(even))
+    recordings.record(tmp_path, recordings.make_rig(2, 48, 32), [even] * 2, draw_nothing)
+    rows = [f"cam0,{k},{t}" for k, t in enumerate(even)] + [f"cam1,{k},{t}" for k, t in enumerate(even + jitter)]
+    (tmp_path / "timestamps.csv").write_text("\n".join(["camera,frame,time", *rows]))
+    found, notes = measured(tmp_path)
+    assert [one.seconds for one in found] == [0.0, 0.0] and notes == []
+    assert found[0].sigma < 1e-6 and 0.0015 < found[1].sigma < 0.0045
