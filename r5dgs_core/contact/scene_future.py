@@ -160,16 +160,22 @@ def _with_contact(
     model = dataclasses.replace(model, radius=smooth.radius)
     past = group.history
     if sampled is not None and sampled.quats.shape[1]:
-        past = dataclasses.replace(past, band=_band(sampled, found, number, body.solid.size, t_max))
+        own = None if number in made.fits else past.band  # nothing else tells its uncertainty at t_max
+        past = dataclasses.replace(past, band=_band(sampled, found, number, body.solid.size, t_max, own))
     return dataclasses.replace(group, model=model, smooth=smooth, history=past)
 
 
-def _band(sampled: futures.Futures, found: Recording, number: int, size: float, t_max: float) -> history.Band:
-    rows = np.minimum(np.searchsorted(found.times, sampled.times), len(found.times) - 1)
+def _band(
+    sampled: futures.Futures, found: Recording, number: int, size: float, t_max: float, own: history.Band | None
+) -> history.Band:
+    """Band of the samples of a body; ``own`` is that of its smooth motion if the samples start in one state."""
+    rows, times = np.minimum(np.searchsorted(found.times, sampled.times), len(found.times) - 1), t_max + sampled.times
     widths = sampled.radii(found.places[rows, number], BAND_LEVEL)
-    angles = np.minimum(sampled.angles(found.quats[rows, number], BAND_LEVEL), np.pi)
+    angles = sampled.angles(found.quats[rows, number], BAND_LEVEL)
+    if own is not None:
+        widths, angles = np.hypot(widths, own.widths(times)), np.hypot(angles, own.angles(times))
+    angles = np.minimum(angles, np.pi)
     late = np.flatnonzero(widths > UNPREDICTABLE * size)
-    times = t_max + sampled.times
     until = float(times[late[0]]) if len(late) else None
     return history.Band(tuple(times.tolist()), tuple(widths.tolist()), tuple(angles.tolist()), BAND_LEVEL, until)
 

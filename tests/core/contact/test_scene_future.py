@@ -8,6 +8,7 @@ import pytest
 from r5dgs_core.contact import scene_future, scene_world, simulation, world
 from r5dgs_core.contact.scene_world import Wishes
 from r5dgs_core.motion import models, rotations
+from r5dgs_core.motion.history import Band, History
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.scene import scene_file
 from tests.support import contact_scenes
@@ -59,13 +60,29 @@ def test_a_scene_with_contacts_is_stored_and_read(fallen, tmp_path):
     assert back.groups[1].model == found.groups[1].model and back.groups[1].smooth == scene.groups[1].model
 
 
-def test_a_sliding_box_pushes_the_one_that_it_hits():
+@pytest.fixture(scope="module")
+def pushed():
+    """Scene of a box that slides into another one, with a band of the other one, and its prediction."""
     scene = contact_scenes.with_units(contact_scenes.scene(contact_scenes.sliding(1.5), contact_scenes.resting(0.8)))
-    found = scene_future.predict(scene, FEW)
+    smooth = History(band=Band((0.6, 1.6), (0.1 * SIZE, 0.5 * SIZE), (0.1, 0.4)))
+    groups = (*scene.groups[:2], dataclasses.replace(scene.groups[2], history=smooth))
+    scene = dataclasses.replace(scene, groups=groups)
+    return scene, scene_future.predict(scene, FEW)
+
+
+def test_a_sliding_box_pushes_the_one_that_it_hits(pushed):
+    scene, found = pushed
     assert set(found.taken) == {"box 1", "box 2"} and "both assumed" in found.taken["box 2"]
     first, second = (models.evaluate(group.model, 0.8)[1] for group in found.groups[1:])
     assert second[0] > 0.05 * SIZE and first[0] < 0.4 + second[0] + 0.05 * SIZE
     assert models.evaluate(scene.groups[1].model, 0.8)[1][0] == pytest.approx(1.2)
+
+
+def test_the_band_of_a_body_that_is_only_hit_includes_that_of_its_smooth_motion(pushed):
+    smooth, band = (part.groups[2].history.band for part in pushed)
+    times = np.array(band.times)
+    assert smooth is not band and (band.widths(times) >= smooth.widths(times) - 1e-12).all()
+    assert (band.angles(times) >= smooth.angles(times) - 1e-12).all()
 
 
 @pytest.mark.parametrize(
