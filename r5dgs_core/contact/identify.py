@@ -147,8 +147,9 @@ class Fitter:
     def _guesses(self, start: State) -> list[Material]:
         """First guesses of the material: the one that follows most poses, and the one that misses none by much."""
         materials = [Material(mu, e) for mu in _FRICTIONS for e in _RESTITUTIONS]
-        missed = [np.nan_to_num(self._residuals(start, material, self.track), nan=1e9) for material in materials]
-        squares = (np.array(missed) ** 2).sum(axis=-1)
+        same = self._many_moved(start, materials[0], np.zeros((len(materials), PARAMETERS)))[0]
+        missed = np.nan_to_num(self._residuals(same, materials, self.track), nan=1e9)
+        squares = (missed**2).sum(axis=-1)
         losses = np.minimum(np.sqrt(squares), _LOST), robust_weights.cauchy_losses(squares, _OUTLIER)
         best = [int(np.argmin(loss.sum(axis=1))) for loss in losses]
         return [materials[k] for k in dict.fromkeys(best)]
@@ -174,11 +175,16 @@ class Fitter:
 
     def moved(self, state: State, material: Material, x: np.ndarray) -> tuple[State, Material]:
         """State and material with deviations [14] in the module's notation."""
-        d = x[:12].reshape(4, 3) * self.scales[:12].reshape(4, 3)
-        quats = rotations.normalize(rotations.multiply(rotations.rotvecs_to_quats(d[1]), state.quats))
-        changed = State(state.places + d[0], quats, state.velocities + d[2], state.spins + d[3])
-        log_friction, logit = _logs(material) + x[12:]
-        return changed, Material(float(np.exp(np.clip(log_friction, -12, 5))), float(1 / (1 + np.exp(-logit))))
+        states, (changed,) = self._many_moved(state, material, x[None])
+        return State(states.places[0], states.quats[0], states.velocities[0], states.spins[0]), changed
+
+    def _many_moved(self, state: State, material: Material, x: np.ndarray) -> tuple[State, list[Material]]:
+        """N states and materials with deviations. [N, 14]"""
+        d = (x[:, :12] * self.scales[:12]).reshape(-1, 4, 1, 3)
+        quats = rotations.normalize(rotations.multiply(rotations.rotvecs_to_quats(d[:, 1]), state.quats))
+        changed = State(state.places + d[:, 0], quats, state.velocities + d[:, 2], state.spins + d[:, 3])
+        logs = _logs(material) + x[:, 12:]
+        return changed, [_material(*row) for row in logs.tolist()]
 
     def at(self, estimate: Estimate, time: float) -> State:
         """State of an estimate at a later time."""
@@ -188,9 +194,15 @@ class Fitter:
 
     def poses(self, state: State, material: Material, times: np.ndarray) -> se3.Pose:
         """Poses of the body at times since a state. [T, 4], [T, 3]"""
-        self.simulation.touch(self._materials(material))
-        quats, places = self.simulation.poses(self._all(state), times)
-        return quats[:, self.body], places[:, self.body]
+        one = State(state.places[None], state.quats[None], state.velocities[None], state.spins[None])
+        quats, places = self._many_poses(one, [material], times)
+        return quats[0], places[0]
+
+    def _many_poses(self, states: State, materials: Sequence[Material], times: np.ndarray) -> se3.Pose:
+        """Poses of the body at times since each of N states. [N, T, 4], [N, T, 3]"""
+        used = [self._materials(material) for material in materials]
+        quats, places = self.simulation.paths(self._all(states), times, used)
+        return quats[:, :, self.body], places[:, :, self.body]
 
     def ballistic(self, track: Track) -> State:
         """State at the first of at least two poses in free flight, by a parabola and a constant spin."""
@@ -222,30 +234,39 @@ class Fitter:
         return int(np.argmax(close)) if close.any() else len(self.track)
 
     def _linearized(self, state: State, prior: Prior, track: Track, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        here = self._residuals(*self.moved(state, prior.material, x), track)
-        nudged = (x + step * nudge for step, nudge in zip(_STEPS, np.eye(PARAMETERS), strict=True))
-        ahead = np.array([self._residuals(*self.moved(state, prior.material, near), track) for near in nudged])
-        return here, (ahead - here) / _STEPS[:, None, None]
+        """Residuals [2 S, 3] at parameters [14], and their derivatives [14, 2 S, 3]."""
+        nearby = x + np.concatenate([np.zeros((1, PARAMETERS)), np.diag(_STEPS)])
+        found = self._residuals(*self._many_moved(state, prior.material, nearby), track)
+        return found[0], (found[1:] - found[0]) / _STEPS[:, None, None]
 
-    def _residuals(self, state: State, material: Material, track: Track) -> np.ndarray:
-        """Differences from observed places and rotations in units of the noise. [2 S, 3]"""
-        found = self.poses(state, material, track.times - track.times[0])
+    def _residuals(self, states: State, materials: Sequence[Material], track: Track) -> np.ndarray:
+        """Differences from observed places and rotations in units of the noise, for N states. [N, 2 S, 3]"""
+        found = self._many_poses(states, materials, track.times - track.times[0])
         missed = se3.differences(found, (track.quats, track.places), 1.0, 1.0)
-        return np.concatenate([missed[:, :3] / track.place_noise[:, None], missed[:, 3:] / track.turn_noise[:, None]])
+        parts = missed[..., :3] / track.place_noise[:, None], missed[..., 3:] / track.turn_noise[:, None]
+        return np.concatenate(parts, axis=1)
 
     def _materials(self, material: Material) -> Sequence[Material]:
         bodies = self.simulation.world.bodies
         return [material if i == self.body else body.material for i, body in enumerate(bodies)]
 
-    def _all(self, state: State) -> State:
-        """State of all bodies: the others at rest in the bind state."""
+    def _all(self, states: State) -> State:
+        """States [..., 1] of the body among all bodies: the others are at rest in the bind state. [..., B]"""
         everything = worlds.at_rest(self.simulation.world)
+        found = {}
         for name in ("places", "quats", "velocities", "spins"):
-            getattr(everything, name)[self.body] = getattr(state, name)[0]
-        return everything
+            own, others = getattr(states, name), getattr(everything, name)
+            found[name] = np.tile(others, (*own.shape[:-2], 1, 1))
+            found[name][..., self.body, :] = own[..., 0, :]
+        return State(**found)
 
 
 def _logs(material: Material) -> np.ndarray:
     """Logarithm of the friction and logit of the restitution. [2]"""
     e = min(max(material.restitution, 1e-3), 1 - 1e-3)
     return np.array([np.log(max(material.friction, 1e-4)), np.log(e / (1 - e))])
+
+
+def _material(log_friction: float, logit: float) -> Material:
+    """Inverse of `_logs`."""
+    return Material(float(np.exp(np.clip(log_friction, -12, 5))), float(1 / (1 + np.exp(-logit))))

@@ -6,6 +6,7 @@ ratio, w the angular frequency of the undamped spring, e the speed after an impa
 
 from __future__ import annotations
 
+import functools
 import math
 
 _GRIP = math.log(20) / (2 * math.pi)  # damping ratio of friction, at least: a bounce of time pi / w leaves 1 / 20
@@ -32,6 +33,7 @@ def limited(e: float) -> float:
     return min(max(e, LEAST), MOST)
 
 
+@functools.lru_cache(maxsize=256)  # simulations of a fit repeat the same values
 def damping_of(e: float) -> float:
     """Damping ratio of a restitution, clipped to [`LEAST`, `MOST`]; inverse of `of_damping`."""
     e = limited(e)

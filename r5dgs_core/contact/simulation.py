@@ -2,12 +2,14 @@
 
 MuJoCo's friction cone is elliptic, as the pyramidal one is wrong by 41 % in diagonal directions; its matrices are
 dense, as these are faster for few bodies; speculative contacts keep thin bodies from passing through each other.
-Its unit of length is the size of the largest body, because MuJoCo has smallest and largest values.
+Its unit of length is the size of the largest body, because MuJoCo has smallest and largest values. While no body can
+touch anything, few steps of Runge and Kutta replace the steps that contacts need.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,6 +18,7 @@ import numpy as np
 from .. import errors, extras
 from ..motion import rotations
 from . import restitution
+from .flights import ROUND, Flights
 from .stepping import Stepping
 from .world import Body, Material, State, World
 
@@ -23,6 +26,10 @@ log = logging.getLogger(__name__)
 _SOFT, _STIFF = 0.99, 0.9999  # impedances; MuJoCo has none beyond the latter
 _YIELD = 10.0  # times 1 / (mass ratio): 1 - impedance; under a heavy body, a light one sinks by the product of the two
 _LEAST_FRICTION, _MOST_FRICTION = 1e-5, 1e3
+_TURN = 0.1  # rotation in one step of a flight of a body whose spin is not constant, rad
+_CHECKED = 16  # steps between two searches for a flight
+_WORTH = 16.0  # least length of a flight, in steps
+_BEFORE = 1.3  # steps before a contact at which a flight ends; bounces are the most exact with a third of a step left
 _TOUCHING = 1e-3  # penetration that stays in the initial state, as a share of a body's size
 
 
@@ -55,6 +62,11 @@ class Simulation:
         self.data = mujoco.MjData(self.model)
         self._moving = [i for i, body in enumerate(world.bodies) if not body.fixed]
         self._geoms = np.array([self.model.geom(f"body{i}").id for i in range(len(world.bodies))], int)
+        self._numbers = np.full(self.model.ngeom, -1)
+        self._numbers[self._geoms] = range(len(self._geoms))
+        self._flights = Flights(world, self.unit)
+        moments = self.model.body_inertia[self.model.dof_bodyid[::6]]
+        self._steady = bool((np.ptp(moments, axis=1) <= ROUND * moments.max(axis=1)).all())
         self.touch([body.material for body in world.bodies])
 
     def touch(self, materials: Sequence[Material]) -> None:
@@ -74,14 +86,22 @@ class Simulation:
 
     def load(self, state: State) -> None:
         """Set the state at time 0."""
+        positions, rates = self._packed(state)
+        self._reset(positions, rates)
+
+    def _reset(self, positions: np.ndarray, rates: np.ndarray) -> None:
         self.mujoco.mj_resetData(self.model, self.data)
-        for k, i in enumerate(self._moving):
-            self.data.qpos[7 * k : 7 * k + 3] = state.places[i] / self.unit
-            self.data.qpos[7 * k + 3 : 7 * k + 7] = state.quats[i]
-            self.data.qvel[6 * k : 6 * k + 3] = state.velocities[i] / self.unit
-            self.data.qvel[6 * k + 3 : 6 * k + 6] = rotations.rotate(
-                rotations.conjugate(state.quats[i]), state.spins[i]
-            )
+        self.data.qpos[:], self.data.qvel[:] = positions, rates
+
+    def _packed(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """MuJoCo's positions [..., 7 M] and rates [..., 6 M] of a state; inverse of `_unpacked`."""
+        shape = (*state.places.shape[:-2], -1)
+        places, quats, velocities, spins = (
+            values[..., self._moving, :] for values in (state.places, state.quats, state.velocities, state.spins)
+        )
+        own_spins = rotations.rotate(rotations.conjugate(quats), spins)
+        positions = np.concatenate([places / self.unit, quats], axis=-1)
+        return positions.reshape(shape), np.concatenate([velocities / self.unit, own_spins], axis=-1).reshape(shape)
 
     def state(self) -> State:
         """Present state; fixed bodies are at rest."""
@@ -100,10 +120,28 @@ class Simulation:
         return State(places, quats, velocities, spins)
 
     def advance(self, time: float) -> None:
-        """Simulate up to the last step before a time."""
-        steps = int(np.floor((time - self.data.time) / self.stepping.step + 1e-9))
-        if steps > 0:
-            self.mujoco.mj_step(self.model, self.data, steps)
+        """Simulate up to a time in free flight, or up to the last step before it."""
+        model, data, step = self.model, self.data, self.stepping.step
+        while (steps := int(np.floor((time - data.time) / step + 1e-9))) > 0:
+            free = self._flights.time(data.qpos.tolist(), data.qvel.tolist()) - _BEFORE * step if model.nv else 0.0
+            if free > _WORTH * step:
+                self._fly(min(free, time - data.time))
+            else:
+                self.mujoco.mj_step(model, data, min(steps, _CHECKED) if model.nv else steps)
+
+    def _fly(self, span: float) -> None:
+        """Simulate bodies that touch nothing for a time."""
+        option, spins = self.model.opt, self.data.qvel.reshape(-1, 6)[:, 3:]
+        steps = 1
+        if not self._steady:
+            steps = max(
+                math.ceil(min(span / option.timestep, span * float(np.abs(spins).sum(axis=1).max()) / _TURN)), 1
+            )
+        kept = option.timestep, option.integrator, option.disableflags
+        option.timestep, option.integrator = span / steps, int(self.mujoco.mjtIntegrator.mjINT_RK4)
+        option.disableflags = kept[2] | int(self.mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self.mujoco.mj_step(self.model, self.data, steps)
+        option.timestep, option.integrator, option.disableflags = kept
 
     def state_at(self, time: float) -> State:
         """Simulate up to a time, the rest after the last whole step at constant rates, and return the state there."""
@@ -130,26 +168,49 @@ class Simulation:
             Quaternions relative to the bind state [T, B, 4] and centres of mass [T, B, 3]; not a number after a
             simulation has failed.
         """
-        self.load(state)
-        positions, rates = (np.empty((len(times), len(now))) for now in (self.data.qpos, self.data.qvel))
-        rest = np.empty(len(times))
-        for row, time in enumerate(times):
-            self.advance(float(time))
-            positions[row], rates[row], rest[row] = self.data.qpos, self.data.qvel, time - self.data.time
-        quats, places = _moved(self._unpacked(positions, rates), rest[:, None, None])
-        if self.failed:
-            places[:], quats[:] = np.nan, np.nan
+        one = State(*(values[None] for values in (state.places, state.quats, state.velocities, state.spins)))
+        quats, places = self.paths(one, times)
+        return quats[0], places[0]
+
+    def paths(
+        self, states: State, times: np.ndarray, materials: Sequence[Sequence[Material]] = ()
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Simulate from many states, as `poses` does.
+
+        Args:
+            states: N initial states, with a leading axis.
+            times: Times >= 0, increasing. [T]
+            materials: Materials of the bodies in each simulation; empty to keep the present ones.
+
+        Returns:
+            Quaternions [N, T, B, 4] and centres of mass [N, T, B, 3].
+        """
+        starts, speeds = self._packed(states)
+        shape = (len(starts), len(times))
+        positions, rates = np.empty((*shape, self.model.nq)), np.empty((*shape, self.model.nv))
+        rest, failed = np.empty(shape), np.zeros(len(starts), bool)
+        for n, (start, speed) in enumerate(zip(starts, speeds, strict=True)):
+            if materials:
+                self.touch(materials[n])
+            self._reset(start, speed)
+            for row, time in enumerate(times.tolist()):
+                self.advance(time)
+                positions[n, row], rates[n, row], rest[n, row] = self.data.qpos, self.data.qvel, time - self.data.time
+            failed[n] = self.failed
+        quats, places = _moved(self._unpacked(positions, rates), rest[..., None, None])
+        places[failed], quats[failed] = np.nan, np.nan
         return quats, places
 
     def contacts(self) -> dict[tuple[int, int], float]:
         """Normal forces that push now, by the two bodies, -1 for the plane."""
+        present = self.data.contact
+        pushing = np.flatnonzero(present.efc_address >= 0)
+        forces = self.data.efc_force[present.efc_address[pushing]]  # of an elliptic cone, the first is normal
+        pairs = np.sort(self._numbers[present.geom[pushing]], axis=1)
         found: dict[tuple[int, int], float] = {}
-        force = np.zeros(6)
-        for k in range(self.data.ncon):
-            self.mujoco.mj_contactForce(self.model, self.data, k, force)
-            if force[0] > 0:
-                pair = self._pair(self.data.contact[k])
-                found[pair] = found.get(pair, 0.0) + float(force[0])
+        for (first, second), force in zip(pairs.tolist(), forces.tolist(), strict=True):
+            if force > 0:
+                found[first, second] = found.get((first, second), 0.0) + force
         return found
 
     def deepest(self, state: State) -> dict[tuple[int, int], float]:
@@ -166,9 +227,7 @@ class Simulation:
         return found
 
     def _pair(self, contact: Any) -> tuple[int, int]:
-        first, second = sorted(
-            int(np.flatnonzero(self._geoms == g)[0]) if g in self._geoms else -1 for g in contact.geom
-        )
+        first, second = sorted(self._numbers[contact.geom].tolist())
         return first, second
 
 
