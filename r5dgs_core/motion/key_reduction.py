@@ -28,6 +28,7 @@ _PER_FRAME = 4  # candidate key times
 _STEPS_PER_SAMPLE, _STEPS_PER_INTERVAL = 4, 16  # integration steps
 _ENOUGH_STEPS = 1 << 16  # cap on the minimum number of integration steps
 _ONE_BY_ONE = 256  # keys found one by one; the rest is split into stripes that are searched together
+_STEEPEST = 1e140  # limit of slopes in checks; squares of larger ones overflow, and such a curve fails anyway
 _PER_STRIPE = 32  # keys per stripe; each stripe adds at most one
 
 Samples = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -189,6 +190,7 @@ class _Curve:
 
     def __init__(self, times: np.ndarray, values: np.ndarray, slopes: np.ndarray, radius: float | None):
         self.times, self.values, self.slopes, self.radius = times, values, slopes, radius
+        self._bounded_slopes = np.clip(slopes, -_STEEPEST, _STEEPEST)
         self.tolerance, self.constant = 0.0, False
         self.change = float(self.error(self.values[:1], self.values).max())
 
@@ -213,7 +215,7 @@ class _Curve:
 
     def turn(self, duration: float) -> float:
         """Upper bound of the rotation angle within a duration, from the sampled rates; rad."""
-        return 2.0 * duration * float(np.linalg.norm(self.slopes, axis=-1).max())
+        return 2.0 * duration * float(np.linalg.norm(self._bounded_slopes, axis=-1).max())
 
     def steps_within_tolerance(self, possible: np.ndarray) -> bool:
         """Return True if every single interval between candidate key times is within the tolerance."""
@@ -224,7 +226,8 @@ class _Curve:
         h = (self.times[stop] - self.times[start])[:, None, None]
         u = (self.times[inside] - self.times[start][:, None])[..., None] / h
         left, right = self.values[start][:, None], self.values[stop][:, None]
-        cubic = cubic_curves.hermite(left, right, self.slopes[start][:, None], self.slopes[stop][:, None], h, u)
+        left_slopes, right_slopes = self._bounded_slopes[start][:, None], self._bounded_slopes[stop][:, None]
+        cubic = cubic_curves.hermite(left, right, left_slopes, right_slopes, h, u)
         good = np.all(self.error(cubic, self.values[inside]) <= self.tolerance, axis=-1)
         if self.radius is not None:
             good &= (self.values[start] * self.values[stop]).sum(-1) >= math.cos(0.5 * MAX_STEP_RAD)

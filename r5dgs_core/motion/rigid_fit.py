@@ -13,6 +13,7 @@ from . import robust_weights, rotations
 
 UNDETERMINED_RAD = 0.1
 ALIASED_RAD = np.radians(120.0)
+_LEAST_INERTIA = 1e-300  # over the variance of the residuals; the quotient of a smaller one overflows
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,8 @@ def _uncertainty(
     sigma2 = float(np.sum(relative * residuals**2)) / dof
     values, vectors = np.linalg.eigh(inertia)
     floor = 1e-12 * max(float(values[-1]), 1e-300)
-    variances = np.where(values > floor, sigma2 / np.maximum(values, floor), np.pi**2)
+    known = (values > floor) & (values > _LEAST_INERTIA * sigma2)
+    variances = np.where(known, sigma2 / np.where(known, values, 1.0), np.pi**2)
     spread = float(np.abs(offsets).max()) if len(offsets) else 0.0
     free = (values <= floor) | (variances > UNDETERMINED_RAD**2)
     if spread <= 1e-300 or size <= 1e-300 or free.sum() > 1:

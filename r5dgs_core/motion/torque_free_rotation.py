@@ -22,6 +22,7 @@ LINE = 1e-3  # minimum ratio of the smallest to the largest moment; collinear bo
 _GAP = 1e-9  # minimum relative gap between moments; Euler's solution divides by their differences
 _SAMPLES = 256  # per period; the Fourier series converges like exp(-n), more slowly near a separatrix
 _TINY = 1e-300
+_FASTEST = 1e150  # rad per unit of time
 _MIN_M1 = 1e-20  # keeps spins off the separatrix, where the period is infinite
 
 
@@ -92,7 +93,7 @@ class Tops:
         self._from_start = self._path.axes @ np.swapaxes(frames[:, 0], -1, -2)
 
     def turns(self, tau: float) -> np.ndarray:
-        """Rotations since tau = 0, as from the function `turns`. [K, 4]"""
+        """Rotations since tau = 0, as from `rotations_and_spins`. [K, 4]"""
         frames, _ = self._path.at(np.array([tau], np.float64))
         quats = rotations.rotmats_to_quats(self._from_start @ frames[:, 0] @ np.swapaxes(self._path.axes, -1, -2))
         return np.where((self._still | (tau == 0))[:, None], rotations.identity(), quats)
@@ -178,7 +179,8 @@ def _solve(body: np.ndarray, w: np.ndarray) -> _Path:
     values = values / values[2]
     middle = max(values[1], values[0] + _GAP)
     values = np.array([values[0], middle, max(values[2], middle + _GAP)])
-    spins = w @ vectors
+    # The squares of faster spins overflow, so their poses are NaN.
+    spins = np.where((np.abs(w) < _FASTEST).all(-1)[..., None], w, np.nan) @ vectors
     # L^2 - 2E I2. If negative, the spin circles the axis of the smallest moment, which becomes the third.
     circling = (values * spins**2 * (values - values[1])).sum(-1)
     flip = (circling < 0)[..., None]

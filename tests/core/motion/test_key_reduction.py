@@ -319,6 +319,7 @@ def work(monkeypatch, model, span, frame, most=key_reduction.MAX_INTERVALS):
     return curves, counts
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("frames", [1, 100, 10_000])
 @pytest.mark.parametrize("name", WILD)
 def test_the_work_for_keys_is_bounded_by_the_number_of_frames(monkeypatch, name, frames):
@@ -327,6 +328,7 @@ def test_the_work_for_keys_is_bounded_by_the_number_of_frames(monkeypatch, name,
     assert counts["steps"] <= 8 * 16 * 1024
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("frame", [1e-6, 1e-3, 1e3, 1e6])
 def test_the_work_for_keys_is_bounded_whatever_the_pace_of_frames(monkeypatch, frame):
     for model in WILD.values():

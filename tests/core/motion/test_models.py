@@ -169,6 +169,7 @@ def test_single_precision_keeps_distances_relative_to_the_pivot(name):
     np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("kind", [kind for kind in models.KINDS if kind != "static"])
 def test_overflow_is_finite_or_logged(kind, caplog):
     inertia = np.diag([1.0, 2.0, 2.5]) if models.KINDS[kind].needs_inertia else None

@@ -75,6 +75,7 @@ def test_a_thin_rod_in_noise_counts_as_a_line():
     assert len(fit.undetermined_axes) == 0
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 60])
 @pytest.mark.parametrize("flatten", [(1, 1, 1), (1, 1, 0), (1, 0.1, 0.1), (1, 0.01, 0.01), (1, 0, 0), (0, 0, 0)])
 def test_no_fit_mirrors_a_cloud_or_is_meaningless(count, flatten):
