@@ -57,6 +57,15 @@ def test_folders_and_selections_that_do_not_suit_give_one_error_and_no_file(scen
         player.put_splat_transform_on_path(monkeypatch)
     if (reason := found.why_unavailable()) is not None:
         pytest.skip(reason)
+    check_folders_and_selections(found, scene, tmp_path)
+
+
+def test_the_format_of_the_developers_page_refuses_unsuitable_folders_and_selections(scene, tmp_path, monkeypatch):
+    added = pages.load("Export format", "r5dgs_core.formats.csv_points", monkeypatch)
+    check_folders_and_selections(added.FORMAT, scene, tmp_path)
+
+
+def check_folders_and_selections(found, scene, tmp_path):
     missing = tmp_path / "missing" / f"a{found.suffix}"
     with pytest.raises(errors.SceneFileError, match="cannot be written|expected an existing folder"):
         list(found.write(scene, missing, registry.Options((0.3,))))
@@ -65,7 +74,7 @@ def test_folders_and_selections_that_do_not_suit_give_one_error_and_no_file(scen
         gone = dataclasses.replace(item, count=0)
         lost = dataclasses.replace(scene, objects=tuple(gone if one is item else one for one in scene.objects))
         for given, ids in ((scene, {77}), (lost, {2})):
-            if name not in POSES or ids == {77}:
+            if found.name not in POSES or ids == {77}:
                 with pytest.raises(errors.ConfigError, match="found none in the select"):
                     list(
                         found.write(
