@@ -20,8 +20,8 @@ from .world import Body, Edge, Plane
 
 _TIMES = 16  # at which a path is tested
 _UNDER = 0.4  # horizontal distance in sizes up to which a surface carries a body
-_DEEP = 0.3  # depth below a plane, in sizes, of what is not the plane
-_LAYER = 0.1  # distance from a plane, in sizes, of what is
+_DEEP = 0.3  # points farther below a plane, in sizes, show that it is empty above them
+_LAYER = 0.1  # points nearer to a plane, in sizes, are part of it
 _CELL = 0.15  # edge length of a cell, in sizes
 _REACH = 12.0  # distance up to which a support is searched, in sizes
 _HOLES = 0.15  # share of empty cells above which a support is not convex
@@ -53,7 +53,7 @@ def first(scene: Scene, bodies: list[SceneBody], numbers: list[int], end: float,
         path = scene_bodies.predicted(body, np.linspace(0, max(end - scene.t_max, 0.0), _TIMES))[1]
         size = body.solid.size
         carried = [ground.carries(place, size) for place in path]
-        if not carried[0] or all(carried):  # no picture has to be drawn
+        if not carried[0] or all(carried):  # decided without drawing pictures
             continue
         plane = _plane(scene, body, up)
         if plane is None or not held_out.in_contact(scene, body, plane):
@@ -83,8 +83,8 @@ class _Ground:
     Attributes:
         up: Unit vector against gravity. [3]
         means: Their centres. [N, 3]
-        upwards: Deviations along the up axis. [N]
-        largest: Largest deviations along their own axes. [N]
+        upwards: Standard deviations along the up axis. [N]
+        largest: Standard deviations along their longest axes. [N]
     """
 
     up: np.ndarray
@@ -94,7 +94,7 @@ class _Ground:
 
     @classmethod
     def of(cls, scene: Scene, up: np.ndarray) -> _Ground:
-        """Return those of a scene."""
+        """Return the opaque, resting Gaussians of the background of a scene."""
         found = scene.gaussians
         rows = (found.object_ids == 0) & (found.motion_ids == 0) & (splats.to_opacities(found.opacity_logits) > _SEEN)
         axes = (
@@ -104,7 +104,7 @@ class _Ground:
         return cls(up, found.means[rows], lengths @ np.abs(up), lengths.max(axis=1))
 
     def carries(self, place: np.ndarray, size: float) -> bool:
-        """Return True if some Gaussians are under a body of a size at a place. [3]"""
+        """Return True if a Gaussian is under a body of the given size with its centre at a place [3]."""
         apart = place - self.means
         heights = apart @ self.up
         across = np.linalg.norm(apart - heights[:, None] * self.up, axis=-1)
@@ -112,7 +112,7 @@ class _Ground:
 
 
 def _find(scene: Scene, plane: Plane, path: np.ndarray, size: float) -> Edge | None:
-    """Edge of the convex part of a plane on which a path begins, if the path leaves it where the plane is empty."""
+    """Edge of the convex part of a plane on which a path begins; None unless the path leads to an empty part of it."""
     normal = plane.normal
     flat = np.linalg.svd(normal[None])[2][1:].T  # world to coordinates in the plane
     surface, origins = support.surface(scene)

@@ -10,17 +10,17 @@ from ..motion import rotations
 from .identify import PARAMETERS, Estimate, Fitter
 from .world import Material, State
 
-WIDENED = 2.0  # factor on the standard deviations of a fit to poses, read off tosses of a cube
+WIDENED = 2.0  # factor on standard deviations of a fit to poses, calibrated on tosses of a cube
 _FACE = np.pi / 4  # angle to the most central future beyond which a body lies on another face
 
 
 @dataclass(frozen=True)
 class Futures:
-    """Sampled poses of one body.
+    """Sampled poses of one body, N at each time.
 
     Attributes:
-        times: [T]
-        quats: [T, N, 4]
+        times: Times since t_max. [T]
+        quats: Unit wxyz, relative to the bind state. [T, N, 4]
         places: Centres of mass. [T, N, 3]
     """
 
@@ -29,11 +29,11 @@ class Futures:
     places: np.ndarray
 
     def radii(self, center: np.ndarray, level: float) -> np.ndarray:
-        """Distance from given places [T, 3] within which a share ``level`` of the samples lies. [T]"""
+        """Distances from places [T, 3] within which the share ``level`` of the samples lies. [T]"""
         return np.quantile(np.linalg.norm(self.places - center[:, None], axis=-1), level, axis=1)
 
     def angles(self, quats: np.ndarray, level: float) -> np.ndarray:
-        """The same of rotations [T, 4], rad. [T]"""
+        """Angles to rotations [T, 4] within which the share ``level`` of the samples lies, rad. [T]"""
         return np.quantile(rotations.angle_between(self.quats, quats[:, None]), level, axis=1)
 
     def other_faces(self) -> float:
@@ -44,7 +44,10 @@ class Futures:
 
 
 def draw(fitter: Fitter, estimate: Estimate, rng: np.random.Generator) -> tuple[State, Material]:
-    """State and material drawn from an estimate; what poses tell counts `WIDENED` times less sure, a prior does not."""
+    """Draw a state and a material from an estimate.
+
+    Standard deviations that come from poses are multiplied by `WIDENED`, those of a prior are not.
+    """
     assumed = np.diag(estimate.assumed)
     told = np.linalg.inv(estimate.covariance) - assumed
     x = np.linalg.cholesky(np.linalg.inv(told / WIDENED**2 + assumed)) @ rng.normal(size=PARAMETERS)

@@ -1,6 +1,6 @@
-"""Bodies in contact whose observed motion no smooth law explains: a test by their last poses, which a fit did not see.
+"""Test of contacts by held-out poses, for bodies whose observed motion no smooth law explains.
 
-A body that a hand drives over a table also has such a motion. Contacts are believed only if, fitted to the poses before
+A body that a hand moves over a table also has such a motion. Contacts are accepted only if, fitted to the poses before
 the last ones, they predict these better than the best smooth law does.
 """
 
@@ -31,8 +31,8 @@ class Comparison:
     """Root mean square residuals of held-out poses, in units of the noise.
 
     Attributes:
-        smooth: Of the best smooth law.
-        contact: Of a simulation with contacts.
+        smooth: Residual of the best smooth law.
+        contact: Residual of a simulation with contacts.
     """
 
     smooth: float
@@ -51,7 +51,8 @@ class Comparison:
     def text(self) -> str:
         """Residuals in words."""
         return (
-            f"held-out poses are predicted to {self.contact:.2g} times their noise, without contacts {self.smooth:.2g}"
+            f"held-out poses are predicted with errors of {self.contact:.2g} times their noise, without contacts "
+            f"{self.smooth:.2g} times"
         )
 
 

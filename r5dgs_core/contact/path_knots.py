@@ -1,7 +1,7 @@
 """Few knots that reproduce the recorded path of a body: the model of its motion past t_max.
 
 A bounce that is much shorter than the flights around it becomes one knot with two velocities. Between bounces, knots
-are as far apart as the tolerance allows, found by galloping and bisection.
+are as far apart as the tolerance allows; a galloping search and bisection find them.
 """
 
 from __future__ import annotations

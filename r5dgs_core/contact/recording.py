@@ -19,7 +19,7 @@ _FELT = 0.01  # change of velocity that counts as an impact, as a share of the l
 
 @dataclass(frozen=True)
 class Touch:
-    """Begin of a contact.
+    """Start of a contact.
 
     Attributes:
         time: Time since the start.
@@ -43,7 +43,7 @@ class Recording:
         spins: Angular velocities, world frame. [N, B, 3]
         velocities: Of the centres of mass. [N, B, 3]
         touching: True while a body is pushed. [N, B]
-        touches: Begins of contacts, in order.
+        touches: Starts of contacts, in order.
         rests: True if all bodies have rested for a while at the end.
         slow: True for bodies that hardly move at the end. [B]
         frequency: Angular frequency of the contacts.

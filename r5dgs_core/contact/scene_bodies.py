@@ -130,7 +130,7 @@ def _reason(scene: Scene, body: SceneBody) -> str:
         return f"its motion is that of a driven body ({models.KINDS[model.kind].word})"
     free = ("translation", "ballistic_spin", "free_top")
     if model.kind in free and model.acceleration.any() and up is not None and not gravity.falls(model, up):
-        return "it accelerates otherwise than by gravity"
+        return "its acceleration is not that of gravity"
     if not len(track(scene, body)):
         return "it was not seen since it set off"
     return ""

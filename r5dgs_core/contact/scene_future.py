@@ -35,9 +35,9 @@ class Prediction:
     Attributes:
         groups: The scene's groups, those of bodies in contact with new motions.
         penetrations: Penetration of the smooth motion, in sizes, of each body that would pass through something.
-        taken: Names of the bodies that got a motion with contacts, with their material in words.
-        compared: Test by held-out poses of those among them that were in doubt.
-        lines: Reasons why others did not, one sentence each.
+        taken: Material in words of each body that got a motion with contacts, by name.
+        compared: Test by held-out poses of those of them that needed one, by name.
+        lines: Reasons for which other bodies keep their smooth motions, a sentence each.
         world: The simulated bodies.
         materials: Their materials.
         recording: The most likely future.
@@ -79,7 +79,7 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     pushed = {number for number, body in enumerate(bodies) if body.group.id in wishes.pushes}
     doubtful = _doubtful(scene, bodies, passing, end, up) - pushed
     driven = [n for n in passing if bodies[n].reason and n not in pushed | doubtful]
-    lines += [f"{bodies[n].name}: moves on without contacts: {bodies[n].reason}" for n in driven]
+    lines += [f"{bodies[n].name}: keeps its smooth motion: {bodies[n].reason}" for n in driven]
     tried = (set(passing) - set(driven)) | pushed | doubtful
     free = [n for n, body in enumerate(bodies) if n not in tried and _is_free(scene, body)]
     leave = None if up is None else edges.first(scene, bodies, free, end, up)
@@ -122,7 +122,7 @@ def _simulated(
         return Prediction(scene.groups, depths, {}, (*lines, "no contacts are predicted: the simulation failed"))
     changed = _changed(made, found, {n for n, b in enumerate(made.bodies) if b.group.id in wishes.pushes})
     untouched = set(made.fits) - changed
-    lines += [f"{made.bodies[n].name}: touches nothing when it is simulated" for n in sorted(untouched)]
+    lines += [f"{made.bodies[n].name}: touches nothing in the simulation" for n in sorted(untouched)]
     times = np.linspace(0, duration, KNOTS)
     sampled = made.sample(scene.t_max, times, materials, wishes) if changed else {}
     groups = list(scene.groups)
@@ -206,11 +206,11 @@ def _passing(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray |
 def _doubtful(
     scene: Scene, bodies: list[SceneBody], passing: Mapping[int, float], end: float, up: np.ndarray | None
 ) -> set[int]:
-    """Numbers of bodies in contact that held-out poses decide about, because their need for contacts is not sure.
+    """Numbers of bodies that get contacts only if held-out poses support them.
 
-    No smooth law explains the last poses of some, also if they pass through something by the law of a driven body: a
-    law that fits nothing proves no hand or motor. Others pass through something by such a law, but contacts may explain
-    the same poses.
+    All of them are close to the plane. Of some, no smooth law explains the last poses; a law of a driven body that does
+    not fit is no evidence of a hand or a motor. The others pass through something by the law of a driven body, but
+    contacts may explain their poses, too.
     """
     asked = [n for n, body in enumerate(bodies) if n not in passing or body.reason]
     tested = [n for n in asked if held_out.is_possible(scene, bodies[n])]
@@ -237,7 +237,7 @@ def _sinks(scene: Scene, body: SceneBody, path: se3.Pose, up: np.ndarray) -> boo
 
 
 def _overlap(body: SceneBody, path: se3.Pose, other: SceneBody, others_path: se3.Pose) -> float:
-    """Largest increase of the overlap of two bodies since t_max: the least shift, of many, that takes them apart."""
+    """Largest increase of the overlap of two bodies since t_max: the smallest of many shifts that separate them."""
     apart = others_path[1] - path[1]
     lines = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
     turns, others_turns = rotations.quats_to_rotmats(path[0]), rotations.quats_to_rotmats(others_path[0])

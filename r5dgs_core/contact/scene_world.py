@@ -68,10 +68,10 @@ class SceneWorld:
 
     Attributes:
         bodies: The B bodies.
-        world: They, with shapes and materials, and the supporting plane.
-        fits: Fitter and result by number, of the bodies that contacts were tried for.
-        lines: Reasons why others were not fitted.
-        comparisons: Test by held-out poses of the fitted bodies in doubt, by number.
+        world: Their shapes and materials, and the supporting plane.
+        fits: Fitter and result of each body whose contacts explain its poses, by number.
+        lines: Reasons for which other bodies have none, a sentence each.
+        comparisons: Test by held-out poses of those of them that needed one, by number.
     """
 
     bodies: tuple[SceneBody, ...]
@@ -168,10 +168,10 @@ def make(
     Args:
         scene: The scene.
         bodies: Its bodies.
-        tried: Numbers of those to fit. Without a fit, they are left out, as driven bodies are.
-        pushed: Numbers of those among them that the user pushes; they are kept and not fixed.
-        doubtful: Numbers of those among them that held-out poses decide about, and True if it is enough that contacts
-            explain these; otherwise, contacts must predict them better than a smooth law.
+        tried: Numbers of the bodies to fit. They are left out if the fit fails, as driven bodies are.
+        pushed: Numbers of those of them that the user pushes; they are kept and not fixed.
+        doubtful: Those of them that need a test by held-out poses, by number: True if it is enough that contacts
+            explain these poses, False if contacts must predict them better than a smooth law.
         gravity: Acceleration of a falling body. [3]
         end: Scene time up to which to simulate.
         leave: A body that moves off its support, which then has an edge.
@@ -198,9 +198,9 @@ def make(
                 comparisons |= {} if compared is None else {len(chosen): compared}
                 shape = dataclasses.replace(shape, material=estimate.material)
             elif number in pushed:
-                lines.append(f"{body.name}: is pushed out of its smooth motion: {reason}")
+                lines.append(f"{body.name}: is pushed from the state of its smooth motion: {reason}")
             else:
-                lines.append(f"{body.name}: moves on without contacts: {reason}")
+                lines.append(f"{body.name}: keeps its smooth motion: {reason}")
                 continue
         chosen.append(body)
         own.append(shape)
@@ -238,7 +238,7 @@ def _body(scene: Scene, body: SceneBody, below: Plane | None, pushed: bool, grav
 
 
 def apart(made: World) -> World:
-    """Shrink bodies that overlap in the bind state, whose penetration would become speed."""
+    """Shrink bodies that overlap in the bind state, because a simulation would push them apart at speed."""
     runs = Simulation(made, Stepping(100.0, 1e-3))
     for _ in range(_ROUNDS):
         deep = {pair: depth for pair, depth in runs.deepest(world.at_rest(made)).items() if min(pair) >= 0}

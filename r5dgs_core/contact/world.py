@@ -15,7 +15,7 @@ _FULL = 0.8  # volume of a ball's hull over that of the ball through its vertice
 
 @dataclass(frozen=True)
 class Material:
-    """Contact parameters of a body. Of two bodies in contact, the rougher and the less elastic one count.
+    """Contact parameters of a body. A contact has the larger friction and the smaller restitution of its two bodies.
 
     Attributes:
         friction: Coulomb coefficient, >= 0.

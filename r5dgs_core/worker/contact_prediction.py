@@ -61,6 +61,6 @@ def _up(scene: Scene) -> np.ndarray:
     up = world_axes.UP_AXIS.get(scene.world_convention)
     if up is None:
         raise errors.ConfigError(
-            f"{scene.name}: its axes do not define up; switch the own gravity of the panel Contact off"
+            f"{scene.name}: its axes do not define up; clear the checkbox of Gravity in the panel Contact"
         )
     return up

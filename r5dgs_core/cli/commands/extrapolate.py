@@ -174,7 +174,7 @@ def _simulated(scene: Scene, words: str, option: str) -> list[int]:
     usable = {body.group.id for body in bodies} & set(_groups(scene, words, option))
     missing = export.object_ids(scene, words, option) - {scene.groups[number].object_id for number in usable}
     for name in (item.name for item in scene.objects if item.id in missing):
-        reason = next((line for line in lines if line.startswith(f"{name}: ")), f"{name}: has no hull that can move")
+        reason = next((line for line in lines if line.startswith(f"{name}: ")), f"{name}: has no hull to simulate")
         raise errors.ConfigError(f"{option} {words!r}: {reason}; remedy: name other objects")
     return sorted(usable)
 

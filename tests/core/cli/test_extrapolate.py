@@ -78,7 +78,7 @@ def test_objects_that_cannot_be_simulated_are_named(tmp_path):
     path = scene_file.write(dataclasses.replace(made, hulls=(flat,)), tmp_path / "scene.r5dgs")
     for given, message in [
         ({"push": [("box 1", "1,0,0")]}, "--push 'box 1': box 1: has no contacts: the points of a hull lie in a plane"),
-        ({"friction": ["box 2=0.1"]}, "--friction 'box 2': box 2: has no hull that can move"),
+        ({"friction": ["box 2=0.1"]}, "--friction 'box 2': box 2: has no hull to simulate"),
     ]:
         with pytest.raises(errors.ConfigError, match=message):
             extrapolate.run_extrapolate(path, path.with_name("never.r5dgs"), **given)

@@ -33,7 +33,7 @@ def test_a_body_that_was_not_seen_since_it_set_off_moves_on_with_the_reason():
     past = dataclasses.replace(history.EMPTY, events=(history.Event(scene.t_max, "change", 0.0),))
     groups = (scene.groups[0], dataclasses.replace(scene.groups[1], history=past))
     found = scene_future.predict(dataclasses.replace(scene, groups=groups), Wishes(samples=1))
-    assert found.lines == ("box 1: moves on without contacts: it was not seen since it set off",)
+    assert found.lines == ("box 1: keeps its smooth motion: it was not seen since it set off",)
     assert found.penetrations["box 1"] > 1 and not found.taken
 
 

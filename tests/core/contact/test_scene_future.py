@@ -92,11 +92,11 @@ def test_the_band_of_a_body_that_is_only_hit_includes_that_of_its_smooth_motion(
         ([contact_scenes.resting()], ""),
         (
             [(MotionModel("constant_twist", velocity=[0, 0, -2], angular_velocity=[0, 0, 1]), np.array([0, 0, 0.6]))],
-            "box 1: moves on without contacts: its motion is that of a driven body (screw)",
+            "box 1: keeps its smooth motion: its motion is that of a driven body (screw)",
         ),
         (
             [(MotionModel("translation", velocity=[0, 0, -2], acceleration=[9, 0, 0]), np.array([0, 0, 0.6]))],
-            "box 1: moves on without contacts: it accelerates otherwise than by gravity",
+            "box 1: keeps its smooth motion: its acceleration is not that of gravity",
         ),
         (
             [(MotionModel("translation", velocity=[0, 0, -2.0]), np.array([0, 0, 0.6]))],
@@ -133,7 +133,7 @@ def test_a_body_whose_poses_contacts_do_not_explain_moves_on_and_nothing_hits_it
     monkeypatch.setattr(scene_world, "_fit", unsound)
     made = contact_scenes.scene(contact_scenes.sliding(1.5), contact_scenes.sliding(-0.5, 0.8))
     found = scene_future.predict(contact_scenes.with_units(made), Wishes(samples=1))
-    assert "box 2: moves on without contacts: contacts do not explain its poses" in found.lines
+    assert "box 2: keeps its smooth motion: contacts do not explain its poses" in found.lines
     assert found.groups[2] is made.groups[2] and "box 2" not in found.taken
 
 
