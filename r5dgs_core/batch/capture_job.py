@@ -93,8 +93,8 @@ class CaptureJob:
 
     def _command(self, *arguments: str) -> None:
         threads = () if self.threads is None else ("--threads", str(self.threads))
-        ended = process.train([*arguments, *threads], self.path(".log"), lambda event: None, lambda ended: None)
-        if ended.status == process.STOPPED:  # from outside: the job has no result, and is executed again
+        ended = process.run([*arguments, *threads], self.path(".log"), lambda event: None, lambda ended: None)
+        if ended.status == process.STOPPED:  # stopped from outside: without a result, the job is repeated
             raise SystemExit(process.STOPPED)
         if ended.status != 0:
             raise TrainingError(f"r5dgs {arguments[0]}: {process.reason(ended)}")

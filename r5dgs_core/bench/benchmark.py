@@ -119,12 +119,12 @@ def _train(plan: BenchmarkRequest, case: Case, progress: Progress) -> None:
     cases.write_record(case, {"sittings": [*before, {"status": None}]})
     log_path = case.beside(".log")
 
-    def note(sitting: process.TrainingProcess) -> None:
+    def note(sitting: process.EndedProcess) -> None:
         values = {key: getattr(sitting, key) for key in ("status", *cases.COSTS)}
         cases.write_record(case, {"sittings": [*before, values]})
 
     try:
-        sitting = process.train(arguments, log_path, progress, note)
+        sitting = process.run(arguments, log_path, progress, note)
     except OSError as error:
         raise CheckpointError(f"{log_path}: training cannot be started or followed: {error}") from error
     if sitting.status == process.STOPPED:

@@ -1,4 +1,4 @@
-"""Training in a separate process, so that its processor time and memory can be measured."""
+"""Commands of ``r5dgs`` in separate processes, so that their processor time and memory can be measured."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ STOPPED = 130
 
 
 @dataclass(frozen=True)
-class TrainingProcess:
-    """One training process.
+class EndedProcess:
+    """Status and cost of a process that has ended.
 
     Attributes:
         status: Exit status; negative for the signal that ended it.
@@ -48,12 +48,12 @@ class TrainingProcess:
     peak_gpu_mb: float | None
 
 
-def train(
+def run(
     arguments: Sequence[str],
     log_path: Path,
     progress: Callable[[dict[str, Any]], None],
-    ended: Callable[[TrainingProcess], None],
-) -> TrainingProcess:
+    ended: Callable[[EndedProcess], None],
+) -> EndedProcess:
     """Run ``r5dgs ARGUMENTS --progress json`` in a separate process and wait for it.
 
     On an exception, such as KeyboardInterrupt, the process gets SIGTERM, saves its state and ends; the exception is
@@ -92,10 +92,10 @@ def train(
         peaks = next((event for event in map(_event, process.stdout) if event.get("event") == "peak"), peaks)
         raise
     finally:
-        sitting = _end(process, began, log_path, start, peaks)
+        result = _end(process, began, log_path, start, peaks)
         process.stdout.close()
-        ended(sitting)
-    return sitting
+        ended(result)
+    return result
 
 
 def print_peak() -> None:
@@ -129,7 +129,7 @@ def _event(line: str) -> dict[str, Any]:
 
 def _end(
     process: subprocess.Popen[str], began: float, log_path: Path, start: int, peaks: dict[str, Any]
-) -> TrainingProcess:
+) -> EndedProcess:
     """Wait for the process and return its status and cost."""
     cpu = None
     if hasattr(os, "wait4"):
@@ -142,7 +142,7 @@ def _end(
         log.seek(start)
         lines = log.read().decode(errors="replace").split("\n")
     complaint = next((line.strip() for line in reversed(lines) if line.strip()), "")
-    return TrainingProcess(
+    return EndedProcess(
         status=process.returncode,
         complaint=complaint.removeprefix("r5dgs: "),
         cpu_seconds=None if cpu is None else round(cpu, 3),
@@ -152,10 +152,10 @@ def _end(
     )
 
 
-def reason(sitting: TrainingProcess) -> str:
+def reason(result: EndedProcess) -> str:
     """Return the reason why a process failed, in one line."""
-    if sitting.status < 0:
-        name = signal.Signals(-sitting.status).name
+    if result.status < 0:
+        name = signal.Signals(-result.status).name
         hint = "; possibly out of memory, which --set densify.max_gaussians=N limits" if name == "SIGKILL" else ""
         return f"ended by {name}{hint}"
-    return sitting.complaint or f"ended with status {sitting.status}"
+    return result.complaint or f"ended with status {result.status}"

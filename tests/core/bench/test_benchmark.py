@@ -335,7 +335,7 @@ def test_a_process_reports_its_own_memory_and_error(tmp_path):
     ballast = np.ones(2**26)  # half a GiB in this process, which must not count in the other
     log_path, ended = tmp_path / "log", []
     log_path.write_text("an earlier complaint\n")
-    sitting = process.train(["evaluate", str(tmp_path / "gone.r5dgs")], log_path, lambda event: None, ended.append)
+    sitting = process.run(["evaluate", str(tmp_path / "gone.r5dgs")], log_path, lambda event: None, ended.append)
     assert ended == [sitting] and sitting.status == exit_status.ExitStatus.ERROR
     assert "gone.r5dgs" in process.reason(sitting) and not process.reason(sitting).startswith("r5dgs:")
     assert sitting.cpu_seconds is not None and sitting.cpu_seconds > 0
@@ -347,7 +347,7 @@ def test_a_process_reports_its_own_memory_and_error(tmp_path):
     ("status", "complaint", "words"), [(-9, "", "SIGKILL"), (-11, "", "SIGSEGV"), (3, "", "status 3"), (1, "no", "no")]
 )
 def test_the_end_of_a_process_is_described(status, complaint, words):
-    assert words in process.reason(process.TrainingProcess(status, complaint, 1.0, 1.0, None, None))
+    assert words in process.reason(process.EndedProcess(status, complaint, 1.0, 1.0, None, None))
 
 
 def test_playing_draws_each_camera_in_the_order_of_time(baked, tiny, monkeypatch):
