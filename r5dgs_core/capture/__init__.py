@@ -1,1 +1,1 @@
-"""Real captures: calibrations, lenses, and what `r5dgs prepare` makes of videos."""
+"""Cameras of real captures: calibrations, lenses, undistortion, and reconstruction without a calibration."""

@@ -19,7 +19,7 @@ class Futures:
     """Sampled poses of one body, N at each time.
 
     Attributes:
-        times: Times since t_max. [T]
+        times: Times of the poses. [T]
         quats: Unit wxyz, relative to the bind state. [T, N, 4]
         places: Centres of mass. [T, N, 3]
     """

@@ -70,7 +70,7 @@ def lines(keys: Sequence[Camera], times: np.ndarray | None, fps: float | None) -
 
 
 def fitted(camera: Camera, width: int, height: int) -> Camera:
-    """Return a camera with another image size and the whole view; another aspect ratio adds to two sides."""
+    """Return a camera with another image size and the whole view; if its shape differs, two sides show more."""
     size, left, top = placement((camera.width, camera.height), (width, height))
     return axes.crop(axes.resize(camera, *size), -left, -top, width, height)
 

@@ -1,1 +1,1 @@
-"""File formats of other programs: PLY, SPZ, SOG, glTF, 4dgs, OpenUSD, HTML, poses, camera files, PNG and OpenEXR."""
+"""File formats of other programs: Gaussians, scenes with motion, poses, bodies for simulators, cameras and images."""

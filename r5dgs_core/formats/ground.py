@@ -1,7 +1,7 @@
 """Horizontal plane under the objects of a scene, for files of simulators.
 
-A scene file holds no ground. The plane is at the lowest point of the hulls that rest now or at the end of a motion with
-contacts, and not above any observed place of a hull, so that no body starts inside it. It has no edges.
+A scene file holds no ground. The plane is at the lowest point of the hulls that rest at t_max or at the end of a motion
+with contacts, and not above any observed place of a hull, so that no body starts inside it. It has no edges.
 """
 
 from __future__ import annotations

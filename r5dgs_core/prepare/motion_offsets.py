@@ -21,11 +21,11 @@ from .motion_tracks import MotionTrack
 
 SEARCH_S = 5.0  # largest offset
 FINE = 0.02  # step of the second scan, frame intervals
-_ROUNDS = 12  # of the minimisation
-BLOCKS = 8  # of time, for the uncertainty
+_ROUNDS = 12  # of the minimisation, over all cameras
+BLOCKS = 8  # parts of the time, whose differences give the uncertainty
 SCALE_PX = 4.0  # distance at which the loss bends, pixels of the full image
 BIAS_PX = 8.0  # largest constant distance that is taken as an error of the calibration
-LEAST_TIMES = 12
+LEAST_TIMES = 12  # fewest times at which a camera sees an object
 DISTINCT = 2.0  # least loss one interval from a usable offset, relative to that at the offset
 COVERED = 0.5  # least share of the times that must be compared at a trial offset
 GAP = 1.6  # longest step that is interpolated, frame intervals

@@ -18,9 +18,9 @@ MOST_FRAMES = 600  # per camera, consecutive; bounds memory
 BACKGROUND_FRAMES = 41
 LEAST_PATH = 2.0  # least extent of the path of an object, px
 LEAST_PIXELS = 20  # of an object's mask
-_NOISE = 12  # least difference from the background, of 255
-_AREA = 0.0008  # least share of the frame
-_SHARE = 0.5  # largest share of the frame
+_NOISE = 12  # least difference of a moving pixel from the background, of 255
+_AREA = 0.0008  # least size of a moving region, as a share of the frame
+_SHARE = 0.5  # largest size of a moving region, as a share of the frame
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Request for the motion of a scene's bodies with contacts, one class for Blender and the worker."""
+"""Request for predicted motions with contacts, one class for Blender and the worker."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class ContactRequest:
     Attributes:
         scene: Path of the file.
         until: Scene time up to which contacts are searched.
-        frictions: Coulomb friction by motion group; the fitted one for others.
-        restitutions: Likewise.
-        masses: Factors of the mass, likewise; the mass of others is proportional to their volume.
+        frictions: Coulomb friction by motion group. Other groups keep the fitted one.
+        restitutions: Coefficients of restitution by motion group, likewise.
+        masses: Factors of the mass by motion group; without one, the mass is proportional to the volume.
         gravity: Downward acceleration along the up axis of the world, scene units; None for that of the scene.
         obstacles: Corners of fixed convex bodies by name, world of the scene. [V, 3] each
     """

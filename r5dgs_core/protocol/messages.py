@@ -1,6 +1,6 @@
 """Render requests, one class for both ends: Blender writes them by `to_json`, the worker reads them by `from_json`.
 
-Other requests have one or two fields each and are read by `fields` directly.
+`contacts` has the class of contact requests. The worker reads the fields of all other requests by `fields`.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ class RenderRequest:
 
         Args:
             request: The request.
-            numbers: Scene number of each loaded path; scene indices of the request refer to paths, those of the result
-            to loaded scenes.
+            numbers: Scene number of each loaded path. Scene indices of the request refer to paths, those of the result
+                to loaded scenes.
 
         Raises:
             ConfigError: A field is invalid; the message names it.

@@ -1,1 +1,1 @@
-"""Surfaces of Gaussians: convex hulls of objects, and visible surfaces from depth pictures."""
+"""Shapes of objects: convex hulls with their mass properties, and visible surfaces from depth pictures."""

@@ -27,7 +27,7 @@ def of(scene: Scene) -> tuple[Hull, ...]:
 def bodies(scene: Scene) -> set[tuple[int, int]]:
     """Return the pairs of object and motion group that are solid bodies.
 
-    These are the motions of an object's own, without shadows and without Gaussians that move with another object. The
+    These are the groups of the object itself, not shadows or Gaussians that move with another object. The
     resting Gaussians of an object count only if none of its Gaussians move.
     """
     found = set()

@@ -15,7 +15,7 @@ from .pictures import Album
 
 COMMON = 0.02  # least share of a camera's view that another camera sees
 SMALL_DEG = 5.0  # angle between the outermost cameras below which a rig is too narrow
-MOST_CAMERAS = 40  # compared cameras; more are thinned evenly
+MOST_CAMERAS = 40  # number of compared cameras; of more, an even selection
 _DEPTHS = np.geomspace(0.2, 3.0, 12)  # of the compared points, in distances to the middle
 _GRID = 7
 
