@@ -9,7 +9,7 @@ from ..r5dgs_addon.ui import stepwise_operator
 
 
 class R5DGS_OT_export_masks(stepwise_operator.Stepwise, polls.NeedsCamera, bpy.types.Operator):
-    """Save the object that each pixel of the active camera shows to image files, rendered by the worker"""
+    """Save masks of the objects that the active camera sees; the worker renders them"""
 
     bl_idname = "r5dgs.export_masks"
     bl_label = "Export Object Masks"

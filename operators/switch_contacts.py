@@ -8,7 +8,7 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_switch_contacts(polls.NeedsScene, bpy.types.Operator):
-    """Switch contacts off: objects pass through each other along their smooth motions; on restores the former keys"""
+    """Switch contacts off, so that objects follow their smooth motions, or on again, which restores the former keys"""
 
     bl_idname = "r5dgs.switch_contacts"
     bl_label = "Contacts"

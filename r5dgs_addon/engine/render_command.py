@@ -59,7 +59,7 @@ def parse_frames(text: str) -> list[int]:
 
 
 def render(scene: bpy.types.Scene, frames: Sequence[int]) -> tuple[int, int]:
-    """Render the missing frames. Prints a line per frame, in the words of Blender, which render farms read.
+    """Render the missing frames. Prints a line per frame as Blender does, because render farms parse it.
 
     Returns:
         The numbers of frames that this process rendered, and of those that existed or that others rendered.

@@ -1,7 +1,7 @@
 """Contacts of predicted motions: their prediction by the worker, and switching them off and on.
 
-Off, the anchors move on along their smooth motions, and keep the keys and motion with contacts as a text; see
-`stored_keys`.
+While contacts are off, anchors follow their smooth motions, and store their former keys and motions as text
+(`stored_keys`).
 """
 
 import json
@@ -45,7 +45,7 @@ def switch_off(collection: bpy.types.Collection) -> list[bpy.types.Object]:
 
 
 def switch_on(collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Restore the keys and motions before `switch_off`. Returns the anchors; raises ConfigError, with no change."""
+    """Restore what `switch_off` stored. Returns the anchors; raises ConfigError, with no change."""
     anchors = [anchor for anchor in bodies(collection) if is_off(anchor)]
     times = timeline.of_collection(collection)
     extrapolate.check(anchors)

@@ -74,8 +74,8 @@ def hand_over(context: bpy.types.Context, anchors: Sequence[bpy.types.Object], f
         The collection of the proxies.
 
     Raises:
-        ConfigError: There is nothing to hand over, or an anchor has no hull or cannot be written; nothing was changed,
-            but what is left of a hand-over whose collection was deleted is removed.
+        ConfigError: There is nothing to hand over, or an anchor has no hull or cannot be written. Nothing was changed,
+            except that the remains of a hand-over whose collection was deleted are removed.
     """
     scene = context.scene
     if proxies_of(scene) is not None:

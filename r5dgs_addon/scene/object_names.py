@@ -49,19 +49,19 @@ def remember(collection: bpy.types.Collection, meanings: bool) -> None:
             if known is None or state.count > known.r5dgs.count:
                 largest[state.object_id] = obj
     for object_id, cloud in largest.items():
-        bearers = [cloud, *(home for home in cloud.users_collection if home.name in collection.children)]
+        blocks = [cloud, *(home for home in cloud.users_collection if home.name in collection.children)]
         if cloud.parent is not None and cloud.parent.r5dgs.object_id == object_id:
-            bearers.append(cloud.parent)
-        for bearer in bearers:
-            bearer.r5dgs_named.object_id, bearer.r5dgs_named.given = object_id, bearer.name
+            blocks.append(cloud.parent)
+        for block in blocks:
+            block.r5dgs_named.object_id, block.r5dgs_named.given = object_id, block.name
 
 
 def names(collection: bpy.types.Collection) -> dict[int, str]:
     """Current unique name of each object of a loaded scene's table, in table order."""
     result = {entry.object_id: entry.name for entry in collection.r5dgs.table}
     renamed = {}
-    for object_id, bearers in _bearers(collection).items():
-        name = _new_name(bearers)
+    for object_id, blocks in _named_blocks(collection).items():
+        name = _new_name(blocks)
         if name and object_id in result:
             renamed[object_id] = name
     taken = {name for object_id, name in result.items() if object_id not in renamed}
@@ -77,10 +77,10 @@ def name_of(entry: bpy.types.PropertyGroup) -> str:
     home = collection.children.get(entry.name)
     cloud = home.objects.get(entry.name) if home is not None else None
     if cloud is not None:
-        bearers = [home, cloud]
+        blocks = [home, cloud]
         if cloud.parent is not None and cloud.parent.r5dgs_named.object_id == entry.object_id:
-            bearers.append(cloud.parent)
-        marks = [(bearer.name, bearer.r5dgs_named) for bearer in bearers]
+            blocks.append(cloud.parent)
+        marks = [(block.name, block.r5dgs_named) for block in blocks]
         if all(mark.object_id == entry.object_id and mark.given == name for name, mark in marks):
             return entry.name
     return names(collection).get(entry.object_id, entry.name)
@@ -138,12 +138,12 @@ def rename(collection: bpy.types.Collection, object_id: int, wanted: str) -> str
     name = fit(_unique(wanted.strip(), set(current.values())))
     former = {old, entry.name}
     entry.name = name
-    for kind, bearers in _bearers(collection).get(object_id, {}).items():
-        for bearer in [b for b in bearers if _bears_given(b)] or bearers[:1]:
-            bearer.name = fit(name + _ANCHOR if kind == "ANCHOR" else name)
-            bearer.r5dgs_named.given = bearer.name
-            if kind == "CLOUD" and bearer.data.library is None:
-                bearer.data.name = bearer.name
+    for kind, blocks in _named_blocks(collection).get(object_id, {}).items():
+        for block in [b for b in blocks if _has_given_name(b)] or blocks[:1]:
+            block.name = fit(name + _ANCHOR if kind == "ANCHOR" else name)
+            block.r5dgs_named.given = block.name
+            if kind == "CLOUD" and block.data.library is None:
+                block.data.name = block.name
     for home in collection.children_recursive:
         if not home.r5dgs_named.given and home.name in {f"{word}{OTHERS_SUFFIX}" for word in former}:
             home.name = fit(name + OTHERS_SUFFIX)
@@ -157,28 +157,28 @@ def rename(collection: bpy.types.Collection, object_id: int, wanted: str) -> str
     return name
 
 
-def _bearers(collection: bpy.types.Collection) -> dict[int, dict[str, list]]:
+def _named_blocks(collection: bpy.types.Collection) -> dict[int, dict[str, list]]:
     """Data-blocks named after each object, by kind."""
     result: dict[int, dict[str, list]] = {}
-    for bearer in (*collection.children_recursive, *collection.all_objects):
-        named = bearer.r5dgs_named
+    for block in (*collection.children_recursive, *collection.all_objects):
+        named = block.r5dgs_named
         if named.given:
-            kind = "COLLECTION" if isinstance(bearer, bpy.types.Collection) else bearer.r5dgs.role
-            result.setdefault(named.object_id, {}).setdefault(kind, []).append(bearer)
+            kind = "COLLECTION" if isinstance(block, bpy.types.Collection) else block.r5dgs.role
+            result.setdefault(named.object_id, {}).setdefault(kind, []).append(block)
     return result
 
 
-def _bears_given(bearer) -> bool:
+def _has_given_name(block) -> bool:
     """True if a data-block still has the assigned name, ignoring Blender's number suffix."""
-    name, given = bearer.name, bearer.r5dgs_named.given
+    name, given = block.name, block.r5dgs_named.given
     return name == given or _NUMBER.sub("", name) == _NUMBER.sub("", given)
 
 
-def _new_name(bearers: dict[str, list]) -> str:
+def _new_name(blocks: dict[str, list]) -> str:
     """Name assigned by the user, from the first kind without any data-block of the former name; "" if none."""
     for kind in KINDS:
-        named = bearers.get(kind, ())
-        if not named or any(_bears_given(bearer) for bearer in named):
+        named = blocks.get(kind, ())
+        if not named or any(_has_given_name(block) for block in named):
             continue
         name = named[0].name
         plain = _NUMBER.sub("", name)
@@ -197,10 +197,10 @@ def _unique(name: str, taken: set[str]) -> str:
     return result
 
 
-def _rename_part(text: str, old: str, new: str, own: bool, nobodys: bool) -> str:
+def _rename_part(text: str, old: str, new: str, own: bool, shadow: bool) -> str:
     """Rename a part such as 'mug still', 'mug shadow' or 'background with mug' after its object was renamed."""
     text = re.sub(rf"(?<= with ){re.escape(old)}(?=$|{_ANCHOR}| shadow|\.\d)", lambda _: new, text)
-    parts = [part for part, belongs in ((" still", own), (" with ", own), (" shadow", nobodys)) if belongs]
+    parts = [part for part, belongs in ((" still", own), (" with ", own), (" shadow", shadow)) if belongs]
     return re.sub(rf"^{re.escape(old)}(?={'|'.join(parts)})", lambda _: new, text) if parts else text
 
 

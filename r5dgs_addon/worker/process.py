@@ -233,14 +233,14 @@ class Worker:
         while line := stream.readline():
             header = json.loads(line)
             if "event" in header:
-                self._hear(header)
+                self._handle_event(header)
                 continue
             arrays = answers.read_arrays(stream, header)
             if arrays is None:
                 return
             self._answers.put((header, arrays))
 
-    def _hear(self, event: dict[str, Any]) -> None:
+    def _handle_event(self, event: dict[str, Any]) -> None:
         self._heard = time.monotonic()
         notice = COMPILING if event["event"] in ("compiling", "progress") else ""
         if event["event"] == "progress":

@@ -471,7 +471,7 @@ def test_compilation_extends_the_timeout_and_not_forever(blender, monkeypatch, t
         running.greet(120.0)
         running.notice, answers, late = process.COMPILING, running._answers, iter(range(5))
         if done:
-            running._hear({"event": "ready"})
+            running._handle_event({"event": "ready"})
             assert running.notice == ""
 
         def get(timeout):
