@@ -25,7 +25,7 @@ class R5DGS_OT_predict_contacts(worker_operator.WaitsForWorker, polls.NeedsScene
         if jobs.simulates() is False:
             cls.poll_message_set("The worker's Python lacks MuJoCo: pip install 'r5dgs[contact]' there")
             return False
-        return worker_operator.free(cls, KEY)
+        return worker_operator.is_free(cls, KEY)
 
     def _begin(self, context):
         collection = loaded_scenes.active_collection(context)

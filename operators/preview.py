@@ -16,7 +16,7 @@ class R5DGS_OT_preview(worker_operator.WaitsForWorker, polls.NeedsCamera, bpy.ty
 
     @classmethod
     def poll(cls, context):
-        return worker_operator.free(cls, render_request.PREVIEW) and super().poll(context)
+        return worker_operator.is_free(cls, render_request.PREVIEW) and super().poll(context)
 
     def _begin(self, context):
         return render_request.start(context)

@@ -1,1 +1,1 @@
-"""Motion of loaded objects: F-curves, editable physics, extrapolation and Exact Mode."""
+"""Motion of loaded objects: F-curves, editable physics, extrapolation, contacts, rigid bodies and Exact Mode."""

@@ -74,7 +74,7 @@ class WaitsForWorker:
         status_bar.redraw()
 
 
-def free(operator: type, key: str) -> bool:
+def is_free(operator: type, key: str) -> bool:
     """True if no job with this key runs; otherwise sets the poll message. For an operator's ``poll``."""
     if jobs.busy(key):
         operator.poll_message_set("Already running; press Esc to stop it")

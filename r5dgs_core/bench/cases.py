@@ -23,7 +23,7 @@ from . import variants as kinds
 
 # Evaluating held-out views during training would add to its time. The user's settings override these.
 QUIET = ("train.probe_every=0",)
-COSTS = ("cpu_seconds", "wall_seconds", "peak_mb", "peak_gpu_mb")  # per sitting; seconds are summed, peaks maximised
+COSTS = ("cpu_seconds", "wall_seconds", "peak_mb", "peak_gpu_mb")  # of a session; seconds are summed, peaks maximised
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def _texts(settings: dict[str, str]) -> tuple[str, ...]:
 
 
 def read_record(case: Case) -> dict[str, Any]:
-    """Return the record of a case: ``sittings`` of its training and, once measured, ``measured``.
+    """Return the record of a case: ``sittings``, the sessions of its training, and, once measured, ``measured``.
 
     Raises:
         CheckpointError: The file is damaged.
@@ -207,10 +207,10 @@ def is_finished(case: Case) -> bool:
 
 
 def cost(sittings: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """Return the cost of training over all sittings: ``cpu_seconds``, ``wall_seconds``, ``peak_mb``, ``peak_gpu_mb``.
+    """Return the cost of training over all sessions: ``cpu_seconds``, ``wall_seconds``, ``peak_mb``, ``peak_gpu_mb``.
 
-    A sum is None if the cost of a sitting is unknown (the benchmark was killed); a peak is None if it is unknown for
-    all sittings.
+    A sum is None if the cost of a session is unknown (the benchmark was killed); a peak is None if it is unknown for
+    all sessions.
     """
     result: dict[str, float | None] = {}
     for key in COSTS[:2]:

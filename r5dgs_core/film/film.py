@@ -71,18 +71,18 @@ def write(
     if settings.is_folder:
         if file is None:
             raise ValueError("file: frames in a folder need the file of the scene")
-        return _folder(film, _key(settings, file, rows, dataset), progress)
+        return _write_folder(film, _key(settings, file, rows, dataset), progress)
     if settings.out.exists() and not settings.overwrite:
         raise errors.ConfigError(
             f"{settings.out}: the file exists; replace it with --overwrite, or choose another name"
         )
-    with _alone(settings.out):
-        _file(film, progress)
+    with _locked(settings.out):
+        _write_file(film, progress)
     return Result((settings.out,))
 
 
 @contextlib.contextmanager
-def _alone(out: Path) -> Iterator[None]:
+def _locked(out: Path) -> Iterator[None]:
     """Lock an output file for the block, and remove what killed processes left of it. Raises ConfigError."""
     with folder_lock.try_file(out.with_name(f".{out.name}.placeholder")) as held:
         if not held:
@@ -92,7 +92,7 @@ def _alone(out: Path) -> Iterator[None]:
         yield
 
 
-def _file(film: _Film, progress: Progress) -> None:
+def _write_file(film: _Film, progress: Progress) -> None:
     """Write a video or a picture."""
     settings, plan = film.settings, film.plan
     if settings.is_video:
@@ -105,7 +105,7 @@ def _file(film: _Film, progress: Progress) -> None:
         progress(_event(1, 1))
 
 
-def _folder(film: _Film, key: dict[str, str], progress: Progress) -> Result:
+def _write_folder(film: _Film, key: dict[str, str], progress: Progress) -> Result:
     """Write frames to a folder."""
     settings, folder = film.settings, film.settings.out
     shots = film.plan.shots

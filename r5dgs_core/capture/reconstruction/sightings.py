@@ -89,7 +89,7 @@ def lens(recording: Recording, views: Sequence[Sighting], points: np.ndarray) ->
     if not (error < _WORST_LENS and 0.4 < focal < 3.0):
         raise errors.DatasetError(
             f"camera {recording.name!r}: no lens fits the board (error {error:.1f} px, focal {focal:.2g} widths). "
-            "Remedy: check the size of the board, hold it still or expose shorter, and tilt it in several ways"
+            "Remedy: check the size of the board, hold it still or use a shorter exposure, and tilt it in several ways"
         )
     return Lens.from_opencv(matrix, [float(k) for k in np.asarray(coefficients).ravel()[:4]])
 
