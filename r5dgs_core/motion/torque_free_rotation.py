@@ -180,7 +180,7 @@ def _solve(body: np.ndarray, w: np.ndarray) -> _Path:
     middle = max(values[1], values[0] + _GAP)
     values = np.array([values[0], middle, max(values[2], middle + _GAP)])
     # The squares of faster spins overflow, so their poses are NaN.
-    spins = np.where((np.abs(w) < _FASTEST).all(-1)[..., None], w, np.nan) @ vectors
+    spins = np.where((np.abs(w) < _FASTEST).all(-1, keepdims=True), w, np.nan) @ vectors
     # L^2 - 2E I2. If negative, the spin circles the axis of the smallest moment, which becomes the third.
     circling = (values * spins**2 * (values - values[1])).sum(-1)
     flip = (circling < 0)[..., None]
