@@ -98,11 +98,12 @@ def test_static_objects_can_get_any_kind_of_motion(blender, loaded, kind):
         "angular_acceleration": [0.0, 0.3, 0.0],
         "center_offset": [0.1, 0.0, 0.2],
     }
+    own = {*models.KINDS[kind].fields} & {*models.VECTORS} - {*models.RATES}
+    rates |= dict.fromkeys(own, [0.3, -0.4, 0.6])
     factor = blender.context.scene.render.fps / 60
-    powers = {"acceleration": 2, "angular_acceleration": 2, "center_offset": 0}
     state.kind = kind
     for name, value in rates.items():
-        setattr(state, name, np.array(value) * factor ** powers.get(name, 1))
+        setattr(state, name, np.array(value) * factor ** models.FIELDS[name].per_time)
     blender.ops.r5dgs.re_extrapolate()
     inertia = motions.addon("motion.physics").inertia(anchor) if kind == "free_top" else None
     model = models.MotionModel(kind, **rates, inertia=inertia)

@@ -119,7 +119,7 @@ def test_files_are_replaced_only_on_demand(path, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("--to", "obj", "--out", "a.obj"), "ply, cameras"),
+        (("--to", "unknown", "--out", "a.unknown"), "ply, cameras"),
         (("--to", "ply", "--out", "a.json"), ".ply"),
         (("--to", "cameras", "--out", "a.json", "--objects", "mug"), "--objects"),
         (("--to", "cameras", "--out", "a.json", "--plain"), "--plain"),
