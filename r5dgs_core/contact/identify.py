@@ -204,6 +204,11 @@ class Fitter:
         quats, places = self.simulation.paths(self._all(states), times, used)
         return quats[:, :, self.body], places[:, :, self.body]
 
+    def residuals(self, state: State, material: Material, time: float) -> np.ndarray:
+        """Differences from the observed poses from the time of a state on, in units of the noise. [2 S', 3]"""
+        rows = slice(int(np.searchsorted(self.track.times, time)), None)
+        return self._residuals(state, material, self.track.rows(rows))
+
     def ballistic(self, track: Track) -> State:
         """State at the first of at least two poses in free flight, by a parabola and a constant spin."""
         gravity = self.simulation.world.gravity

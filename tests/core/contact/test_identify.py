@@ -1,5 +1,7 @@
 """Material and state of simulated tosses are found from noisy poses."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -50,6 +52,16 @@ def test_the_samples_of_a_fit_hold_the_true_end(slid):
     center = np.median(found.places, axis=1)
     assert np.linalg.norm(center[0] - places[-1]) < 2 * found.radii(center, 0.95)[0] < SIZE
     assert found.other_faces() < 0.5 and found.angles(found.quats[:, 0], 0.9)[0] < 1.0
+
+
+def test_samples_agree_with_the_last_poses_even_if_a_direction_seems_undetermined(slid):
+    fitter, estimate, _, _ = slid
+    covariance = estimate.covariance.copy()
+    covariance[8, 8] += 9.0  # of the vertical velocity, as of a body whose fit moves it into the floor
+    wide = dataclasses.replace(estimate, covariance=covariance)
+    found = futures.sample(fitter, wide, fitter.track.times[-1:], 24, np.random.default_rng(3))
+    away = np.linalg.norm(found.places[0] - fitter.track.places[-1], axis=-1)
+    assert away.max() < 10 * fitter.track.place_noise[-1]
 
 
 def test_a_flight_tells_nothing_about_the_material():
