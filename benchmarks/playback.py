@@ -47,8 +47,9 @@ LIMIT_S = 1.5  # per row
 
 def repeated(values: dict[str, np.ndarray], count: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return raw parameters of at least ``count`` Gaussians that cover the pixels of the given ones, and their rows."""
-    times = max(1, -(-count // len(values["means"])))
-    rows = np.repeat(np.arange(len(values["means"])), times)[:count] if times > 1 else np.arange(len(values["means"]))
+    own = len(values["means"])
+    total, times = max(count, own), max(count / own, 1.0)
+    rows = np.arange(total) * own // total
     found = {name: array[rows] for name, array in values.items()}
     if times > 1:
         spread = np.exp(found["log_scales"]) * np.random.default_rng(0).standard_normal(found["means"].shape)
@@ -61,7 +62,19 @@ def scaled_scene(scene: Scene, count: int) -> Scene:
     """Return a scene with ``count`` Gaussians."""
     names = [f.name for f in dataclasses.fields(scene.gaussians) if getattr(scene.gaussians, f.name) is not None]
     values, rows = repeated({name: getattr(scene.gaussians, name) for name in names}, count)
-    more: dict[str, Any] = {"gaussians": dataclasses.replace(scene.gaussians, **values), "residuals": None}
+    starts = np.searchsorted(rows, np.arange(len(scene.gaussians.means) + 1)).tolist()
+    more: dict[str, Any] = {
+        "gaussians": dataclasses.replace(scene.gaussians, **values),
+        "residuals": None,
+        "objects": tuple(
+            dataclasses.replace(o, start=starts[o.start], count=starts[o.start + o.count] - starts[o.start])
+            for o in scene.objects
+        ),
+        "groups": tuple(
+            dataclasses.replace(g, anchor_index=starts[g.anchor_index] if g.anchor_index >= 0 else -1)
+            for g in scene.groups
+        ),
+    }
     for name in ("dynamics", "shading"):
         group = getattr(scene, name)
         if group is not None:

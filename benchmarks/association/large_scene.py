@@ -76,7 +76,7 @@ def measure(gaussians: int, objects: int, images: int, pixels: int) -> dict[str,
         start = time.perf_counter()
         done = mask_repair.repair(scene, dataset, progress=note)
         end = time.perf_counter()
-    mended = [mask.reshape(-1) for mask in done.mended]
+        mended = [mask.reshape(-1) for mask in done.mended]  # reads the masks of the data set
     found = {
         "read_s": moments["draw", 0] - start,
         "draw_s": moments["draw", len(views)] - moments["draw", 0],
