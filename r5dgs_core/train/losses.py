@@ -18,6 +18,9 @@ from torch import Tensor
 from ..raster import arrays, thread_pool
 from ..raster import compilation as kernels
 
+_REACH = 5  # of the window, px
+_KEPT = 16  # rows in memory, at least the 11 of the window
+_WORTH_A_THREAD = 32  # rows; each thread blurs and compares up to 20 rows of its neighbours again
 _OFFSETS = np.arange(11) - 5
 _WINDOW = np.exp(-(_OFFSETS**2) / (2 * 1.5**2))
 WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
@@ -51,13 +54,9 @@ class _Photometric(torch.autograd.Function):
         height, width, _ = x.shape
         shape = (height, 3 * width)
         x, y = x.reshape(shape), y.reshape(shape)
-        moments = np.empty((5, *shape), np.float32)
-        slopes = np.empty((3, *shape), np.float32)
         sums = np.empty((height, 2), np.float64)
         gradient = np.empty(shape, np.float32)
-        thread_pool.run(_moments, height, x, y, WINDOW, moments)
-        thread_pool.run(_compare, height, x, y, WINDOW, moments, slopes, sums)
-        thread_pool.run(_gather, height, x, y, WINDOW, slopes, np.float32(ssim_weight), gradient)
+        thread_pool.run(_compare, height // _WORTH_A_THREAD, x, y, WINDOW, np.float32(ssim_weight), sums, gradient)
         similarity, difference = sums.sum(0) / x.size
         ctx.gradient = torch.from_numpy(gradient.reshape(height, width, 3))
         return image.new_tensor((1 - ssim_weight) * difference + ssim_weight * (1 - similarity))
@@ -102,71 +101,97 @@ def _window(device: torch.device) -> Tensor:
 
 
 @kernels.kernel
-def _moments(worker, workers, x, y, window, moments):
-    """Blur x, y, x^2, y^2 and xy along the rows. Channels are interleaved: neighbours are 3 floats apart."""
+def _compare(worker, workers, x, y, window, weight, sums, gradient):
+    """Compute L1 and SSIM of this worker's rows, and the gradient of the loss with respect to x.
+
+    The image passes in one sweep: row r is blurred along itself, row r - 5 is compared once the rows around it are
+    there, and the gradient of row r - 10 once the rows around it are compared. Only the last `_KEPT` rows of each are
+    in memory. Channels are interleaved: neighbours are 3 floats apart.
+
+    Args:
+        x, y: The images. [H, 3 W]
+        window: Weights of the blur. [11]
+        weight: Of SSIM in the loss.
+        sums: Result, sums of SSIM and of the differences of each row. [H, 2]
+        gradient: Result. [H, 3 W]
+    """
     height, length = x.shape
-    raw = np.empty((5, length), np.float32)
-    for r in range(worker * height // workers, (worker + 1) * height // workers):
-        for j in range(np.uint64(length)):
-            raw[0, j] = x[r, j]
-            raw[1, j] = y[r, j]
-            raw[2, j] = x[r, j] * x[r, j]
-            raw[3, j] = y[r, j] * y[r, j]
-            raw[4, j] = x[r, j] * y[r, j]
-        for m in range(5):
-            _blur_row(raw[m], window, moments[m, r])
+    raw, full = np.empty((5, length), np.float32), np.empty((5, length), np.float32)
+    moments, slopes = np.empty((_KEPT, 5, length), np.float32), np.empty((_KEPT, 3, length), np.float32)
+    first, end = worker * height // workers, (worker + 1) * height // workers
+    for row in range(first - 2 * _REACH, end + 2 * _REACH):
+        if 0 <= row < height:
+            _blur_products(x[row], y[row], window, raw, moments[row % _KEPT])
+        at = row - _REACH
+        if max(first - _REACH, 0) <= at < min(end + _REACH, height):
+            found = _compare_row(x, y, at, window, moments, raw, full, slopes[at % _KEPT])
+            if first <= at < end:
+                sums[at, 0], sums[at, 1] = found
+        at = row - 2 * _REACH
+        if first <= at < end:
+            _write_gradient(x, y, at, window, weight, slopes, full, gradient)
 
 
-@kernels.kernel
-def _compare(worker, workers, x, y, window, moments, slopes, sums):
-    """Compute SSIM per pixel from the blurred moments, and its derivatives by these, blurred along the rows."""
+@kernels.helper
+def _blur_products(x, y, window, raw, moments):
+    """Blur x, y, x^2, y^2 and xy of a row along it."""
+    for j in range(np.uint64(len(x))):
+        raw[0, j] = x[j]
+        raw[1, j] = y[j]
+        raw[2, j] = x[j] * x[j]
+        raw[3, j] = y[j] * y[j]
+        raw[4, j] = x[j] * y[j]
+    for m in range(5):
+        _blur_row(raw[m], window, moments[m])
+
+
+@kernels.helper
+def _compare_row(x, y, r, window, moments, raw, full, slopes):
+    """Compute SSIM of a row from the blurred moments, and its derivatives by these, blurred along the row.
+
+    Returns the sums of SSIM and of the differences of the images.
+    """
     height, length = x.shape
-    full = np.empty((5, length), np.float32)
-    raw = np.empty((3, length), np.float32)
     one, two = np.float32(1.0), np.float32(2.0)
-    for r in range(worker * height // workers, (worker + 1) * height // workers):
-        for m in range(5):
-            _blur_column(moments[m], r, window, full[m])
-        similarity = 0.0
-        difference = 0.0
-        for j in range(length):
-            mu1, mu2 = full[0, j], full[1, j]
-            a = two * mu1 * mu2 + C1
-            b = two * (full[4, j] - mu1 * mu2) + C2
-            c = mu1 * mu1 + mu2 * mu2 + C1
-            d = full[2, j] - mu1 * mu1 + full[3, j] - mu2 * mu2 + C2
-            inverse = one / (c * d)
-            s = a * b * inverse
-            similarity += s
-            difference += abs(x[r, j] - y[r, j])
-            raw[0, j] = two * mu2 * (b - a) * inverse - two * mu1 * s * (one / c - one / d)
-            raw[1, j] = -s / d
-            raw[2, j] = two * a * inverse
-        sums[r, 0] = similarity
-        sums[r, 1] = difference
-        for m in range(3):
-            _blur_row(raw[m], window, slopes[m, r])
+    for m in range(5):
+        _blur_column(moments, m, r, height, window, full[m])
+    similarity = 0.0
+    difference = 0.0
+    for j in range(length):
+        mu1, mu2 = full[0, j], full[1, j]
+        a = two * mu1 * mu2 + C1
+        b = two * (full[4, j] - mu1 * mu2) + C2
+        c = mu1 * mu1 + mu2 * mu2 + C1
+        d = full[2, j] - mu1 * mu1 + full[3, j] - mu2 * mu2 + C2
+        inverse = one / (c * d)
+        s = a * b * inverse
+        similarity += s
+        difference += abs(x[r, j] - y[r, j])
+        raw[0, j] = two * mu2 * (b - a) * inverse - two * mu1 * s * (one / c - one / d)
+        raw[1, j] = -s / d
+        raw[2, j] = two * a * inverse
+    for m in range(3):
+        _blur_row(raw[m], window, slopes[m])
+    return similarity, difference
 
 
-@kernels.kernel
-def _gather(worker, workers, x, y, window, slopes, weight, gradient):
-    """Compute the gradient of the loss with respect to x from the derivatives, blurred along the columns."""
+@kernels.helper
+def _write_gradient(x, y, r, window, weight, slopes, full, gradient):
+    """Compute the gradient of the loss by a row of x from the derivatives, blurred along the columns."""
     height, length = x.shape
-    full = np.empty((3, length), np.float32)
     n = np.float32(height * length)
     l1 = (np.float32(1.0) - weight) / n
     share = -weight / n
-    for r in range(worker * height // workers, (worker + 1) * height // workers):
-        for m in range(3):
-            _blur_column(slopes[m], r, window, full[m])
-        for j in range(np.uint64(length)):
-            difference = x[r, j] - y[r, j]
-            sign = np.float32(difference > 0) - np.float32(difference < 0)
-            chain = full[0, j] + np.float32(2.0) * x[r, j] * full[1, j] + y[r, j] * full[2, j]
-            gradient[r, j] = l1 * sign + share * chain
+    for m in range(3):
+        _blur_column(slopes, m, r, height, window, full[m])
+    for j in range(np.uint64(length)):
+        difference = x[r, j] - y[r, j]
+        sign = np.float32(difference > 0) - np.float32(difference < 0)
+        chain = full[0, j] + np.float32(2.0) * x[r, j] * full[1, j] + y[r, j] * full[2, j]
+        gradient[r, j] = l1 * sign + share * chain
 
 
-@kernels.kernel
+@kernels.helper
 def _blur_row(source, window, out):
     length = len(source)
     for j in range(np.uint64(length)):
@@ -181,15 +206,15 @@ def _blur_row(source, window, out):
                 target[j] += w * neighbours[j]
 
 
-@kernels.kernel
-def _blur_column(source, r, window, out):
-    height, length = source.shape
-    for j in range(np.uint64(length)):
+@kernels.helper
+def _blur_column(rows, m, r, height, window, out):
+    """Blur map ``m`` of row r along the columns, from the rows around it. ``rows`` are the last ones. [_KEPT, M, L]"""
+    for j in range(np.uint64(len(out))):
         out[j] = np.float32(0.0)
     for k in range(11):
-        q = r + k - 5
+        q = r + k - _REACH
         if 0 <= q < height:
             w = window[k]
-            row = source[q]
-            for j in range(np.uint64(length)):
+            row = rows[q % _KEPT, m]
+            for j in range(np.uint64(len(out))):
                 out[j] += w * row[j]

@@ -147,3 +147,19 @@ def test_transposed_images_give_the_same_loss():
     turned = x.transpose(0, 1).contiguous().transpose(0, 1)
     assert not turned.is_contiguous()
     assert float(losses.photometric(turned, y, 0.3)) == float(losses.photometric(x, y, 0.3))
+
+
+@pytest.mark.parametrize("height", [1, 4, 9, 40])
+def test_the_loss_does_not_depend_on_the_number_of_threads(height):
+    draw = np.random.default_rng(height)
+    x, y = (draw.random((height, 3 * 20), np.float32) for _ in range(2))
+
+    def compare(workers):
+        sums, gradient = np.full((height, 2), np.nan), np.full(x.shape, np.nan, np.float32)
+        for worker in range(workers):
+            losses._compare(worker, workers, x, y, losses.WINDOW, np.float32(0.2), sums, gradient)
+        return sums, gradient
+
+    alone, shared = compare(1), compare(3)
+    for one, other in zip(alone, shared, strict=True):
+        np.testing.assert_array_equal(one, other)
