@@ -30,7 +30,7 @@ from r5dgs_core.bake import bake
 from r5dgs_core.cli.commands import prepare
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.data import images, masks
+from r5dgs_core.data import images, masks, unexplained
 from r5dgs_core.evaluation import evaluate, ground_truth_poses, metrics
 from r5dgs_core.prepare.plan import Plan
 from r5dgs_core.render import warm_up
@@ -189,11 +189,13 @@ def main() -> None:
     row = {
         "val": val["psnr"],
         "val_aligned": val["psnr_aligned"],
+        "val_explained": val["psnr_explained"],
         "val_objects": val["psnr_objects"],
         "cpu_seconds": seconds,
         "gaussians": len(scene.gaussians.means),
         "refined": record.get("refined"),
         "sizes": record.get("sizes"),
+        "unexplained": next(row["value"] for row in scene.needs if row["name"] == unexplained.NEED),
         **pose_errors(scene, dataset),
     }
     print("\n".join(f"{name:>14} {value}" for name, value in row.items()))

@@ -31,7 +31,7 @@ FAINT = 0.5  # limit of faint differences relative to that of clear ones
 SHADOW = 0.3  # smallest factor on the colours by shadows; its inverse is the largest one by light
 DIM = 1e-4  # squared colour that counts as black
 OFTEN = 0.1  # share of the frames with clear differences in a region whose colours mostly differ
-MARGIN = 0.011  # dilation of the masks, relative to the rows of blocks
+MARGIN = 0.05  # dilation of the masks, relative to the rows of blocks; it keeps the outlines of objects in training
 SPECK, GAP = 0.008, 0.03  # radius of removed specks and of closed gaps, relative to the rows of blocks
 SMALL = 0.002  # share of the image below which a region is ignored
 
