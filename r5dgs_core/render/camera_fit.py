@@ -7,6 +7,7 @@ matrix J^T J and the vector J^T r.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -140,28 +141,36 @@ def normal_tiles(
         change[index] = steps[index]
         moved = correction.plus(change)
         other = moved.seen(draw(moved.camera(shot.camera), shot.t + moved.time))
-        geometry.append((index, ((other - picture) / steps[index]).reshape(-1, 3)))
+        geometry.append((index, steps[index], (other - picture).reshape(-1, 3)))
     height, width = plain.shape[:2]
     rows, cols = np.arange(height) * tiles // height, np.arange(width) * tiles // width
-    tile = (tiles * rows[:, None] + cols).ravel()
+    tile = (tiles * rows[:, None] + cols).astype(np.int16).ravel()
     if shot.valid is not None:
         tile[~shot.valid.ravel()] = -1
     colors, residual = plain.reshape(-1, 3), (shot.image - picture).reshape(-1, 3)
     tile[((shot.image >= 1) & (picture > 1)).any(-1).ravel()] = -1  # saturated
-    return [_sums(tile == k, geometry, colors, residual) for k in range(tiles * tiles)]
+    order = np.argsort(tile, kind="stable")
+    bounds = np.searchsorted(tile[order], np.arange(tiles * tiles + 1)).tolist()
+    return [_sums(order[first:last], geometry, colors, residual) for first, last in itertools.pairwise(bounds)]
 
 
 def _sums(
-    chosen: np.ndarray, geometry: list[tuple[int, np.ndarray]], colors: np.ndarray, residual: np.ndarray
+    pixels: np.ndarray, geometry: list[tuple[int, float, np.ndarray]], colors: np.ndarray, residual: np.ndarray
 ) -> Normal:
-    """Return the normal equations of chosen pixels."""
+    """Return the normal equations of some pixels.
+
+    Args:
+        pixels: Their indices.
+        geometry: Index and step of each parameter of the geometry, and the change of the picture by the step. [P, 3]
+        colors: The picture without correction of its colours. [P, 3]
+        residual: Image minus picture. [P, 3]
+    """
     total = Normal(np.zeros((COUNT, COUNT)), np.zeros(COUNT), 0.0, 0)
-    pixels = np.flatnonzero(chosen)
     for first in range(0, len(pixels), ROWS):
         some = pixels[first : first + ROWS]
         slopes = np.zeros((len(some), 3, COUNT))
-        for index, slope in geometry:
-            slopes[:, :, index] = slope[some]
+        for index, step, change in geometry:
+            slopes[:, :, index] = change[some] / step
         for channel in range(3):
             slopes[:, channel, COLOR.start + 3 * channel : COLOR.start + 3 * channel + 3] = colors[some]
             slopes[:, channel, COLOR.stop - 3 + channel] = 1.0

@@ -56,6 +56,8 @@ class Correction:
 
     def seen(self, image: np.ndarray) -> np.ndarray:
         """Return the image that the camera takes of the scene's colours. [..., 3]"""
+        if not self.changes_colors:
+            return image
         return image @ self.gain.T.astype(image.dtype) + self.offset.astype(image.dtype)
 
     def unseen(self, image: np.ndarray) -> np.ndarray:
