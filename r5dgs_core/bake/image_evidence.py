@@ -24,7 +24,9 @@ from ..data import dataset as datasets
 from ..errors import DatasetError
 from ..motion import rotations
 from ..playback import scene_player
+from ..raster import RasterSettings
 from ..render import scene_renderer
+from ..scene import cameras
 from ..scene.sampling import spread
 from ..scene.scene import Scene
 from ..train import train_views
@@ -35,6 +37,9 @@ PIXELS = 700_000  # total of the sampled views
 MIN_VIEWS, MAX_VIEWS = 20, 40  # limits of the number of sampled views
 CLUSTERS = 8  # smallest number of clusters; with fewer cameras, their views are split in time
 PATCHES = 8  # patches per body: its octants
+WHOLE = 500_000  # pixels of an image above which only the part that a group may reach is drawn
+REACH = 3.4  # standard deviations at which an opaque Gaussian is fainter than the rasterizer draws
+MARGIN = 2.0  # pixels added to the reach, for the low-pass filter and rounding
 STEP = 0.02  # change of the poses for finite differences of the images, rad or radii
 
 
@@ -75,11 +80,28 @@ class ImageEvidence:
         self._views = views
         self._truths = [datasets.load_image(view, behind) for view in views]
         self._clusters = _clusters(views)
-        self.psnr = self._psnr(self._scene)
+        self.remember()
+
+    def remember(self) -> None:
+        """Compare the pictures of the trained motion with the images; to be called when these have changed."""
+        player = scene_player.Player(self._scene)
+        self._errors = [self._error(self._frame(player, row), row) for row in range(len(self._views))]
+        self.psnr = _mean_psnr(self._errors)
 
     def loss(self, poses: np.ndarray) -> float:
         """Return the decrease of the mean PSNR on the sampled views, dB, if the groups take other poses [G, S, 7]."""
-        return self.psnr - self._psnr(self._with(poses))
+        moving = self._moving(self._scene.tracks.poses, poses)
+        players = [scene_player.Player(scene) for scene in (self._scene, self._with(poses))]
+        errors = []
+        for row, error in enumerate(self._errors):
+            frames = [self._frame(player, row) for player in players]
+            window = self._window(row, frames, moving)
+            if window == self._whole(row):
+                errors.append(self._error(frames[1], row))
+            else:
+                old, new = (self._error(frame, row, window) for frame in frames)
+                errors.append(error + (new - old) * self._truths[row][window].size / self._truths[row].size)
+        return self.psnr - _mean_psnr(errors)
 
     def support(
         self, group: int, before: np.ndarray, after: np.ndarray, size: float, rows: Sequence[int] | None = None
@@ -101,20 +123,23 @@ class ImageEvidence:
             scene_player.Player(self._with(_between(before, after, share))) for share in (0.0, step, -step)
         )
         colored = self._scene.shading is not None and not np.array_equal(before[..., :4], after[..., :4])
-        octants = self._octants(group)
+        octants, moving = self._octants(group), self._moving(before, after)
         scores, information = np.zeros((2, int(self._clusters.max()) + 1, PATCHES + 1))
         pixels, changed = 0, 0.0
         for row in rows:
+            own = [self._frame(player, row) for player in (here, plus, minus, simpler)]
+            window = self._window(row, own, moving)
             factor = simpler.frame(self._views[row].t).shading_factor
-            picture, patches = self._draw(here, row, factor, octants)
-            slope = (self._draw(plus, row, factor)[0] - self._draw(minus, row, factor)[0]).astype(np.float64)
+            lit = own[:3] if factor is None else [dataclasses.replace(f, shading_factor=factor) for f in own[:3]]
+            picture, patches = self._draw(dataclasses.replace(lit[0], object_ids=octants), row, window)
+            slope = (self._draw(lit[1], row, window)[0] - self._draw(lit[2], row, window)[0]).astype(np.float64)
             slope /= 2 * step
             pixels += int((patches < PATCHES).sum())
-            cluster, error = self._clusters[row], (picture - self._truths[row]) * slope
+            cluster, error = self._clusters[row], (picture - self._truths[row][window]) * slope
             scores[cluster] -= np.bincount(patches.ravel(), error.sum(-1).ravel(), PATCHES + 1)
             information[cluster] += np.bincount(patches.ravel(), (slope**2).sum(-1).ravel(), PATCHES + 1)
             if colored:
-                changed += float(((self._draw(simpler, row)[0] - self._draw(here, row)[0]) ** 2).sum())
+                changed += float(((self._draw(own[3], row, window)[0] - self._draw(own[0], row, window)[0]) ** 2).sum())
         return _support(scores, information, pixels, changed)
 
     def _with(self, poses: np.ndarray) -> Scene:
@@ -133,30 +158,75 @@ class ImageEvidence:
         mine = (np.flatnonzero(self._clusters == cluster) for cluster in clusters)
         return [int(rows[np.argmax(changes[knots[rows]])]) for rows in mine]
 
+    def _moving(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return a mask of the Gaussians whose groups change. Poses [G, S, 7]; [N] bool"""
+        return (before != after).any(axis=(1, 2))[self._scene.gaussians.motion_ids]
+
+    def _frame(self, player: scene_player.Player, row: int) -> scene_player.Frame:
+        """Return the frame of a view, relative to its camera."""
+        view = self._views[row]
+        return player.frame(view.t, view.camera.center)
+
+    def _whole(self, row: int) -> tuple[slice, slice]:
+        camera = self._views[row].camera
+        return slice(0, camera.height), slice(0, camera.width)
+
+    def _window(self, row: int, frames: Sequence[scene_player.Frame], moving: np.ndarray) -> tuple[slice, slice]:
+        """Return rows and columns of a view outside of which some Gaussians do not show; of small images, all.
+
+        Args:
+            row: Index of the view.
+            frames: Frames in which they may be drawn.
+            moving: Mask of the Gaussians. [N]
+        """
+        camera, whole = self._views[row].camera, self._whole(row)
+        if camera.width * camera.height <= WHOLE:
+            return whole
+        low, high = np.full(2, np.inf), np.full(2, -np.inf)
+        for frame in frames:
+            pixels, depth = cameras.project(camera, frame.means[moving].astype(np.float64) + camera.center)
+            if not (depth > self._scene.near_plane).all():  # close to the camera, it may cover everything
+                return whole
+            sizes = np.exp(frame.log_scales[moving].max(axis=1).astype(np.float64))
+            slant = np.linalg.norm(pixels - camera.intrinsics[:2, 2], axis=1) / camera.intrinsics[0, 0]
+            reach = (REACH * sizes * camera.intrinsics[0, 0] / depth * (1 + slant) + MARGIN)[:, None]
+            low = np.minimum(low, (pixels - reach).min(axis=0, initial=np.inf))
+            high = np.maximum(high, (pixels + reach).max(axis=0, initial=-np.inf))
+        size = np.array([camera.width, camera.height])
+        first, last = np.floor(np.clip(low, 0, size - 1)), np.ceil(np.clip(high, 1, size))
+        (left, top), (right, bottom) = first.astype(int).tolist(), np.maximum(last, first + 1).astype(int).tolist()
+        return slice(top, bottom), slice(left, right)
+
     def _draw(
-        self, player: scene_player.Player, row: int, factor: np.ndarray | None = None, octants: np.ndarray | None = None
+        self, frame: scene_player.Frame, row: int, window: tuple[slice, slice] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the image of a view, sRGB in [0, 1] [H, W, 3], and the patch that each pixel shows [H, W].
 
         Args:
-            player: Player of the poses.
+            frame: Frame of the view. Its object ids are the patches of the Gaussians.
             row: Index of the view.
-            factor: Shading factors that replace those of the poses. [N]
-            octants: Patch of each Gaussian; without it, the returned patches are meaningless. [N]
+            window: Rows and columns to draw; None for all.
         """
-        view = self._views[row]
-        frame = player.frame(view.t, view.camera.center)
-        if factor is not None:
-            frame = dataclasses.replace(frame, shading_factor=factor)
-        if octants is not None:
-            frame = dataclasses.replace(frame, object_ids=octants)
-        output = scene_renderer.render_frame(self._scene, frame, view.camera)
+        camera, settings = self._views[row].camera, None
+        if window is not None and window != self._whole(row):
+            rows, columns = window
+            size = columns.stop - columns.start, rows.stop - rows.start
+            # Gaussians beside the window are linearised where the whole image linearises them.
+            usual = RasterSettings(near_plane=self._scene.near_plane)
+            slack = (2 + usual.frustum_slack) * max(camera.width / size[0], camera.height / size[1])
+            settings = dataclasses.replace(usual, frustum_slack=slack)
+            camera = cameras.crop(camera, columns.start, rows.start, *size)
+        output = scene_renderer.render_frame(self._scene, frame, camera, settings=settings)
         return np.clip(output.color, 0, 1), np.where(output.ids < 0, PATCHES, output.ids)
 
-    def _psnr(self, scene: Scene) -> float:
-        player = scene_player.Player(scene)
-        errors = [float(np.mean((self._draw(player, row)[0] - truth) ** 2)) for row, truth in enumerate(self._truths)]
-        return float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
+    def _error(self, frame: scene_player.Frame, row: int, window: tuple[slice, slice] | None = None) -> float:
+        """Return the mean squared error of a picture, or of a part of it."""
+        truth = self._truths[row] if window is None else self._truths[row][window]
+        return float(np.mean((self._draw(frame, row, window)[0] - truth) ** 2))
+
+
+def _mean_psnr(errors: Sequence[float]) -> float:
+    return float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
 
 
 def _support(scores: np.ndarray, information: np.ndarray, pixels: int, changed: float) -> Support:

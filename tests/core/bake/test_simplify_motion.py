@@ -11,6 +11,7 @@ from r5dgs_core.data import dataset as datasets
 from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
 from r5dgs_core.train import checkpoint, checkpoint_content
 from tests.support import tiny_datasets
 
@@ -49,9 +50,9 @@ def evidence_of(scene, data, shown=None):
     draw, truths = np.random.default_rng(4), evidence._truths
     if shown is not None:
         player = scene_player.Player(shown)
-        truths = [evidence._draw(player, row)[0] for row in range(len(truths))]
+        truths = [evidence._draw(evidence._frame(player, row), row)[0] for row in range(len(truths))]
     evidence._truths = [(t + 0.01 * draw.standard_normal(t.shape)).astype(np.float32) for t in truths]
-    evidence.psnr = evidence._psnr(evidence._scene)
+    evidence.remember()
     return evidence
 
 
@@ -165,3 +166,28 @@ def test_without_training_images_a_warning_is_logged_and_poses_decide(trained, t
     scene = bake.bake(dataclasses.replace(trained, dataset_root=copied), data)
     assert "without the training images" in caplog.text and "--data" in caplog.text
     assert "training_views" not in scene.provenance
+
+
+@pytest.mark.parametrize("given", ["slide"], indirect=True)
+def test_in_large_images_only_the_part_that_the_body_reaches_is_drawn(given, monkeypatch):
+    _, truth, data = given
+    evidence, noisy = evidence_of(truth, data), with_noise(truth, 0.02, 0.02).tracks.poses
+    drawn = []
+
+    def compare():
+        drawn.append(0)
+        return evidence.support(BRICK, truth.tracks.poses, noisy, 0.1), evidence.loss(noisy)
+
+    draw = scene_renderer.render_frame
+
+    def counted(scene, frame, camera, **options):
+        drawn[-1] += camera.width * camera.height
+        return draw(scene, frame, camera, **options)
+
+    monkeypatch.setattr(scene_renderer, "render_frame", counted)
+    support, loss = compare()
+    monkeypatch.setattr(image_evidence, "WHOLE", 0)
+    in_part, loss_in_part = compare()
+    assert drawn[1] < 0.5 * drawn[0]
+    assert dataclasses.astuple(in_part) == pytest.approx(dataclasses.astuple(support), rel=1e-4)
+    assert loss_in_part == pytest.approx(loss, rel=1e-3) and loss > 0.1
