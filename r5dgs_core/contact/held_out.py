@@ -14,8 +14,9 @@ from ..motion import models, rotations, se3
 from ..motion_fit import model_selection
 from ..scene.scene import Scene
 from . import scene_bodies, world
-from .identify import Fitter, Track
+from .identify import Fitter
 from .scene_bodies import SceneBody
+from .tracks import Track
 from .world import Plane
 
 UNEXPLAINED = 3.0  # root mean square residual of the last poses, in units of the noise, above which a law is wrong
@@ -89,7 +90,7 @@ def compare(fitter: Fitter, up: np.ndarray) -> Comparison:
         fitter: The fitter of the body.
         up: Unit vector against gravity. [3]
     """
-    track = fitter.track
+    track = fitter.observed
     held = max(_LEAST_HELD, round(_HELD * len(track)))
     before, last = track.rows(slice(0, -held)), track.rows(slice(-held, None))
     estimate = (again := Fitter(fitter.simulation, before, fitter.body)).run()

@@ -2,6 +2,9 @@
 
 Notation: the parameters are deviations from a reference: place, rotation, velocity and spin, with lengths in sizes of
 the body and times in sqrt(size / g), then the logarithm of the friction and the logit of the restitution.
+
+A simulation is not exact after the first contact: a hull is not the body's shape, and Coulomb's law is a model. Poses
+since then have the error of the model besides their noise, and as that error changes slowly, neighbours repeat it.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import numpy as np
 from ..motion import levenberg_marquardt, robust_weights, rotations, se3
 from . import world as worlds
 from .simulation import Simulation
+from .tracks import Track
 from .world import Material, State
 
 PARAMETERS = 14
@@ -24,36 +28,16 @@ _OUTLIER = 9.0  # squared residual of a pose whose weight is one half
 _FRICTIONS, _RESTITUTIONS = (0.1, 0.18, 0.3, 0.5), (0.1, 0.3, 0.6)  # first guesses
 _LEARNED = np.array([0.1, 0.5])  # least deviations of log friction and logit of restitution from the whole track
 _LOST = 10.0  # residual, in units of the noise, of a pose that a guess misses
+_GOOD = 0.3  # misfit of a fit after which no other start is tried
+_UNFOLLOWED = 15.0  # misfit above which no simulation follows a track, so that its pieces tell more
+_FOLLOWED = 4.0  # misfit of a piece up to which it tells something
+_LEAST_FLIGHT = 2  # poses that determine a flight
+_NEGLIGIBLE = 0.02  # gain of the cost below which a fit ends
+_REPEATED = 4  # least number of poses since the first contact that show how much neighbours repeat
+_LEAST_TOLD = 0.05  # least share of the information of independent poses that others have
+_MISSED = 9.0  # mean squared residual of a pose that a simulation misses
 _CLOSE = 0.04  # gap, as a share of the size, below which a pose may be in contact
 _EARLY, _FULL = 5, 8  # iterations
-
-
-@dataclass(frozen=True)
-class Track:
-    """Observed poses of a body.
-
-    Attributes:
-        times: Increasing. [S]
-        quats: Relative to the bind state. [S, 4]
-        places: Centres of mass. [S, 3]
-        place_noise: Standard deviation of a place per axis. [S]
-        turn_noise: The same of a rotation, rad. [S]
-    """
-
-    times: np.ndarray
-    quats: np.ndarray
-    places: np.ndarray
-    place_noise: np.ndarray
-    turn_noise: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.times)
-
-    def rows(self, rows: slice) -> Track:
-        """Select poses."""
-        return Track(
-            *(column[rows] for column in (self.times, self.quats, self.places, self.place_noise, self.turn_noise))
-        )
 
 
 @dataclass(frozen=True)
@@ -84,7 +68,9 @@ class Estimate:
         covariance: Of the parameters of the module's notation. [14, 14]
         assumed: Precision of the parameters that comes from the prior and not from poses. [14]
         cost: Weighted sum of squared residuals, with the prior.
-        misfit: Mean squared residual in units of the noise.
+        misfit: Mean squared residual in units of the errors.
+        squares: The same of each pose. [S]
+        told: Information of the poses over that of independent ones, at most 1.
     """
 
     state: State
@@ -94,6 +80,8 @@ class Estimate:
     assumed: np.ndarray
     cost: float
     misfit: float
+    squares: np.ndarray
+    told: float
 
 
 class Fitter:
@@ -102,47 +90,97 @@ class Fitter:
     Args:
         simulation: A draft simulation.
         track: Observed poses.
+
+    Attributes:
+        observed: The poses with their noise.
+        track: The poses with their noise and the error of the simulation.
     """
 
     def __init__(self, simulation: Simulation, track: Track, body: int = 0):
-        self.simulation, self.track, self.body = simulation, track, body
+        self.simulation, self.observed, self.body = simulation, track, body
         world = simulation.world
         self.size = world.bodies[body].solid.size
         g = float(np.linalg.norm(world.gravity))
         self.unit_time = float(np.sqrt(self.size / g)) if g > 0 else float(np.ptp(track.times)) or 1.0
         self.scales = np.repeat([self.size, 1.0, self.size / self.unit_time, 1 / self.unit_time, 1.0], [3, 3, 3, 3, 2])
+        self.flight = self._flight()
+        self.track = track.with_model_error(self.flight, self.size)
 
     def run(self, prior: Prior = WIDE) -> Estimate:
         """Fit material and state by the whole track, then the state by its last poses."""
         first = self._whole(prior)
-        rows = slice(max(len(self.track) - LAST, 0), None)
-        start = self.at(first, float(self.track.times[rows][0]))
         if not self._touched():  # nothing was learned about the material
             return first
-        wide, learned = np.array([prior.friction, prior.restitution]), np.sqrt(np.diag(first.covariance)[12:])
-        kept = np.minimum(np.maximum(_LEARNED, learned), wide)
-        last = self.fit(start, first.material, self.track.rows(rows), Prior(first.material, *kept.tolist()), _FULL)
+        pieces = None if first.misfit < _UNFOLLOWED else self._by_pieces(prior)
+        material, learned = pieces or (first.material, first.covariance[12:, 12:])
+        deviations = np.sqrt(np.diag(learned))
+        kept = np.minimum(np.maximum(_LEARNED, deviations), [prior.friction, prior.restitution])
+        rows, missed = self._last(first)
+        start = self.ballistic(rows.rows(slice(0, 2))) if missed else self.at(first, float(rows.times[0]))
+        last = self.fit(start, material, rows, Prior(material, *kept.tolist()), _FULL, 1.0)
         assumed = np.zeros(PARAMETERS)  # the prior of the last fit comes from poses, unless these told little
-        assumed[12:] = np.where(learned > _LEARNED, first.assumed[12:], 0.0)
+        assumed[12:] = np.where(deviations > _LEARNED, first.assumed[12:], 0.0)
         return dataclasses.replace(last, assumed=assumed)
 
+    def _by_pieces(self, prior: Prior) -> tuple[Material, np.ndarray] | None:
+        """Material by short pieces of the track before its last poses, and its covariance. [2, 2]
+
+        No simulation follows a long track with many impacts if the first of them is missed. None if none follows a
+        piece either.
+        """
+        information = np.diag([prior.friction**-2.0, prior.restitution**-2.0])
+        certain, pull, count = information.copy(), np.zeros(2), 0
+        for stop in range(len(self.track) - LAST + 1, max(self.flight, LAST - 1), 1 - LAST):
+            piece = self.track.rows(slice(stop - LAST, stop))
+            found = self.fit(self.ballistic(piece.rows(slice(0, 2))), prior.material, piece, prior, _FULL, 1.0)
+            if found.misfit < _FOLLOWED:
+                told = np.linalg.inv(found.covariance[12:, 12:])
+                certain, count = certain + told - information, count + 1
+                pull += told @ (_logs(found.material) - _logs(prior.material))
+        if not count:
+            return None
+        learned = np.linalg.inv(certain)
+        return _material(*(_logs(prior.material) + learned @ pull).tolist()), learned
+
+    def _last(self, whole: Estimate) -> tuple[Track, bool]:
+        """Last poses, and True if the fit of all poses misses the first of them.
+
+        If it misses those after an impact, the pose before the impact is left out.
+        """
+        first = max(len(self.track) - LAST, 0)
+        missed = whole.squares[first:] > _MISSED
+        if len(missed) == LAST and missed[1] and not missed[0]:
+            first, missed = first + 1, missed[1:]
+        return self.track.rows(slice(first, None)), bool(missed[0])
+
     def _touched(self) -> bool:
-        return self._flight() < len(self.track)
+        return self.flight < len(self.track)
 
     def _whole(self, prior: Prior) -> Estimate:
-        track, flight = self.track, max(self._flight(), min(3, len(self.track)))
+        track, flight = self.track, self.flight if self.flight >= _LEAST_FLIGHT else min(3, len(self.track))
         start = self.ballistic(track.rows(slice(0, flight)))
         if not self._touched():
             return self.fit(start, prior.material, track, prior, _FULL)
-        found, count = [], len(track)
-        for guess in self._guesses(start):
-            near, grown = (start, guess), []
-            for rows in sorted({min(count, flight + 2), min(count, (flight + 2 + count) // 2), count}):
-                steps = _FULL if rows == count else _EARLY
-                grown.append(self.fit(*near, track.rows(slice(0, rows)), prior, steps))
-                near = grown[-1].state, grown[-1].material
-            found += [grown[-1], self.fit(start, guess, track, prior, _FULL)]
-        return min(found, key=lambda estimate: estimate.cost)
+        found, guesses = [], self._guesses(start)
+        for fit in (self._direct, self._grown):
+            for guess in guesses:
+                found.append(fit(start, guess, prior))
+                if found[-1].misfit < _GOOD:
+                    return found[-1]
+        best = min(found, key=lambda estimate: estimate.cost)
+        return self._direct(best.state, best.material, prior)
+
+    def _direct(self, start: State, guess: Material, prior: Prior) -> Estimate:
+        """Fit all poses at once."""
+        return self.fit(start, guess, self.track, prior, _FULL)
+
+    def _grown(self, start: State, guess: Material, prior: Prior) -> Estimate:
+        """Fit more and more poses."""
+        count, flight, near = len(self.track), max(self.flight, 1), (start, guess)
+        for rows in sorted({min(count, flight + 2), min(count, (flight + 2 + count) // 2)} - {count}):
+            grown = self.fit(*near, self.track.rows(slice(0, rows)), prior, _EARLY)
+            near = grown.state, grown.material
+        return self._direct(*near, prior)
 
     def _guesses(self, start: State) -> list[Material]:
         """First guesses of the material: the one that follows most poses, and the one that misses none by much."""
@@ -154,24 +192,52 @@ class Fitter:
         best = [int(np.argmin(loss.sum(axis=1))) for loss in losses]
         return [materials[k] for k in dict.fromkeys(best)]
 
-    def fit(self, state: State, material: Material, track: Track, prior: Prior, steps: int) -> Estimate:
-        """Fit from a state at the time of the first pose of a track."""
-        theta = _logs(material) - _logs(prior.material)
+    def fit(
+        self, state: State, material: Material, track: Track, prior: Prior, steps: int, told: float | None = None
+    ) -> Estimate:
+        """Fit from a state at the time of the first pose of a track; None for ``told`` finds it by the residuals."""
         precision = np.append(np.zeros(12), [1 / prior.friction, 1 / prior.restitution])
-        start = np.append(np.zeros(12), theta)
+        start, least = np.append(np.zeros(12), _logs(material) - _logs(prior.material)), np.inf
 
         def linearized(x: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            values, slopes = zip(*(self._linearized(state, prior, track, row) for row in x), strict=True)
-            return np.array(values), np.array(slopes)
+            nonlocal least
+            here = self._residuals(*self._many_moved(state, prior.material, x), track)
+            losses = robust_weights.cauchy_losses((here**2).sum(axis=-1), _OUTLIER)
+            cost = float(losses.sum() + ((precision * x) ** 2).sum())
+            if not cost <= least:  # the step is rejected
+                return here, np.zeros((1, PARAMETERS, *here.shape[1:]))
+            least = cost
+            return here, self._slopes(state, prior, track, x[0], here[0])[None]
 
         found = levenberg_marquardt.solve_linearized(
-            linearized, start[None], precision=precision, softness=_OUTLIER, steps=steps
+            linearized, start[None], precision=precision, softness=_OUTLIER, steps=steps, enough=_NEGLIGIBLE
         ).row(0)
         moved, learned = self.moved(state, prior.material, found.x)
+        residuals = found.residuals.reshape(2, len(track), 3)
+        squares = (residuals**2).mean(axis=(0, 2))
+        told = self._told(track, residuals) if told is None else told
         ridge = np.diag(1e-9 * np.maximum(np.diag(found.normal), 1e-9))
-        covariance = np.linalg.inv(found.normal + ridge)
-        misfit = float((found.residuals**2).mean())
-        return Estimate(moved, float(track.times[0]), learned, covariance, precision**2, float(found.cost), misfit)
+        information = told * found.normal + (1 - told) * np.diag(precision**2)
+        return Estimate(
+            moved,
+            float(track.times[0]),
+            learned,
+            np.linalg.inv(information + ridge),
+            precision**2,
+            float(found.cost),
+            float(squares.mean()),
+            squares,
+            told,
+        )
+
+    def _told(self, track: Track, residuals: np.ndarray) -> float:
+        """Information of poses over that of independent ones with the assumed errors. [2, S, 3]"""
+        rows = residuals[:, track.times >= self.track.times[min(self.flight, len(self.track) - 1)]]
+        if rows.shape[1] < _REPEATED or not np.isfinite(rows).all():
+            return 1.0
+        power = max(float((rows**2).mean()), 1e-12)
+        repeated = min(max(float((rows[:, 1:] * rows[:, :-1]).mean()) / power, 0.0), 1.0)
+        return max((1 - repeated) / (1 + repeated) / max(power, 1.0), _LEAST_TOLD)
 
     def moved(self, state: State, material: Material, x: np.ndarray) -> tuple[State, Material]:
         """State and material with deviations [14] in the module's notation."""
@@ -227,21 +293,20 @@ class Fitter:
         """Number of poses before the first that is close to the plane, or that follows an impact."""
         plane = self.simulation.world.plane
         if plane is None:
-            return len(self.track)
+            return len(self.observed)
         body = self.simulation.world.bodies[self.body]
-        gaps = worlds.gaps(body, plane, self.track.places, self.track.quats)
+        gaps = worlds.gaps(body, plane, self.observed.places, self.observed.quats)
         close = gaps < _CLOSE * self.size
         if len(gaps) > 2:
-            steps, drop = np.diff(self.track.times), 0.5 * float(np.linalg.norm(self.simulation.world.gravity))
+            steps, drop = np.diff(self.observed.times), 0.5 * float(np.linalg.norm(self.simulation.world.gravity))
             speeds = np.diff(gaps)[:-1] / steps[:-1] - drop * steps[:-1]
             close[2:] |= gaps[1:-1] + speeds * steps[1:] - drop * steps[1:] ** 2 < 0
-        return int(np.argmax(close)) if close.any() else len(self.track)
+        return int(np.argmax(close)) if close.any() else len(self.observed)
 
-    def _linearized(self, state: State, prior: Prior, track: Track, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals [2 S, 3] at parameters [14], and their derivatives [14, 2 S, 3]."""
-        nearby = x + np.concatenate([np.zeros((1, PARAMETERS)), np.diag(_STEPS)])
-        found = self._residuals(*self._many_moved(state, prior.material, nearby), track)
-        return found[0], (found[1:] - found[0]) / _STEPS[:, None, None]
+    def _slopes(self, state: State, prior: Prior, track: Track, x: np.ndarray, here: np.ndarray) -> np.ndarray:
+        """Derivatives of the residuals ``here`` [2 S, 3] at parameters x [14]. [14, 2 S, 3]"""
+        ahead = self._residuals(*self._many_moved(state, prior.material, x + np.diag(_STEPS)), track)
+        return (ahead - here) / _STEPS[:, None, None]
 
     def _residuals(self, states: State, materials: Sequence[Material], track: Track) -> np.ndarray:
         """Differences from observed places and rotations in units of the noise, for N states. [N, 2 S, 3]"""

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r5dgs_core.contact import futures, identify, world
+from r5dgs_core.contact import futures, identify, tracks, world
 from r5dgs_core.motion import rotations
 from tests.support import contacts
 from tests.support.contacts import SIZE
@@ -22,7 +22,7 @@ def observed(until, seed=0, noise=0.005, height=0.09):
     quats, places = runs.poses(state, times)
     seen = int((times <= until).sum())
     turns = rotations.rotvecs_to_quats(rng.normal(0, noise, (seen, 3)))
-    track = identify.Track(
+    track = tracks.Track(
         times[:seen],
         rotations.multiply(turns, quats[:seen, 0]),
         places[:seen, 0] + rng.normal(0, noise * SIZE, (seen, 3)),
@@ -83,9 +83,46 @@ def test_the_state_between_two_steps_is_that_of_the_poses_there():
     fitter, _, _ = observed(0.11, height=0.22)
     start = fitter.ballistic(fitter.track)
     known = np.eye(identify.PARAMETERS), np.zeros(identify.PARAMETERS)
-    estimate = identify.Estimate(start, 0.0, world.Material(0.3, 0.3), *known, 0.0, 0.0)
+    estimate = identify.Estimate(start, 0.0, world.Material(0.3, 0.3), *known, 0.0, 0.0, np.zeros(3), 1.0)
     late = 20.9 * fitter.simulation.stepping.step
     quats, places = fitter.poses(start, estimate.material, np.array([late]))
     found = fitter.at(estimate, late)
     np.testing.assert_allclose(found.places, places, atol=1e-12)
     np.testing.assert_allclose(found.quats, quats, atol=1e-12)
+
+
+def test_poses_after_the_first_contact_have_the_error_of_the_simulation_too(slid):
+    fitter, _, _, _ = slid
+    assert 0 < fitter.flight < len(fitter.track)
+    before, after = slice(0, fitter.flight), slice(fitter.flight, None)
+    np.testing.assert_array_equal(fitter.track.place_noise[before], fitter.observed.place_noise[before])
+    assert (fitter.track.place_noise[after] > fitter.observed.place_noise[after]).all()
+    assert (fitter.track.turn_noise[after] > fitter.observed.turn_noise[after]).all()
+
+
+def test_residuals_that_repeat_tell_less_than_independent_ones(slid):
+    fitter, _, _, _ = slid
+    rng, shape = np.random.default_rng(0), (2, len(fitter.track), 3)
+    independent = fitter._told(fitter.track, rng.normal(0, 0.5, shape))
+    repeated = fitter._told(fitter.track, np.tile(rng.normal(0, 0.5, (2, 1, 3)), (1, shape[1], 1)))
+    assert repeated < 0.2 < 0.4 < independent <= 1.0
+    assert fitter._told(fitter.track, rng.normal(0, 3.0, shape)) < 0.5 * independent
+
+
+def test_the_pose_before_an_impact_that_a_simulation_misses_is_left_out_of_the_last_ones(slid):
+    fitter, estimate, _, _ = slid
+    squares = np.full(len(fitter.track), 0.5)
+    followed, missed = fitter._last(dataclasses.replace(estimate, squares=squares))
+    assert len(followed) == identify.LAST and not missed
+    squares[-identify.LAST + 1 :] = 40.0
+    left, missed = fitter._last(dataclasses.replace(estimate, squares=squares))
+    assert left.times.tolist() == followed.times[1:].tolist() and missed
+
+
+def test_pieces_of_a_track_tell_the_friction_of_a_slide(slid):
+    fitter, _, _, _ = slid
+    found = fitter._by_pieces(identify.WIDE)
+    assert found is not None
+    material, covariance = found
+    assert material.friction == pytest.approx(FRICTION, rel=0.25)
+    assert np.sqrt(covariance[0, 0]) < 0.5 * identify.WIDE.friction
