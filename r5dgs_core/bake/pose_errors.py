@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -268,6 +268,20 @@ def with_unseen(errors: PoseErrors, unseen: Unseen) -> PoseErrors:
     turn, count = np.array(errors.turn), len(unseen.axes)
     every = np.sqrt(((3 - count) * turn**2 + count * UNKNOWN**2) / 3) if count < 3 else UNKNOWN
     return dataclasses.replace(errors, turn=tuple(np.where(np.isinf(turn), turn, every).tolist()))
+
+
+def with_slips(errors: PoseErrors, times: np.ndarray, slipped: Iterable[tuple[float, float]]) -> PoseErrors:
+    """Return the errors of all rotations, with `UNKNOWN` for those that slipped, for the scene file.
+
+    Args:
+        errors: Errors of the poses.
+        times: Their times. [S]
+        slipped: First and last time of slipped rotations.
+    """
+    turn = np.array(errors.turn)
+    for first, last in slipped:
+        turn[(times > first) & (times < last) & (turn < UNKNOWN)] = UNKNOWN
+    return dataclasses.replace(errors, turn=tuple(turn.tolist()))
 
 
 def weights(errors: PoseErrors, observed: np.ndarray, radius: float, turns: bool) -> np.ndarray:

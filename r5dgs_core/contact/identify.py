@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..motion import levenberg_marquardt, robust_weights, rotations, se3
+from ..motion.history import UNKNOWN_TURN
 from . import world as worlds
 from .simulation import Simulation
 from .tracks import Track
@@ -280,11 +281,17 @@ class Fitter:
         t = track.times - track.times[0]
         columns = np.stack([np.ones_like(t), t], axis=1)
         place, velocity = np.linalg.lstsq(columns, track.places - 0.5 * gravity * t[:, None] ** 2, rcond=None)[0]
-        steps = rotations.quats_to_rotvecs(rotations.multiply(track.quats[1:], rotations.conjugate(track.quats[:-1])))
-        quat, spin = track.quats[0], np.median(steps / np.diff(t)[:, None], axis=0) if len(t) > 1 else np.zeros(3)
+        known = track.turn_noise < UNKNOWN_TURN
+        if known.sum() > 1:
+            columns, t, quats = columns[known], t[known], track.quats[known]
+        else:
+            quats = track.quats
+        steps = rotations.quats_to_rotvecs(rotations.multiply(quats[1:], rotations.conjugate(quats[:-1])))
+        spin = np.median(steps / np.diff(t)[:, None], axis=0) if len(t) > 1 else np.zeros(3)
+        quat = rotations.multiply(rotations.rotvecs_to_quats(-spin * t[0]), quats[0])
         for _ in range(5 if len(t) > 1 else 0):
             shown = rotations.multiply(rotations.rotvecs_to_quats(spin * t[:, None]), quat)
-            missed = rotations.quats_to_rotvecs(rotations.multiply(track.quats, rotations.conjugate(shown)))
+            missed = rotations.quats_to_rotvecs(rotations.multiply(quats, rotations.conjugate(shown)))
             turn, more = np.linalg.lstsq(columns, missed, rcond=None)[0]
             quat, spin = rotations.multiply(rotations.rotvecs_to_quats(turn), quat), spin + more
         return State(place[None], rotations.normalize(quat)[None], velocity[None], spin[None])

@@ -75,6 +75,11 @@ class Candidate:
         return ()
 
     @property
+    def slipped(self) -> tuple[float, float] | None:
+        """Times between which observed rotations are wrong, infinite at an end of the track; None if none is."""
+        return None
+
+    @property
     def oscillates(self) -> bool:
         """True if a frequency is free."""
         return "pace" in self.blocks

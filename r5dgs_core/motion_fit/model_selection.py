@@ -55,6 +55,7 @@ class Fit:
         sigma_r: Noise of the rotations, per component, rad.
         history: Events and segments in the observed window, and the confidence band past t_max.
         slips: Times at which the tracked rotation slipped by a constant turn, see `slips`.
+        slipped: First and last time of the poses whose rotations are wrong by that turn.
     """
 
     model: models.MotionModel
@@ -65,6 +66,7 @@ class Fit:
     sigma_r: float
     history: History = EMPTY
     slips: tuple[float, ...] = ()
+    slipped: tuple[tuple[float, float], ...] = ()
 
 
 def fit(
@@ -165,6 +167,11 @@ def _result(
         sigma_r=scale * level.turn,
         history=History(found, segments, band),
         slips=tuple(t_max + span * time for part, _ in parts for time in part.candidate.slip_times),
+        slipped=tuple(
+            (t_max + span * between[0], t_max + span * between[1])
+            for part, _ in parts
+            if (between := part.candidate.slipped) is not None
+        ),
     )
 
 

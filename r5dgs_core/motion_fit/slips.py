@@ -58,6 +58,10 @@ class Slip(Candidate):
         return tuple(time for time in (self.low, self.high) if np.isfinite(time))
 
     @property
+    def slipped(self) -> tuple[float, float] | None:
+        return self.low, self.high
+
+    @property
     def law(self) -> Candidate:
         own = {"name": self.name.removesuffix(_SUFFIX), "kind": self.kind, "blocks": self.blocks[:-1]}
         return Candidate(**own, window=self.window, inertia=self.inertia)

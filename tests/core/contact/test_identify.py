@@ -7,6 +7,7 @@ import pytest
 
 from r5dgs_core.contact import futures, identify, tracks, world
 from r5dgs_core.motion import rotations
+from r5dgs_core.motion.history import UNKNOWN_TURN
 from tests.support import contacts
 from tests.support.contacts import SIZE
 
@@ -77,6 +78,18 @@ def test_a_flight_tells_nothing_about_the_material():
         for _ in range(2)
     )
     assert first.tolist() == again.tolist() and first[1] > 2 * first[0]
+
+
+@pytest.mark.parametrize("slipped", [slice(0, 1), slice(2, 4)], ids=["first", "last"])
+def test_unknown_rotations_do_not_enter_a_fit(slipped):
+    fitter, _, places = observed(0.11, height=0.22, noise=1e-4)
+    quats, noise = fitter.observed.quats.copy(), fitter.observed.turn_noise.copy()
+    quats[slipped] = rotations.multiply(quats[slipped], rotations.rotvecs_to_quats(np.array([0.3, -0.4, 0.2])))
+    noise[slipped] = UNKNOWN_TURN
+    track = dataclasses.replace(fitter.observed, quats=quats, turn_noise=noise)
+    found, expected = identify.Fitter(fitter.simulation, track).run(), fitter.run()
+    assert rotations.angle_between(found.state.quats, expected.state.quats)[0] < 0.01
+    np.testing.assert_allclose(found.state.spins, expected.state.spins, atol=0.1)
 
 
 def test_the_state_between_two_steps_is_that_of_the_poses_there():

@@ -35,6 +35,11 @@ def fitted(path, rows, seed=0):
     return fit, np.degrees(float(angle)), np.linalg.norm(d[-1] + move - true) / SIZE
 
 
+def wrong(fit):
+    """Numbers of the poses whose rotations a fit calls slipped."""
+    return [n for n, time in enumerate(TIMES[:15]) if any(first < time < last for first, last in fit.slipped)]
+
+
 @pytest.mark.default_cases("steady-3", "ballistic-5")
 @pytest.mark.parametrize("count", [1, 3, 5])
 @pytest.mark.parametrize("path", [steady, ballistic], ids=["steady", "ballistic"])
@@ -43,6 +48,7 @@ def test_a_slip_of_the_last_poses_is_no_impact_and_does_not_turn_the_prediction(
     assert fit.history.events == ()
     if count > 1:  # a single pose may also count as an outlier
         np.testing.assert_allclose(fit.slips, TIMES[-count] - 0.5 * STEP)
+        assert wrong(fit) == list(range(15 - count, 15))
     assert angle < 4
     assert distance < 0.05
 
@@ -50,6 +56,7 @@ def test_a_slip_of_the_last_poses_is_no_impact_and_does_not_turn_the_prediction(
 def test_a_slip_of_the_first_poses_keeps_the_later_ones():
     fit, angle, distance = fitted(steady, slice(0, 4))
     np.testing.assert_allclose(fit.slips, TIMES[4] - 0.5 * STEP)
+    assert wrong(fit) == [0, 1, 2, 3]
     assert angle < 3
     assert distance < 0.03
 
@@ -57,9 +64,10 @@ def test_a_slip_of_the_first_poses_keeps_the_later_ones():
 def test_a_slip_that_ends_in_the_window_has_two_times():
     fit, angle, _ = fitted(steady, slice(6, 10))
     np.testing.assert_allclose(fit.slips, TIMES[[6, 10]] - 0.5 * STEP)
+    assert wrong(fit) == [6, 7, 8, 9]
     assert angle < 3
 
 
 def test_tracks_without_a_slip_have_none():
     fit, _, _ = fitted(steady, slice(0, 0))
-    assert fit.slips == ()
+    assert fit.slips == () and fit.slipped == ()
