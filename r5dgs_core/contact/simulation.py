@@ -30,6 +30,7 @@ _TURN = 0.1  # rotation in one step of a flight of a body whose spin is not cons
 _CHECKED = 16  # steps between two searches for a flight
 _WORTH = 16.0  # least length of a flight, in steps
 _BEFORE = 1.3  # steps before a contact at which a flight ends; bounces are the most exact with a third of a step left
+_ALONE = {"contype": 0, "conaffinity": 0}  # of geometry that touches nothing but by explicit pairs
 _TOUCHING = 1e-3  # penetration that stays in the initial state, as a share of a body's size
 
 
@@ -64,6 +65,8 @@ class Simulation:
         self._geoms = np.array([self.model.geom(f"body{i}").id for i in range(len(world.bodies))], int)
         self._numbers = np.full(self.model.ngeom, -1)
         self._numbers[self._geoms] = range(len(self._geoms))
+        pairs = self._numbers[np.stack([self.model.pair_geom1, self.model.pair_geom2], axis=1)]
+        self._pairs = [[i for i in sorted(pair) if i >= 0] for pair in pairs.tolist()]
         self._flights = Flights(world, self.unit)
         moments = self.model.body_inertia[self.model.dof_bodyid[::6]]
         self._steady = bool((np.ptp(moments, axis=1) <= ROUND * moments.max(axis=1)).all())
@@ -71,18 +74,14 @@ class Simulation:
 
     def touch(self, materials: Sequence[Material]) -> None:
         """Set the materials of the B bodies."""
-        model, frequency = self.model, self.stepping.frequency
-        for i, material in enumerate(materials):
-            friction = min(max(material.friction, _LEAST_FRICTION), _MOST_FRICTION)
-            reference = restitution.reference(max(material.restitution, self.stepping.least_restitution), frequency)
-            model.geom_friction[self._geoms[i], 0] = friction
-            model.geom_solref[self._geoms[i]] = reference
-            if self.world.plane is not None and not self.world.bodies[i].fixed:
-                count = model.npair // len(self._moving)  # floor and ground
-                pairs = slice(count * self._moving.index(i), count * (self._moving.index(i) + 1))
-                model.pair_friction[pairs, :2] = friction
-                model.pair_solref[pairs] = reference
-                model.pair_solreffriction[pairs] = restitution.grip(reference)
+        model, frequency, least = self.model, self.stepping.frequency, self.stepping.least_restitution
+        for pair, bodies in enumerate(self._pairs):
+            own = [materials[i] for i in bodies]
+            friction = max(material.friction for material in own)
+            reference = restitution.reference(max(min(material.restitution for material in own), least), frequency)
+            model.pair_friction[pair, :2] = min(max(friction, _LEAST_FRICTION), _MOST_FRICTION)
+            model.pair_solref[pair] = reference
+            model.pair_solreffriction[pair] = restitution.grip(reference)
 
     def load(self, state: State) -> None:
         """Set the state at time 0."""
@@ -238,19 +237,24 @@ def _moved(now: State, rest: float | np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _specification(mujoco: Any, world: World, stepping: Stepping, unit: float) -> Any:
-    """Model of a world before it is compiled: an `MjSpec`, with lengths in a unit and masses in that of the largest."""
+    """Model of a world before it is compiled: an `MjSpec`, with lengths in a unit and masses in that of the largest.
+
+    All contacts are those of explicit pairs, as only these have a damping of friction of their own.
+    """
     spec = mujoco.MjSpec()
     option = spec.option
     option.timestep, option.gravity = stepping.step, world.gravity / unit
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.enableflags = int(mujoco.mjtEnableBit.mjENBL_SPECULATIVE)
-    geom = spec.default.geom
     masses = [body.density * body.solid.volume for body in world.bodies if not body.fixed] or [1.0]
     heaviest, impedance = max(masses), _impedance(max(masses) / min(masses))
-    geom.condim, geom.solimp = 3, impedance
+    shared = {"condim": 3, "solimp": impedance}
     for i, body in enumerate(world.bodies):
         _add_body(mujoco, spec, i, body, unit, body.density * unit**3 / heaviest)
+        for j, other in enumerate(world.bodies[:i]):
+            if not (body.fixed and other.fixed):
+                spec.add_pair(geomname1=f"body{j}", geomname2=f"body{i}", **shared)
         if world.plane is not None and not body.fixed:
             _add_floor(mujoco, spec, i, body, world, unit, impedance)
     return spec
@@ -262,12 +266,13 @@ def _add_body(mujoco: Any, spec: Any, number: int, body: Body, unit: float, dens
     if not body.fixed:
         added.add_freejoint()
     if radius is not None:
-        added.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius / unit, 0, 0], density=density)
+        sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+        added.add_geom(name=name, type=sphere, size=[radius / unit, 0, 0], density=density, **_ALONE)
         return
     mesh = spec.add_mesh(name=name)
     mesh.uservert, mesh.userface = ((solid.vertices - solid.center) / unit).ravel(), solid.triangles.ravel()
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-    added.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, density=density)
+    added.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, density=density, **_ALONE)
 
 
 def _impedance(mass_ratio: float) -> list[float]:
@@ -282,7 +287,6 @@ def _add_floor(
     """Add what a body rests on, which touches that body alone: a plane, or a prism over the ground."""
     assert world.plane is not None
     normal, height = world.plane.normal, world.plane.height if body.floor is None else body.floor
-    shared = {"contype": 0, "conaffinity": 0}
     levels = [(f"floor{number}", world.plane, height)]
     if world.edge is not None:
         ground = world.edge.ground
@@ -292,7 +296,7 @@ def _add_floor(
         mesh = spec.add_mesh(name=f"floor{number}")
         mesh.uservert = (np.concatenate([top, top - depth * normal]) / unit).ravel()
         spec.worldbody.add_geom(
-            name=f"floor{number}", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"floor{number}", **shared
+            name=f"floor{number}", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"floor{number}", **_ALONE
         )
         spec.add_pair(geomname1=f"floor{number}", geomname2=f"body{number}", condim=3, solimp=impedance)
     for name, plane, level in levels:
@@ -302,6 +306,6 @@ def _add_floor(
             size=[0, 0, 0.05],
             pos=level / unit * plane.normal,
             quat=rotations.between_vectors(np.array([0.0, 0.0, 1.0]), plane.normal),
-            **shared,
+            **_ALONE,
         )
         spec.add_pair(geomname1=name, geomname2=f"body{number}", condim=3, solimp=impedance)

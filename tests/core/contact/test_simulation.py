@@ -74,6 +74,31 @@ def test_two_balls_exchange_momentum_and_keep_it():
     assert after[0, 0] < 0.0 < after[1, 0] and 0.5 < (after[1] - after[0]) @ normal <= 0.95
 
 
+@pytest.mark.parametrize("e", [0.1, 0.5, 0.9])
+def test_a_collision_of_two_balls_with_enough_friction_ends_their_slip(e):
+    balls = [contacts.ball([x, 0, 0], friction=0.8, restitution=e) for x in (0, 1.5 * SIZE)]
+    runs, state = contacts.simulate(world.World(tuple(balls), None, np.zeros(3)))
+    radius = balls[0].ball_radius or 0.0
+    state.velocities[0] = [1.0, 0.2, 0.0]
+    state.places[0, 1] -= 0.2 * (1.5 * SIZE - 2 * radius)  # they meet along x
+    runs.load(state)
+    runs.advance(0.2)
+    now = runs.state()
+    slip = now.velocities[0, 1] - now.velocities[1, 1] + radius * (now.spins[0, 2] + now.spins[1, 2])
+    assert now.velocities[1, 0] > 0.5
+    assert abs(slip) < 0.1 * 0.2
+
+
+def test_of_two_bodies_the_rougher_and_the_less_elastic_one_count():
+    balls = contacts.ball([0, 0, 0], 0.2, 0.9), contacts.ball([1.5 * SIZE, 0, 0], 0.7, 0.5)
+    runs, state = contacts.simulate(world.World(balls, None, np.zeros(3)))
+    assert runs.model.pair_friction[0, 0] == 0.7
+    state.velocities[0, 0] = 1.0
+    runs.load(state)
+    runs.advance(0.5)
+    assert runs.state().velocities[:, 0] @ [-1, 1] == pytest.approx(0.5, abs=0.02)
+
+
 def test_bodies_of_equal_density_have_masses_by_volume():
     small = contacts.ball([0, 0, 0], restitution=0.9)
     large = dataclasses.replace(small, solid=solid.of(2 * small.solid.vertices + [0.3, 0, 0]))
