@@ -24,7 +24,6 @@ from ..data import dataset as datasets
 from ..errors import DatasetError
 from ..motion import rotations
 from ..playback import scene_player
-from ..raster import RasterSettings
 from ..render import scene_renderer
 from ..scene import cameras
 from ..scene.sampling import spread
@@ -207,16 +206,11 @@ class ImageEvidence:
             row: Index of the view.
             window: Rows and columns to draw; None for all.
         """
-        camera, settings = self._views[row].camera, None
-        if window is not None and window != self._whole(row):
-            rows, columns = window
-            size = columns.stop - columns.start, rows.stop - rows.start
-            # Gaussians beside the window are linearised where the whole image linearises them.
-            usual = RasterSettings(near_plane=self._scene.near_plane)
-            slack = (2 + usual.frustum_slack) * max(camera.width / size[0], camera.height / size[1])
-            settings = dataclasses.replace(usual, frustum_slack=slack)
-            camera = cameras.crop(camera, columns.start, rows.start, *size)
-        output = scene_renderer.render_frame(self._scene, frame, camera, settings=settings)
+        camera = self._views[row].camera
+        if window is None or window == self._whole(row):
+            output = scene_renderer.render_frame(self._scene, frame, camera)
+        else:
+            output = scene_renderer.render_window(self._scene, frame, camera, *window)
         return np.clip(output.color, 0, 1), np.where(output.ids < 0, PATCHES, output.ids)
 
     def _error(self, frame: scene_player.Frame, row: int, window: tuple[slice, slice] | None = None) -> float:

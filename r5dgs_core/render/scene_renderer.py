@@ -61,6 +61,19 @@ def render_frame(
     )
 
 
+def render_window(
+    scene: Scene, pose: scene_player.Frame | PosedScene, camera: Camera, rows: slice, columns: slice
+) -> RenderOutput:
+    """Render a part of a picture, a rectangle of its rows and columns; other arguments as in `render_frame`."""
+    width, height = columns.stop - columns.start, rows.stop - rows.start
+    usual = RasterSettings(near_plane=scene.near_plane)
+    # Gaussians beside the part are linearised where the whole picture linearises them.
+    slack = (2 + usual.frustum_slack) * max(camera.width / width, camera.height / height)
+    settings = dataclasses.replace(usual, frustum_slack=slack)
+    part = cameras.crop(camera, columns.start, rows.start, width, height)
+    return render_frame(scene, pose, part, settings=settings)
+
+
 def render(player: scene_player.Player, camera: Camera, t: float, **options: Any) -> RenderOutput:
     """Render a player's scene at a time, with centres relative to the camera, near which float32 is most precise.
 

@@ -264,3 +264,14 @@ def test_all_pictures_of_a_scene_far_from_the_origin_are_the_same(t):
         (alone, highlight.isolate(scene, [item.id for item in scene.objects], CAMERA, t)),
     ):
         assert np.mean((found - near) ** 2) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "window", [(slice(0, 40), slice(0, 48)), (slice(3, 17), slice(20, 48)), (slice(39, 40), slice(0, 1))]
+)
+def test_a_part_of_a_picture_is_a_part_of_the_whole_one(scene, window):
+    frame = scene_player.Player(scene).frame(0.3, CAMERA.center)
+    expected = scene_renderer.render_frame(scene, frame, CAMERA)
+    part = scene_renderer.render_window(scene, frame, CAMERA, *window)
+    np.testing.assert_allclose(part.color, expected.color[window], atol=TOLERANCE)
+    np.testing.assert_allclose(part.alpha, expected.alpha[window], atol=TOLERANCE)
