@@ -24,7 +24,7 @@ from scipy import ndimage
 from ..config.config import Config
 from ..data import dataset as datasets
 from ..motion import rotations
-from ..motion.history import UNKNOWN_TURN, PoseErrors
+from ..motion.history import UNKNOWN_TURN, History, PoseErrors
 from ..playback import scene_player
 from ..render import posed_scene, scene_renderer
 from ..render.posed_scene import PosedScene
@@ -282,6 +282,17 @@ def with_slips(errors: PoseErrors, times: np.ndarray, slipped: Iterable[tuple[fl
     for first, last in slipped:
         turn[(times > first) & (times < last) & (turn < UNKNOWN)] = UNKNOWN
     return dataclasses.replace(errors, turn=tuple(turn.tolist()))
+
+
+def with_unknown(
+    history: History, unseen: Unseen | None, times: np.ndarray, slipped: Sequence[tuple[float, float]]
+) -> History:
+    """Return a history whose errors name the rotations that the images do not determine or that slipped."""
+    errors = history.errors
+    if errors is None:
+        return history
+    errors = errors if unseen is None else with_unseen(errors, unseen)
+    return dataclasses.replace(history, errors=with_slips(errors, times, slipped) if slipped else errors)
 
 
 def weights(errors: PoseErrors, observed: np.ndarray, radius: float, turns: bool) -> np.ndarray:

@@ -26,7 +26,6 @@ from scipy import special
 
 from ..config.sections.needs import NeedsSection
 from ..motion import rotations
-from ..motion.history import History
 from ..motion_fit import model_selection, shared_gravity
 from ..scene.scene import MotionGroup, Scene
 from . import bind_state, future_fit, image_evidence, needs, pose_errors, track_checks, unseen_rotations
@@ -185,19 +184,10 @@ def simplify(
         if part.is_noise and part.group in models:
             models[part.group] = dataclasses.replace(models[part.group], **{part.kind.offset: np.zeros(3)})
     for index, model in models.items():
-        history = _history(shared[index], unseen.get(index), scene.tracks.times)
+        fit = shared[index]
+        history = pose_errors.with_unknown(fit.history, unseen.get(index), scene.tracks.times, fit.slipped)
         groups[index] = dataclasses.replace(groups[index], model=model, history=history)
     return Simplified(dataclasses.replace(bound, groups=tuple(groups)), tuple(rows))
-
-
-def _history(fit: model_selection.Fit, unseen: Unseen | None, times: np.ndarray) -> History:
-    """History of a fit, whose errors name the rotations that the images do not determine or that slipped."""
-    errors = fit.history.errors
-    if errors is not None and unseen is not None:
-        errors = pose_errors.with_unseen(errors, unseen)
-    if errors is not None and fit.slipped:
-        errors = pose_errors.with_slips(errors, times, fit.slipped)
-    return dataclasses.replace(fit.history, errors=errors)
 
 
 def _moving(scene: Scene) -> list[MotionGroup]:
