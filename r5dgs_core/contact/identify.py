@@ -261,7 +261,7 @@ class Fitter:
 
     def poses(self, state: State, material: Material, times: np.ndarray) -> se3.Pose:
         """Poses of the body at times since a state. [T, 4], [T, 3]"""
-        quats, places = self._many_poses(_batch_of_one(state), [material], times)
+        quats, places = self._many_poses(state.batch(), [material], times)
         return quats[0], places[0]
 
     def _many_poses(self, states: State, materials: Sequence[Material], times: np.ndarray) -> se3.Pose:
@@ -273,7 +273,7 @@ class Fitter:
     def residuals(self, state: State, material: Material, time: float) -> np.ndarray:
         """Differences from the observed poses from the time of a state on, in units of the noise. [2 S', 3]"""
         rows = slice(int(np.searchsorted(self.track.times, time)), None)
-        return self._residuals(_batch_of_one(state), [material], self.track.rows(rows))[0]
+        return self._residuals(state.batch(), [material], self.track.rows(rows))[0]
 
     def ballistic(self, track: Track) -> State:
         """State at the first of at least two poses in free flight, by a parabola and a constant spin."""
@@ -335,11 +335,6 @@ class Fitter:
             found[name] = np.tile(others, (*own.shape[:-2], 1, 1))
             found[name][..., self.body, :] = own[..., 0, :]
         return State(**found)
-
-
-def _batch_of_one(state: State) -> State:
-    """Add a leading dimension of one to a state."""
-    return State(state.places[None], state.quats[None], state.velocities[None], state.spins[None])
 
 
 def _logs(material: Material) -> np.ndarray:

@@ -112,6 +112,10 @@ class State:
         rows = slice(body, body + 1)
         return State(self.places[rows], self.quats[rows], self.velocities[rows], self.spins[rows])
 
+    def batch(self) -> State:
+        """The state as a batch of one, with a leading dimension for simulations of many states."""
+        return State(self.places[None], self.quats[None], self.velocities[None], self.spins[None])
+
 
 def at_rest(world: World) -> State:
     """State of bodies at rest in the bind state."""
