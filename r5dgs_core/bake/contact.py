@@ -7,7 +7,7 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
-from ..contact import held_out, scene_future
+from ..contact import held_out, restitution, scene_future
 from ..contact.scene_future import Prediction
 from ..errors import BackendError, Interrupted, R5dgsError
 from .draft import Context, Draft, Need
@@ -44,7 +44,8 @@ def needs(rows: Sequence[dict[str, Any]], found: Prediction) -> tuple[dict[str, 
 
 
 def _rows(found: Prediction) -> list[dict[str, Any]]:
-    rows = []
+    rows, bodies = [], () if found.world is None else found.world.bodies
+    materials = {body.name: material for body, material in zip(bodies, found.materials, strict=True)}
     for name, material in found.taken.items():
         value, threshold = found.penetrations.get(name, 0.0), scene_future.PENETRATION
         reason = "without contacts, it passes into others, in sizes" if value else "is pushed or hit by another body"
@@ -53,5 +54,8 @@ def _rows(found: Prediction) -> list[dict[str, Any]]:
         if (compared := found.compared.get(name)) is not None and compared.better:
             value, threshold = compared.smooth - compared.contact, held_out.BETTER
             reason = f"no smooth law explains its last motion; {compared.text()}"
-        rows.append({"object": name, **Need(NAME, value, threshold, True, f"{reason}; {material}").row()})
+        row = {"object": name, **Need(NAME, value, threshold, True, f"{reason}; {material}").row()}
+        if (own := materials.get(name)) is not None:  # as it is simulated
+            row |= {"friction": own.friction, "restitution": restitution.limited(own.restitution)}
+        rows.append(row)
     return rows

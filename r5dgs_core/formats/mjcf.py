@@ -15,6 +15,7 @@ from . import registry, rigid_bodies
 from .rigid_bodies import RigidBody
 
 KEY = "start"  # name of the keyframe
+_TORSION = (0.005, 0.0001)  # MuJoCo's torsional and rolling friction
 
 
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
@@ -36,10 +37,11 @@ def model(scene: Scene, bodies: list[RigidBody], height: float | None) -> Elemen
     option = {"timestep": numbers([rigid_bodies.time_step(scene)]), "integrator": "RK4", "cone": "elliptic"}
     add(root, "option", option, gravity=numbers(rigid_bodies.gravity(scene)))
     defaults = add(root, "default")
-    add(defaults, "geom", type="mesh", condim="3", friction=numbers([rigid_bodies.FRICTION, 0.005, 0.0001]))
+    add(defaults, "geom", type="mesh", condim="3", friction=numbers([rigid_bodies.FRICTION, *_TORSION]))
     assets, world = add(root, "asset"), add(root, "worldbody")
     if height is not None:
-        place = {"pos": numbers([0, 0, height]), "size": "0 0 1"}
+        # Of two geoms, the larger friction counts: that of the body.
+        place = {"pos": numbers([0, 0, height]), "size": "0 0 1", "friction": numbers([0, *_TORSION])}
         add(world, "geom", place, name=rigid_bodies.GROUND, type="plane")
     for body in bodies:
         corners = numbers(body.solid.vertices.ravel())
@@ -49,7 +51,9 @@ def model(scene: Scene, bodies: list[RigidBody], height: float | None) -> Elemen
             add(element, "freejoint", name=body.name)
         inertia = numbers(body.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
         add(element, "inertial", pos="0 0 0", mass=numbers([body.mass]), fullinertia=inertia)
-        add(element, "geom", name=body.name, mesh=body.name)
+        shape = add(element, "geom", name=body.name, mesh=body.name)
+        if body.friction != rigid_bodies.FRICTION:
+            shape.set("friction", numbers([body.friction, *_TORSION]))
     moving = [body for body in bodies if body.moves]
     if moving:
         places = np.concatenate([[*body.position, *body.quat] for body in moving])
@@ -68,8 +72,9 @@ FORMAT = registry.Format(
     name="mjcf",
     label="MuJoCo Model",
     suffix=".xml",
-    keeps="convex hulls as rigid bodies with mass, inertia, gravity, ground and a keyframe of poses and velocities",
-    loses="Gaussians, colours, learned motion, joints, concave shapes, shape of the ground, cameras",
+    keeps="convex hulls as rigid bodies with mass, inertia, fitted friction, gravity, ground and a keyframe of poses "
+    "and velocities",
+    loses="Gaussians, colours, learned motion, restitution, joints, concave shapes, shape of the ground, cameras",
     write=export,
     per_frame=True,
     losses=rigid_bodies.simulator_losses,

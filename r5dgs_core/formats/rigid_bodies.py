@@ -22,7 +22,7 @@ from . import ground, registry, scene_nodes
 
 WORLD, GROUND = "world", "ground"  # names that the files use; MuJoCo reserves the former
 DENSITY = 1000.0  # unknown; masses of bodies are proportional to their volumes
-FRICTION = 0.3
+FRICTION = 0.3  # of bodies whose motion does not tell it
 _NEAR = 0.2  # of the size: distance up to which the centre of rotation in flight replaces the centre of the hull
 
 
@@ -38,6 +38,8 @@ class RigidBody:
         velocity: Of the centre of mass. [3]
         spin: Angular velocity, world axes. [3]
         moves: False for an object without motion of its own.
+        friction: Coulomb coefficient of its contacts, `FRICTION` if it is unknown.
+        restitution: Speed after an impact over the speed before it, or None if it is unknown.
     """
 
     name: str
@@ -47,6 +49,8 @@ class RigidBody:
     velocity: np.ndarray
     spin: np.ndarray
     moves: bool
+    friction: float = FRICTION
+    restitution: float | None = None
 
     @property
     def mass(self) -> float:
@@ -76,7 +80,7 @@ def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
     start = {(one.object_id, one.group): one for one in object_poses.at(scene, (t,))}
     turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
     axes, length, time = rotations.rotmats_to_quats(turn), scene.units.meters_per_unit or 1.0, _time_unit(scene)
-    found = []
+    found, materials = [], _materials(scene)
     for (hull, body), name in zip(chosen, names, strict=True):
         group = scene.groups[hull.motion_id]
         center = _center_of_mass(group, body, turn[2])
@@ -97,6 +101,7 @@ def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
                 length / time * turn @ velocity,
                 turn @ spin / time,
                 hull.motion_id > 0,
+                *materials.get(scene.object(hull.object_id).name, (FRICTION, None)),
             )
         )
     return found
@@ -141,6 +146,16 @@ def simulator_losses(scene: Scene, options: registry.Options) -> list[str]:
     """As `losses`, for formats of simulators."""
     unknown = [] if gravity(scene).any() else ["gravity is unknown and set to 0; set it in the simulator"]
     return [*losses(scene, options), *unknown, ground.MISSING if ground_height(scene) is None else ground.LOSS]
+
+
+def _materials(scene: Scene) -> dict[str, tuple[float, float | None]]:
+    """Friction and restitution that contacts were simulated with, by name of the object."""
+    found: dict[str, tuple[float, float | None]] = {}
+    for row in scene.needs:
+        if row.get("name") == "contact" and isinstance(row.get("friction"), float):
+            e = row.get("restitution")
+            found[str(row.get("object"))] = max(row["friction"], 0.0), e if isinstance(e, float) else None
+    return found
 
 
 def _hulls(scene: Scene) -> tuple[Hull, ...]:

@@ -67,8 +67,10 @@ def _robot(scene: Scene, bodies: list[RigidBody], meshes: list[str], height: flo
         add(inertial, "inertia", {name: numbers([body.inertia[at]]) for name, at in entries.items()})
         for part in ("visual", "collision"):
             add(add(add(link, part), "geometry"), "mesh", filename=mesh)
-        friction = add(add(link, "contact"), "lateral_friction")
-        friction.set("value", numbers([rigid_bodies.FRICTION]))
+        contact = add(link, "contact")  # Bullet reads it
+        add(contact, "lateral_friction", value=numbers([body.friction]))
+        if body.restitution is not None:
+            add(contact, "restitution", value=numbers([body.restitution]))
         joint = add(root, "joint", name=f"{body.name} joint", type="floating" if body.moves else "fixed")
         add(joint, "origin", xyz=numbers(body.position), rpy=numbers(_roll_pitch_yaw(body.quat)))
         add(joint, "parent", link=rigid_bodies.WORLD)
@@ -107,8 +109,8 @@ FORMAT = registry.Format(
     name="urdf",
     label="URDF",
     suffix=".urdf",
-    keeps="convex hulls as links with mass, inertia and friction; poses, velocities, ground; one file per frame, and "
-    "one OBJ file per hull beside them",
+    keeps="convex hulls as links with mass, inertia, fitted friction and restitution; poses, velocities, ground; one "
+    "file per frame, and one OBJ file per hull beside them",
     loses="Gaussians, colours, learned motion, joints, concave shapes, shape of the ground, cameras",
     write=export,
     per_frame=True,

@@ -220,6 +220,22 @@ def test_a_thrown_box_lands_on_the_ground_under_the_one_that_rests(tmp_path, kin
     assert ground.LOSS in registry.get(kind).losses(boxes, OPTIONS)
 
 
+def test_the_files_have_the_friction_and_restitution_that_contacts_were_simulated_with(tmp_path):
+    mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
+    boxes = contact_scenes.scene(contact_scenes.falling(), contact_scenes.resting(2.0))
+    row = {"object": "box 1", "name": "contact", "decision": "on", "friction": 0.17, "restitution": 0.62}
+    boxes = dataclasses.replace(boxes, needs=(row,))
+    (path,) = mjcf.export(boxes, tmp_path / "a.xml", registry.Options((0.6,)))
+    model = mujoco.MjModel.from_xml_path(str(path))
+    frictions = {model.geom(k).name: model.geom_friction[k, 0] for k in range(model.ngeom)}
+    assert frictions == {rigid_bodies.GROUND: 0.0, "box 1": 0.17, "box 2": rigid_bodies.FRICTION}
+    *_, path = urdf.export(boxes, tmp_path / "a.urdf", registry.Options((0.6,)))
+    links = {link.get("name"): link.find("contact") for link in ElementTree.parse(path).findall("link")}
+    first, second = ({one.tag: float(one.get("value")) for one in links[name] or ()} for name in ("box 1", "box 2"))
+    assert first == {"lateral_friction": 0.17, "restitution": 0.62}
+    assert second == {"lateral_friction": rigid_bodies.FRICTION}
+
+
 def test_the_ground_is_below_all_observed_places_and_missing_if_nothing_rests(thrown):
     resting, flying = contact_scenes.resting(2.0), contact_scenes.falling(height=0.1)
     scene = contact_scenes.scene(flying, resting)
