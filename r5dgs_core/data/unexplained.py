@@ -34,6 +34,7 @@ OFTEN = 0.1  # share of the frames with clear differences in a region whose colo
 MARGIN = 0.05  # dilation of the masks, relative to the rows of blocks; it keeps the outlines of objects in training
 SPECK, GAP = 0.008, 0.03  # radius of removed specks and of closed gaps, relative to the rows of blocks
 SMALL = 0.002  # share of the image below which a region is ignored
+MOST = 0.7  # share of the image above which the camera or its colours have changed instead
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,8 @@ class UsualColors:
     def _of_blocks(self, small: np.ndarray, covered: np.ndarray) -> np.ndarray:
         clear, faint = _differences(small, self.colors, self.limit)
         allowed = self.known & ~covered
-        found = _cleaned(clear & allowed, (faint | self.unsteady) & allowed, self.unsteady & allowed)
-        return found & ~covered
+        found = ~covered & _cleaned(clear & allowed, (faint | self.unsteady) & allowed, self.unsteady & allowed)
+        return found if found.mean() <= MOST else np.zeros_like(found)
 
 
 class Seen(Protocol):

@@ -89,6 +89,16 @@ def test_pixels_of_masks_are_never_unexplained():
     assert not usual.blocks(image, mask)[:, :45].any()
 
 
+def test_a_change_of_the_whole_picture_is_no_body():
+    frames, _ = recording(body=True)
+    usual = unexplained.usual(frames)
+    image, mask = frames[4]
+    assert usual.blocks(image, mask).any()
+    tinted = np.minimum(image * np.array([0.6, 1.0, 1.4]), 255).astype(np.uint8)
+    assert not usual.blocks(tinted, mask).any()
+    assert not usual.blocks(np.roll(image, 30, axis=(0, 1)), mask).any()
+
+
 def test_too_few_frames_are_no_evidence():
     frames, _ = recording(body=True)
     assert unexplained.usual(frames[: unexplained.MIN_FRAMES - 1]) is None
