@@ -17,7 +17,7 @@ from . import array_encoding
 from .array_types import DTYPES, EMBEDDINGS
 from .json_row import Row
 
-# Steps of int16 members: a size changes by at most 0.4 %, an opacity by 0.4 %, a colour by 0.3 of 255 per coefficient.
+# Steps of int16 members: a size changes by at most 0.8 %, an opacity by 0.4 %, a colour by 0.3 of 255 per coefficient.
 STEPS = {"log_scales": 2.0**-6, "opacity_logits": 2.0**-5, "sh": 2.0**-7, "shading": 2.0**-9, "shading_rest": 2.0**-9}
 PLACES = ("means", "canonical_means")  # steps by object, from the sizes of its Gaussians
 PLACE_STEP = 1 / 16  # of the size of a small Gaussian of the object
@@ -174,8 +174,9 @@ def _encode_places(means: np.ndarray, sizes: np.ndarray, counts: Sequence[int]) 
 
 
 def _step_of_bytes(array: np.ndarray) -> float:
+    """Step by which the largest magnitude becomes 32 to 63, which gives the same step when it is written again."""
     largest = float(np.abs(array).max()) if array.size else 0.0
-    return min(max(2 * _power_of_two(largest / 64), _MIN_STEP), _MAX_STEP)
+    return min(max(2 * _power_of_two(largest / 63.5), _MIN_STEP), _MAX_STEP)
 
 
 def _power_of_two(value: float) -> float:

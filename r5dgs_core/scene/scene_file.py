@@ -87,9 +87,9 @@ def precision_of(path: str | Path) -> Precision:
     """
     with Archive(Path(path)) as archive:
         top = _read_json(archive)
+        if format_features.is_quantised(top.data):
+            return "quantised"
         headers = _read_headers(archive, top, (*array_encoding.FIXED_POINT, *array_encoding.HALF))
-    if format_features.is_quantised(top.data):
-        return "quantised"
     return "exact" if any(header.dtype == "<f4" for header in headers.values()) else "compact"
 
 

@@ -1,13 +1,12 @@
 """Quantised scene files: stated errors, equal bytes when written again, and faults of their own."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from r5dgs_core import check, errors, findings
 from r5dgs_core.motion import rotations
 from r5dgs_core.scene import format_features, quantised_arrays, scene_file
+from r5dgs_core.scene.array_types import EMBEDDINGS
 from tests.core.scene.test_scene_file import npy, rewrite
 from tests.fuzz.readers import rich_scene
 from tests.support.scenes import make_scene
@@ -23,8 +22,19 @@ ERRORS = {
     "residual_offsets": 1e-3,
 }
 TURN = 5e-3  # rad
-RELATIVE = {"dynamics": 2**-11, "embeddings": 2**-11, "vocabulary_embeddings": 2**-11}
-SAME = ("object_ids", "motion_ids", "track_times", "track_poses", "background_sh", "classifier_weight", "residual_rows")
+RELATIVE = {name: 2**-11 for name in ("dynamics", *EMBEDDINGS)}
+CHECKED_BELOW = ("quats", "residual_quats", "identities", "means", "canonical_means")
+SAME = (
+    "object_ids",
+    "motion_ids",
+    "track_times",
+    "track_poses",
+    "background_sh",
+    "classifier_weight",
+    "classifier_bias",
+    "residual_rows",
+    "origin",
+)
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +63,12 @@ def test_each_member_is_within_its_stated_error(scene, path):
             assert (change <= RELATIVE[name] * np.abs(array) + 3e-8).all(), name
         elif name in SAME:
             assert not change.any(), name
+        else:
+            assert name in CHECKED_BELOW
     assert angles(before["quats"], after["quats"]).max() < TURN
     assert angles(before["residual_quats"], after["residual_quats"]).max() < 1e-4
     identities = before["identities"].astype(float)
-    assert np.abs(after["identities"] - identities).max() <= np.abs(identities).max() / 64
+    assert np.abs(after["identities"] - identities).max() <= np.abs(identities).max() / 63
     sizes = np.exp(before["log_scales"].astype(float).mean(axis=-1))
     for item in scene.objects:
         rows = slice(item.start, item.start + item.count)
@@ -82,6 +94,18 @@ def test_rotations_whose_components_are_alike_are_stored_once_and_for_all():
     assert angles(quats, read).max() < TURN
     again, _ = quantised_arrays.encode({"quats": read, "log_scales": scales}, counts)
     np.testing.assert_array_equal(again["quats"], stored["quats"])
+
+
+@pytest.mark.parametrize("largest", [0.0, 31.8, 32.0, 63.4, 63.5, 63.9, 64.0, 127.4])
+def test_identity_encodings_of_any_range_are_stored_once_and_for_all(largest):
+    given = (largest / 32 * np.linspace(-1, 1, 96)).reshape(6, 16).astype(np.float32)
+    arrays = {"identities": given, "log_scales": np.zeros((6, 3), np.float32)}
+    stored, steps = quantised_arrays.encode(arrays, [6])
+    read = quantised_arrays.decode("identities", stored["identities"], steps, "a file")
+    assert np.abs(read - given).max() <= largest / 32 / 63
+    again, steps_again = quantised_arrays.encode(arrays | {"identities": read}, [6])
+    assert steps_again == steps
+    np.testing.assert_array_equal(again["identities"], stored["identities"])
 
 
 @pytest.mark.parametrize("far", [0.0, 50.0, 1e4, 1e15])
@@ -171,9 +195,9 @@ def test_faulty_steps_are_one_error(path, tmp_path, change, message):
 
 
 def test_whole_numbers_belong_to_quantised_files_alone(scene, path, tmp_path):
-    compact = scene_file.write(dataclasses.replace(scene), tmp_path / "compact.r5dgs")
-    for name, array in (("means", np.zeros(scene.gaussians.means.shape, np.int16)), ("quats", np.uint8)):
-        data = array if name == "means" else np.zeros(scene.gaussians.quats.shape, array)
+    compact = scene_file.write(scene, tmp_path / "compact.r5dgs")
+    for name, dtype in (("means", np.int16), ("quats", np.uint8)):
+        data = np.zeros_like(getattr(scene.gaussians, name), dtype)
         broken = rewrite(compact, tmp_path / "broken.r5dgs", replace={f"{name}.npy": npy(data)})
         with pytest.raises(errors.SceneFileError, match=f"{name}.npy"):
             scene_file.read(broken)
