@@ -34,6 +34,7 @@ SAME = (
     "classifier_bias",
     "residual_rows",
     "origin",
+    "light_direction",
 )
 
 
