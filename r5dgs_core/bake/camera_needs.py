@@ -28,7 +28,6 @@ def rows(record: Mapping[str, Any], config: Config) -> tuple[Need, ...]:
         on = part in record.get("refined", ())
         reason = f"size on which the pictures agree, {UNITS[part]}" if size is not None else "not examined"
         reason += f"; {sizes[part]}" if part in sizes else ""
-        wanted = getattr(config.needs, part)
-        reason = reason if wanted == "auto" else f"set {wanted} by the user; {reason}"
-        table.append(Need(part, size or 0.0, trial.least_size(part, config), on, reason, on))
+        need = Need(part, size or 0.0, trial.least_size(part, config), on, reason, on)
+        table.append(need.decided_by_training(getattr(config.needs, part)))
     return tuple(table)

@@ -166,6 +166,13 @@ class Need:
         reason = f"set {wanted} by the user{', but not trained' if missing else ''}; {self.reason}"
         return replace(self, on=on, reason=reason)
 
+    def decided_by_training(self, wanted: str) -> Need:
+        """Return the row of a part of training with the user's override in its reason; baking cannot change it."""
+        if wanted == "auto":
+            return self
+        kept = "" if wanted == ("on" if self.on else "off") else ", but training has decided otherwise"
+        return replace(self, reason=f"set {wanted} by the user{kept}; {self.reason}")
+
     def row(self) -> dict[str, Any]:
         """Return the row as it is stored in a scene."""
         return {

@@ -136,9 +136,8 @@ def left_out(tensors: Mapping[str, Tensor], config: Config) -> Need:
     found = tensors.get(checkpoint_content.UNEXPLAINED)
     share, on = (0.0, False) if found is None else (float(found[0]), bool(found[1]))
     reason = "not examined" if found is None else "share of the pixels that move although no mask names them"
-    wanted = config.needs.unexplained_regions
-    reason = reason if wanted == "auto" else f"set {wanted} by the user; {reason}"
-    return Need(unexplained.NEED, share, config.init.unexplained, on, reason, on)
+    need = Need(unexplained.NEED, share, config.init.unexplained, on, reason, on)
+    return need.decided_by_training(config.needs.unexplained_regions)
 
 
 def _summary(moves: RegroupCounts | None) -> str:

@@ -32,7 +32,7 @@ def follow(dataset_root: Path, workers: Workers) -> None:
     dataset = datasets.read(dataset_root, config.data.masks, config.data.min_registered)
     if devices.select(config.train.device).type == devices.CPU:
         warm_up.warm_up()
-    trainer = Trainer(dataset, config, found, workers)
+    trainer = Trainer(dataset, config, found, workers, state)
     if state is not None:
         trainer.restore(state)
     decision = run.decision_step(trainer)

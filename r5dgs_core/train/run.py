@@ -166,7 +166,7 @@ def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]
         note = memory.note(dataset, run.config.data.memory)
         progress({"event": "prepare", "text": f"images, objects, background{note}"})
         request.workers.broadcast((run.config, found, state))
-        trainer = Trainer(dataset, run.config, found, request.workers)
+        trainer = Trainer(dataset, run.config, found, request.workers, state)
         held_out = view_psnr.configured(trainer)
     if replaces:
         run = run_folder.create_run(folder, dataset, request.config)

@@ -60,6 +60,7 @@ class Trainer:
         config: The run's configuration.
         discovered_masks: Masks of the training views for the initialisation, if the data set has none.
         workers: Processes that take the same steps.
+        state: Checkpoint that `restore` will be called with, whose choice of training data is kept.
 
     Raises:
         DatasetError: The training split is empty or cannot be read, or no Gaussian can be placed.
@@ -71,6 +72,7 @@ class Trainer:
         config: Config,
         discovered_masks: Sequence[np.ndarray] | None = None,
         workers: Workers = ALONE,
+        state: Checkpoint | None = None,
     ):
         workers.check_batch(config.train.batch)
         self.workers = workers
@@ -82,7 +84,7 @@ class Trainer:
         self.behind = train_views.behind(dataset, config)
         self._memory = memory.for_images(config.data.memory)
         views = train_views.load(dataset, self.normalization, self.behind, self._memory)
-        self.given_views, self.unexplained = unexplained_views.decide(views, config)
+        self.given_views, self.unexplained = unexplained_views.decide(views, config, state)
         self.discovered_masks, shown = None, self.given_views
         if discovered_masks is not None:
             self.discovered_masks = packed_masks.pack(discovered_masks)

@@ -17,6 +17,8 @@ from torch import Tensor
 from ..config.config import Config
 from ..data import masks, unexplained
 from ..data.unexplained import UsualColors
+from . import checkpoint_content
+from .checkpoint import Checkpoint
 from .train_views import IMAGE, MASK, TrainView, in_turn
 
 log = logging.getLogger(__name__)
@@ -45,27 +47,35 @@ class Decision:
         return cls(share, bool(on))
 
 
-def decide(views: Sequence[TrainView], config: Config) -> tuple[list[TrainView], Decision | None]:
+def decide(
+    views: Sequence[TrainView], config: Config, state: Checkpoint | None = None
+) -> tuple[list[TrainView], Decision | None]:
     """Return the views, without unexplained regions if there are more of them than ``init.unexplained``.
 
     Args:
         views: Training views.
         config: Configuration of the run.
+        state: Checkpoint from which the run continues. Its decision is kept; a release that made none trained on whole
+            images.
 
     Returns:
         The same views if the regions are few; and the decision, None if no fixed camera has enough frames with masks or
         the user has switched the search off.
     """
     wanted = config.needs.unexplained_regions
-    if wanted == "off":
-        return list(views), None
+    stored = None if state is None else state.tensors.get(checkpoint_content.UNEXPLAINED)
+    earlier = None if stored is None else Decision.of(stored)
+    if wanted == "off" or (state is not None and (earlier is None or not earlier.on)):
+        return list(views), earlier
     usual = unexplained.of_cameras([view for view in views if view.has_mask], _read)
     if not usual:
         return list(views), None
-    share = float(np.mean([one.share for one in usual.values()]))
-    on = wanted == "on" or share > config.init.unexplained
-    log.info("regions that no mask explains: %.1f %% of the pixels; %s", 100 * share, "left out" if on else "trained")
-    return _without(views, usual) if on else list(views), Decision(share, on)
+    if earlier is None:
+        share = float(np.mean([one.share for one in usual.values()]))
+        earlier = Decision(share, wanted == "on" or share > config.init.unexplained)
+    done = "left out" if earlier.on else "trained"
+    log.info("regions that no mask explains: %.1f %% of the pixels; %s", 100 * earlier.share, done)
+    return _without(views, usual) if earlier.on else list(views), earlier
 
 
 def _read(views: Sequence[TrainView]) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:

@@ -1,23 +1,26 @@
 """Training leaves out what moves although no mask names it, and nothing else."""
 
 import dataclasses
+import signal
+import types
 
 import numpy as np
 import pytest
 import torch
 from scipy import ndimage
 
+from r5dgs_core import errors
 from r5dgs_core.bake import needs
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import masks, unexplained
 from r5dgs_core.evaluation import evaluate, explained
 from r5dgs_core.raster import RasterStats
-from r5dgs_core.train import checkpoint_content, train_views, unexplained_views
+from r5dgs_core.train import checkpoint, checkpoint_content, losses, run, train_views, unexplained_views
 from r5dgs_core.train.initialization import background_images
 from r5dgs_core.train.normalization import Normalization
 from r5dgs_core.train.step_graphs import StepInputs
-from r5dgs_core.train.trainer import Trainer
+from r5dgs_core.train.trainer import Trainer, _without
 from tests.support import passers_by, tiny_datasets
 
 
@@ -27,9 +30,9 @@ def crossed(tiny, tmp_path_factory):
     return passers_by.add(tiny.root, tmp_path_factory.mktemp("crossed") / "data")
 
 
-def decided(dataset, *overrides):
+def decided(dataset, *overrides, state=None):
     views = train_views.load(dataset, Normalization(np.zeros(3), 1.0), None)
-    return views, *unexplained_views.decide(views, tiny_datasets.settings(*overrides))
+    return views, *unexplained_views.decide(views, tiny_datasets.settings(*overrides), state)
 
 
 def hidden(dataset, index):
@@ -80,6 +83,54 @@ def test_pixels_that_are_always_left_out_are_no_background(crossed):
     assert not background_images.compute(mine)[0].known.any()
 
 
+def of_run(decision):
+    """Stand-in for a checkpoint with a decision, or with none."""
+    return types.SimpleNamespace(tensors={checkpoint_content.UNEXPLAINED: decision.tensor()} if decision else {})
+
+
+def test_a_resumed_run_keeps_its_decision(crossed, tiny):
+    kept = unexplained_views.Decision(0.02, True)
+    _, views, decision = decided(crossed, state=of_run(kept))
+    assert decision == kept and all(view.load_unexplained is not None for view in views)
+    dropped = unexplained_views.Decision(0.2, False)
+    for state, expected in ((of_run(dropped), dropped), (of_run(None), None)):  # the last one is of an older release
+        _, views, decision = decided(crossed, state=state)
+        assert decision == expected and all(view.load_unexplained is None for view in views)
+
+
+@pytest.mark.heavy
+def test_resuming_does_not_search_again(crossed, tmp_path, monkeypatch):
+    def stop(event):
+        if event.get("iteration", 0) >= 20:
+            signal.raise_signal(signal.SIGINT)
+
+    settings = tiny_datasets.settings("train.iterations=30", "init.unexplained=0.5")
+    with pytest.raises(errors.Interrupted):
+        run.train(crossed.root, tmp_path / "run", settings, progress=stop)
+    before = checkpoint.load(tmp_path / "run").tensors[checkpoint_content.UNEXPLAINED]
+    monkeypatch.setattr(unexplained, "of_cameras", lambda *_: pytest.fail("searched again"))
+    run.train(crossed.root, tmp_path / "run", settings, resume=True)
+    assert torch.equal(checkpoint.load(tmp_path / "run").tensors[checkpoint_content.UNEXPLAINED], before)
+
+
+def test_left_out_pixels_change_neither_the_loss_nor_its_gradient():
+    rng = np.random.default_rng(0)
+    picture, target = (torch.from_numpy(rng.random((16, 16, 3), np.float32)) for _ in range(2))
+    region = np.zeros((16, 16), bool)
+    region[3:7, 5:12] = True
+    inside = torch.from_numpy(region)[..., None]
+    found = []
+    for given in (target, torch.where(inside, 1 - target, target), torch.where(inside, target, 1 - target)):
+        image = picture.clone().requires_grad_()
+        loss = losses.photometric(*_without(region, image, given), 0.2)
+        (gradient,) = torch.autograd.grad(loss, image)
+        assert not gradient[region].any() and gradient[~region].any()
+        found.append((float(loss), gradient))
+    assert found[0][0] == found[1][0] and torch.equal(found[0][1], found[1][1])
+    assert found[0][0] != found[2][0]
+
+
+@pytest.mark.slow
 @pytest.mark.heavy
 def test_pixels_of_the_regions_have_no_effect_on_a_step(crossed):
     trainer = Trainer(crossed, tiny_datasets.settings("train.iterations=10"))
@@ -106,6 +157,9 @@ def test_the_decision_is_kept_in_checkpoints_and_in_the_table_of_needs(crossed):
     assert (row["name"], row["decision"], row["threshold"]) == (unexplained.NEED, "on", 0.03)
     assert row["value"] == trainer.unexplained.share
     assert needs.left_out({}, config.Config()).row()["reason"] == "not examined"
+    late = needs.left_out(tensors, settings.replace(**{"needs.unexplained_regions": "off"})).row()
+    assert late["decision"] == "on"
+    assert late["reason"].startswith("set off by the user, but training has decided otherwise; share")
 
 
 def test_the_evaluation_measures_the_explained_regions_on_their_own(crossed):
