@@ -5,7 +5,8 @@ A `Stage` is a module with a function ``apply``, which leaves the arrays of its 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -196,6 +197,7 @@ class Draft:
         bent: The row "residuals" of the needs table; `point_motion` measures it.
         trained: The scene before its motion was simplified.
         parts: Rows of the needs table for parts of single bodies' motion.
+        slipped: First and last time of rotations that slipped, by group.
     """
 
     scene: Scene
@@ -205,6 +207,7 @@ class Draft:
     bent: Need
     trained: Scene | None = None
     parts: tuple[dict[str, Any], ...] = ()
+    slipped: Mapping[int, Sequence[tuple[float, float]]] = field(default_factory=dict)
 
 
 class Stage(Protocol):

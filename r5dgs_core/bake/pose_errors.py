@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +24,7 @@ from scipy import ndimage
 from ..config.config import Config
 from ..data import dataset as datasets
 from ..motion import rotations
-from ..motion.history import UNKNOWN_TURN, History, PoseErrors
+from ..motion.history import UNKNOWN_TURN, PoseErrors
 from ..playback import scene_player
 from ..render import posed_scene, scene_renderer
 from ..render.posed_scene import PosedScene
@@ -270,29 +270,18 @@ def with_unseen(errors: PoseErrors, unseen: Unseen) -> PoseErrors:
     return dataclasses.replace(errors, turn=tuple(np.where(np.isinf(turn), turn, every).tolist()))
 
 
-def with_slips(errors: PoseErrors, times: np.ndarray, slipped: Iterable[tuple[float, float]]) -> PoseErrors:
-    """Return the errors of all rotations, with `UNKNOWN` for those that slipped, for the scene file.
-
-    Args:
-        errors: Errors of the poses.
-        times: Their times. [S]
-        slipped: First and last time of slipped rotations.
-    """
-    turn = np.array(errors.turn)
-    for first, last in slipped:
-        turn[(times > first) & (times < last) & (turn < UNKNOWN)] = UNKNOWN
-    return dataclasses.replace(errors, turn=tuple(turn.tolist()))
-
-
-def with_unknown(
-    history: History, unseen: Unseen | None, times: np.ndarray, slipped: Sequence[tuple[float, float]]
-) -> History:
-    """Return a history whose errors name the rotations that the images do not determine or that slipped."""
-    errors = history.errors
-    if errors is None:
-        return history
-    errors = errors if unseen is None else with_unseen(errors, unseen)
-    return dataclasses.replace(history, errors=with_slips(errors, times, slipped) if slipped else errors)
+def with_slips(scene: Scene, slipped: Mapping[int, Sequence[tuple[float, float]]]) -> Scene:
+    """Return the scene with the error `UNKNOWN` of the rotations that slipped, given by group as in `draft.Draft`."""
+    groups = list(scene.groups)
+    for index, spans in slipped.items():
+        past, times = groups[index].history, scene.tracks.times
+        if past.errors is not None:
+            turn = np.array(past.errors.turn)
+            for first, last in spans:
+                turn[(times > first) & (times < last) & (turn < UNKNOWN)] = UNKNOWN
+            errors = dataclasses.replace(past.errors, turn=tuple(turn.tolist()))
+            groups[index] = dataclasses.replace(groups[index], history=dataclasses.replace(past, errors=errors))
+    return dataclasses.replace(scene, groups=tuple(groups))
 
 
 def weights(errors: PoseErrors, observed: np.ndarray, radius: float, turns: bool) -> np.ndarray:

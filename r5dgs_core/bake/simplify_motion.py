@@ -17,7 +17,7 @@ Notation: G groups, S poses. Until `bind_state.rebind`, poses are relative to th
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -116,10 +116,12 @@ class Simplified:
     Attributes:
         scene: The scene, in a new bind state for bodies whose last pose was not on the simplified motion.
         rows: Measurements and decisions for each body, as rows of the needs table.
+        slipped: See `Draft`.
     """
 
     scene: Scene
     rows: tuple[dict[str, Any], ...]
+    slipped: Mapping[int, Sequence[tuple[float, float]]]
 
 
 def apply(draft: Draft, context: Context) -> Draft:
@@ -128,10 +130,10 @@ def apply(draft: Draft, context: Context) -> Draft:
     evidence = image_evidence.gather(draft.scene, context.dataset, context.config)
     measured = pose_errors.NOTHING
     if evidence is not None:
-        groups = [group.id for group in _moving(draft.scene)]
-        measured = pose_errors.measure(draft.scene, context.dataset, context.config, groups, not context.discovered)
+        ids = [group.id for group in _moving(draft.scene)]
+        measured = pose_errors.measure(draft.scene, context.dataset, context.config, ids, not context.discovered)
     found = simplify(draft.scene, observed, evidence, context.wanted, measured)
-    return dataclasses.replace(draft, scene=found.scene, trained=draft.scene, parts=found.rows)
+    return dataclasses.replace(draft, scene=found.scene, trained=draft.scene, parts=found.rows, slipped=found.slipped)
 
 
 def simplify(
@@ -178,16 +180,17 @@ def simplify(
         found += [_unseen_row(unseen[g.id])] if g.id in unseen else []
         rows += [{"object": names[g.object_id], **row} for row in found]
     shared = future_fit.share_gravity(fits, scene.world_convention)
-    models = {index: fit.model for index, fit in shared.items()}
-    groups = list(bound.groups)
+    models, groups = {index: fit.model for index, fit in shared.items()}, list(bound.groups)
     for part in parts:  # a model fitted without noise starts at the bind state
         if part.is_noise and part.group in models:
             models[part.group] = dataclasses.replace(models[part.group], **{part.kind.offset: np.zeros(3)})
     for index, model in models.items():
-        fit = shared[index]
-        history = pose_errors.with_unknown(fit.history, unseen.get(index), scene.tracks.times, fit.slipped)
+        history = shared[index].history
+        if index in unseen and history.errors is not None:
+            history = dataclasses.replace(history, errors=pose_errors.with_unseen(history.errors, unseen[index]))
         groups[index] = dataclasses.replace(groups[index], model=model, history=history)
-    return Simplified(dataclasses.replace(bound, groups=tuple(groups)), tuple(rows))
+    slipped = {index: fit.slipped for index, fit in shared.items() if fit.slipped}
+    return Simplified(dataclasses.replace(bound, groups=tuple(groups)), tuple(rows), slipped)
 
 
 def _moving(scene: Scene) -> list[MotionGroup]:

@@ -1,21 +1,25 @@
 """The stage of baking that adds contacts."""
 
 import builtins
+import dataclasses
 import types
 
+import numpy as np
 import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.bake import contact
 from r5dgs_core.bake.draft import Draft
 from r5dgs_core.config.sections.needs import NeedsSection
+from r5dgs_core.contact import scene_future
+from r5dgs_core.motion.history import UNKNOWN_TURN, History, PoseErrors
 from tests.support import contact_scenes
 
 FALLING, RESTING = contact_scenes.scene(contact_scenes.falling()), contact_scenes.scene(contact_scenes.resting())
 
 
-def baked(scene, wanted="auto"):
-    draft = Draft(scene, None, None, None, None, parts=({"name": "motion"},))
+def baked(scene, wanted="auto", **options):
+    draft = Draft(scene, None, None, None, None, parts=({"name": "motion"},), **options)
     return draft, contact.apply(draft, types.SimpleNamespace(wanted=NeedsSection(contact=wanted)))
 
 
@@ -29,6 +33,23 @@ def test_a_body_that_would_pass_through_the_floor_gets_contacts_and_a_row_with_t
     assert before == {"name": "motion"} and row["object"] == "box 1" and row["name"] == "contact"
     assert row["friction"] == pytest.approx(0.3, abs=0.05) and 0.05 <= row["restitution"] <= 0.98
     assert row["decision"] == "on" and row["value"] > row["threshold"] == 0.02 and "friction" in row["reason"]
+
+
+def test_contacts_are_told_of_slipped_rotations_and_a_scene_without_need_is_not(monkeypatch):
+    times = contact_scenes.TIMES
+    errors = PoseErrors((0.01,) * len(times), (0.02,) * len(times))
+    groups = [dataclasses.replace(group, history=History(errors=errors)) for group in FALLING.groups]
+    scene, given = dataclasses.replace(FALLING, groups=tuple(groups)), []
+
+    def predict(scene):
+        given.append(scene.groups[1].history.errors)
+        return scene_future.Prediction(scene.groups, {}, {}, ())
+
+    monkeypatch.setattr(contact.scene_future, "predict", predict)
+    draft, after = baked(scene, slipped={1: [(times[2], times[5]), (times[-2], np.inf)]})
+    unknown = [n for n, turn in enumerate(given[0].turn) if turn == UNKNOWN_TURN]
+    assert unknown == [3, 4, len(times) - 1] and given[0].place == errors.place
+    assert after is draft and after.scene.groups[1].history.errors == errors
 
 
 @pytest.mark.parametrize(("scene", "wanted"), [(RESTING, "auto"), (FALLING, "off")])

@@ -91,12 +91,6 @@ def test_without_any_view_all_observed_poses_count_alike():
     assert pose_errors.weights(exact, np.array([True, True]), 1.0, True).tolist() == [1, 1]
 
 
-def test_slipped_rotations_are_stored_as_unknown():
-    errors = PoseErrors((0.1,) * 4, (0.01, 0.01, 0.01, np.inf))
-    found = pose_errors.with_slips(errors, np.arange(4.0), [(0.5, 1.5), (2.5, np.inf)])
-    assert found.turn == (0.01, pose_errors.UNKNOWN, 0.01, np.inf) and found.place == errors.place
-
-
 def test_rotations_about_unseen_axes_are_stored_as_unknown():
     errors = PoseErrors((0.1, 0.1), (0.01, np.inf))
     some = pose_errors.with_unseen(errors, Unseen(np.eye(3)[:1], 0.1))
