@@ -84,7 +84,8 @@ def _fall(gap: float, speed: float, pull: float) -> float:
     root = speed * speed - 2 * pull * gap
     if root < 0:
         return math.inf
-    return 2 * gap / (math.sqrt(root) - speed)
+    root = math.sqrt(root)
+    return -(speed + root) / pull if speed > 0 else 2 * gap / (root - speed)  # without a difference of equal numbers
 
 
 def _meeting(apart: list[float], speed: list[float], reach: float) -> float:

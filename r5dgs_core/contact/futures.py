@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,8 +47,8 @@ class Futures:
         return float((apart[np.argmin(np.median(apart, axis=1))] > _FACE).mean())
 
 
-def draw(fitter: Fitter, estimate: Estimate, rng: np.random.Generator) -> tuple[State, Material]:
-    """Draw a state and a material from an estimate.
+def draws(fitter: Fitter, estimate: Estimate, rng: np.random.Generator) -> Iterator[tuple[State, Material]]:
+    """Yield states and materials that are drawn from an estimate, without end.
 
     Standard deviations that come from poses are multiplied by `WIDENED`, those of a prior are not.
     Draws that contradict the poses are repeated, the last ones closer to the estimate. In contact, the poses are no
@@ -56,13 +58,16 @@ def draw(fitter: Fitter, estimate: Estimate, rng: np.random.Generator) -> tuple[
     told = np.linalg.inv(estimate.covariance) - assumed
     root = np.linalg.cholesky(np.linalg.inv(told / WIDENED**2 + assumed))
     fitted = fitter.residuals(estimate.state, estimate.material, estimate.time)
-    for attempt in range(2 * _ATTEMPTS):
-        closer = 0.5 ** max(attempt - _ATTEMPTS, 0)
-        drawn = fitter.moved(estimate.state, estimate.material, closer * root @ rng.normal(size=PARAMETERS))
-        change = fitter.residuals(*drawn, estimate.time) - fitted
-        if (change**2).sum() <= WIDENED**2 * CONTRADICTS:
-            return drawn
-    return estimate.state, estimate.material
+    while True:
+        found = estimate.state, estimate.material
+        for attempt in range(2 * _ATTEMPTS):
+            closer = 0.5 ** max(attempt - _ATTEMPTS, 0)
+            drawn = fitter.moved(estimate.state, estimate.material, closer * root @ rng.normal(size=PARAMETERS))
+            change = fitter.residuals(*drawn, estimate.time) - fitted
+            if (change**2).sum() <= WIDENED**2 * CONTRADICTS:
+                found = drawn
+                break
+        yield found
 
 
 def sample(
@@ -82,8 +87,7 @@ def sample(
         rng: Source of the samples.
     """
     quats, places = np.empty((len(times), count, 4)), np.empty((len(times), count, 3))
-    for n in range(count):
-        state, material = draw(fitter, estimate, rng)
+    for n, (state, material) in enumerate(itertools.islice(draws(fitter, estimate, rng), count)):
         quats[:, n], places[:, n] = fitter.poses(state, material, times - estimate.time)
     good = np.isfinite(places).all(axis=(0, 2))
     return Futures(times, quats[:, good], places[:, good])

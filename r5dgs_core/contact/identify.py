@@ -205,10 +205,12 @@ class Fitter:
             here = self._residuals(*self._many_moved(state, prior.material, x), track)
             losses = robust_weights.cauchy_losses((here**2).sum(axis=-1), _OUTLIER)
             cost = float(losses.sum() + ((precision * x) ** 2).sum())
-            if not cost <= least:  # the step is rejected
+            if not cost <= least * (1 + 1e-9):  # the solver rejects the step
                 return here, np.zeros((1, PARAMETERS, *here.shape[1:]))
-            least = cost
-            return here, self._slopes(state, prior, track, x[0], here[0])[None]
+            slopes = self._slopes(state, prior, track, x[0], here[0])
+            if np.isfinite(slopes).all():  # else the solver rejects this step, too
+                least = cost
+            return here, slopes[None]
 
         found = levenberg_marquardt.solve_linearized(
             linearized, start[None], precision=precision, softness=_OUTLIER, steps=steps, enough=_NEGLIGIBLE

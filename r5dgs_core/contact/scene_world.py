@@ -126,11 +126,12 @@ class SceneWorld:
         rng, start = np.random.default_rng(wishes.seed), self.start(t_max)
         for number, body in enumerate(self.bodies):
             start.velocities[number] += wishes.pushes.get(body.group.id, np.zeros(3))
+        drawn_of = {number: futures.draws(*fit, rng) for number, fit in self.fits.items()}
         for _ in range(wishes.samples):
             state, used = _copy(start), list(materials)
             for number, (fitter, estimate) in self.fits.items():
                 group = self.bodies[number].group.id
-                drawn, material = futures.draw(fitter, estimate, rng)
+                drawn, material = next(drawn_of[number])
                 _put(state, number, fitter.at(dataclasses.replace(estimate, state=drawn, material=material), t_max))
                 state.velocities[number] += wishes.pushes.get(group, np.zeros(3))
                 used[number] = wishes.material(group, material)

@@ -139,8 +139,10 @@ class Simulation:
         kept = option.timestep, option.integrator, option.disableflags
         option.timestep, option.integrator = span / steps, int(self.mujoco.mjtIntegrator.mjINT_RK4)
         option.disableflags = kept[2] | int(self.mujoco.mjtDisableBit.mjDSBL_CONTACT)
-        self.mujoco.mj_step(self.model, self.data, steps)
-        option.timestep, option.integrator, option.disableflags = kept
+        try:
+            self.mujoco.mj_step(self.model, self.data, steps)
+        finally:
+            option.timestep, option.integrator, option.disableflags = kept
 
     def state_at(self, time: float) -> State:
         """Simulate up to a time, the rest after the last whole step at constant rates, and return the state there."""

@@ -42,6 +42,12 @@ def test_two_bodies_that_fall_together_fly_until_they_meet():
     assert free(place, state) == np.inf
 
 
+@pytest.mark.parametrize(("gap", "speed", "pull"), [(1.0, 1.0, -1e-17), (1e-16, 10.0, -9.8), (2.0, 3.0, -9.8)])
+def test_a_body_that_rises_flies_until_it_has_come_down_again(gap, speed, pull):
+    found = flights._fall(gap, speed, pull)
+    assert found == pytest.approx(2 * speed / -pull, rel=1e-9) or gap + speed * found + 0.5 * pull * found**2 < 1e-9
+
+
 @pytest.mark.parametrize("fixed", [False, True])
 def test_a_body_that_touches_or_may_touch_another_does_not_fly(fixed):
     place = contacts.on_plane(contacts.box([0, 0, 1.0]), contacts.box([0.05, 0, 1.0 + SIZE], fixed=fixed))

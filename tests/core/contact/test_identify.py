@@ -1,6 +1,7 @@
 """Material and state of simulated tosses are found from noisy poses."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -71,13 +72,30 @@ def test_a_flight_tells_nothing_about_the_material():
     assert len(fitter.track) >= 3
     np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance))[12:], [0.6, 1.0], rtol=0.2)
     rng = np.random.default_rng(2)
-    drawn = [np.log(futures.draw(fitter, estimate, rng)[1].friction) for _ in range(400)]
+    found = itertools.islice(futures.draws(fitter, estimate, rng), 400)
+    drawn = [np.log(material.friction) for _, material in found]
     assert np.std(drawn) == pytest.approx(0.6, rel=0.15)  # a prior is not widened
     first, again = (
         futures.sample(fitter, estimate, times[[3, -1]], 24, np.random.default_rng(1)).radii(places[[3, -1]], 0.9)
         for _ in range(2)
     )
     assert first.tolist() == again.tolist() and first[1] > 2 * first[0]
+
+
+def test_a_simulation_that_fails_beside_the_best_state_leaves_its_uncertainty_known(monkeypatch):
+    fitter, _, _ = observed(0.11, height=0.22, noise=1e-4)
+    expected = fitter.run()
+    slopes, calls = fitter._slopes, []
+
+    def failing(*arguments):
+        calls.append(None)
+        found = slopes(*arguments)
+        return np.full_like(found, np.nan) if len(calls) == 2 else found
+
+    monkeypatch.setattr(fitter, "_slopes", failing)
+    found = fitter.run()
+    assert len(calls) > 2
+    np.testing.assert_allclose(np.diag(found.covariance), np.diag(expected.covariance), rtol=0.5)
 
 
 @pytest.mark.parametrize("slipped", [slice(0, 1), slice(2, 4)], ids=["first", "last"])
