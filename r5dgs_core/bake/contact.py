@@ -46,7 +46,7 @@ def needs(rows: Sequence[dict[str, Any]], found: Prediction) -> tuple[dict[str, 
 
 def _rows(found: Prediction) -> list[dict[str, Any]]:
     rows, bodies = [], () if found.world is None else found.world.bodies
-    materials = {body.name: material for body, material in zip(bodies, found.materials, strict=True)}
+    simulated = {body.name: (body, material) for body, material in zip(bodies, found.materials, strict=True)}
     for name, material in found.taken.items():
         value, threshold = found.penetrations.get(name, 0.0), scene_future.PENETRATION
         reason = "without contacts, it passes into others, in sizes" if value else "is pushed or hit by another body"
@@ -56,7 +56,9 @@ def _rows(found: Prediction) -> list[dict[str, Any]]:
             value, threshold = compared.smooth - compared.contact, held_out.BETTER
             reason = f"no smooth law explains its last motion; {compared.text()}"
         row = {"object": name, **Need(NAME, value, threshold, True, f"{reason}; {material}").row()}
-        if (own := materials.get(name)) is not None:  # as it is simulated
+        if name in simulated:
+            body, own = simulated[name]  # the id, as users change names
+            row |= {"object_id": body.group.object_id}
             row |= {"friction": own.friction, "restitution": restitution.limited(own.restitution)}
         rows.append(row)
     return rows

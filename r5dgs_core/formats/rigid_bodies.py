@@ -101,7 +101,7 @@ def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
                 length / time * turn @ velocity,
                 turn @ spin / time,
                 hull.motion_id > 0,
-                *materials.get(scene.object(hull.object_id).name, (FRICTION, None)),
+                *materials.get(hull.object_id, (FRICTION, None)),
             )
         )
     return found
@@ -148,13 +148,14 @@ def simulator_losses(scene: Scene, options: registry.Options) -> list[str]:
     return [*losses(scene, options), *unknown, ground.MISSING if ground_height(scene) is None else ground.LOSS]
 
 
-def _materials(scene: Scene) -> dict[str, tuple[float, float | None]]:
-    """Friction and restitution that contacts were simulated with, by name of the object."""
-    found: dict[str, tuple[float, float | None]] = {}
+def _materials(scene: Scene) -> dict[int, tuple[float, float | None]]:
+    """Friction and restitution that contacts were simulated with, by id of the object."""
+    found: dict[int, tuple[float, float | None]] = {}
     for row in scene.needs:
-        if row.get("name") == "contact" and isinstance(row.get("friction"), float):
+        number = row.get("object_id")
+        if row.get("name") == "contact" and isinstance(number, int) and isinstance(row.get("friction"), float):
             e = row.get("restitution")
-            found[str(row.get("object"))] = max(row["friction"], 0.0), e if isinstance(e, float) else None
+            found[number] = max(row["friction"], 0.0), e if isinstance(e, float) else None
     return found
 
 

@@ -30,7 +30,8 @@ def test_a_body_that_would_pass_through_the_floor_gets_contacts_and_a_row_with_t
         after.scene.groups[1].model.kind == "trajectory" and after.scene.groups[1].smooth is draft.scene.groups[1].model
     )
     before, row = after.parts
-    assert before == {"name": "motion"} and row["object"] == "box 1" and row["name"] == "contact"
+    assert before == {"name": "motion"} and row["name"] == "contact"
+    assert row["object"] == "box 1" and row["object_id"] == after.scene.groups[1].object_id
     assert row["friction"] == pytest.approx(0.3, abs=0.05) and 0.05 <= row["restitution"] <= 0.98
     assert row["decision"] == "on" and row["value"] > row["threshold"] == 0.02 and "friction" in row["reason"]
 

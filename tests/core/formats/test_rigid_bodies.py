@@ -223,7 +223,8 @@ def test_a_thrown_box_lands_on_the_ground_under_the_one_that_rests(tmp_path, kin
 def test_the_files_have_the_friction_and_restitution_that_contacts_were_simulated_with(tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
     boxes = contact_scenes.scene(contact_scenes.falling(), contact_scenes.resting(2.0))
-    row = {"object": "box 1", "name": "contact", "decision": "on", "friction": 0.17, "restitution": 0.62}
+    row = {"object": "mug", "object_id": boxes.objects[1].id, "name": "contact", "decision": "on"}  # box 1, renamed
+    row |= {"friction": 0.17, "restitution": 0.62}
     boxes = dataclasses.replace(boxes, needs=(row,))
     (path,) = mjcf.export(boxes, tmp_path / "a.xml", registry.Options((0.6,)))
     model = mujoco.MjModel.from_xml_path(str(path))
