@@ -175,7 +175,8 @@ def _without_torch(pytest, left_out: list[str]):
 
     It skips files that cannot be imported and tests that need a picture.
     """
-    missing = [name for name in ("torch", "numba") if importlib.util.find_spec(name) is None]
+    packages = "torch", "numba"
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
     lacking = [f"{name} is not installed; remedy" for name in missing]
     lacking += [f"{sys.executable} lacks {', '.join(missing)}"] if missing else []
 
@@ -183,8 +184,11 @@ def _without_torch(pytest, left_out: list[str]):
         @pytest.hookimpl(wrapper=True)
         def pytest_make_collect_report(self, collector):
             report = yield
-            if report.outcome == "failed" and "No module named 'torch'" in str(report.longrepr):
-                report.outcome, report.longrepr = "skipped", (str(collector.path), 0, "Skipped: torch is not installed")
+            text = str(report.longrepr)
+            wanted = next((name for name in packages if f"No module named '{name}'" in text), None)
+            if report.outcome == "failed" and wanted is not None:
+                why = f"Skipped: {wanted} is not installed"
+                report.outcome, report.longrepr = "skipped", (str(collector.path), 0, why)
                 left_out.append(collector.path.name)
             elif report.outcome == "skipped" and "torch is not installed" in str(report.longrepr):
                 left_out.append(collector.path.name)

@@ -22,13 +22,15 @@ def run(*arguments):
 
 @pytest.mark.slow
 def test_passed_failed_and_torch_dependent_tests_are_distinguished(tmp_path):
-    passing, wanting, drawing = (tmp_path / f"test_{name}.py" for name in ("passing", "wanting", "drawing"))
+    names = "passing", "torch", "numba", "drawing"
+    passing, torch, numba, drawing = (tmp_path / f"test_{name}.py" for name in names)
     passing.write_text(PASSING)
-    wanting.write_text("raise ModuleNotFoundError(\"No module named 'torch'\", name='torch')\n")
+    for path, name in ((torch, "torch"), (numba, "numba")):
+        path.write_text(f"raise ModuleNotFoundError(\"No module named '{name}'\", name='{name}')\n")
     drawing.write_text("def test_it():\n    raise RuntimeError('cpu: no_such_package is not installed; remedy: pip')\n")
-    done = run("--no-figures", passing, wanting)
+    done = run("--no-figures", passing, torch, numba)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "tests: passed; left out for want of torch: test_wanting.py" in done.stdout
+    assert "tests: passed; left out for want of torch: test_numba.py, test_torch.py" in done.stdout
     done = run("--no-figures", "--json", tmp_path / "result.json", passing, drawing)
     assert done.returncode == 1, "a missing package is no excuse if it is not torch or numba"
     assert done.stdout.rstrip().endswith("FAILED: tests")
