@@ -109,7 +109,7 @@ def test_a_record_holds_the_results_of_evaluation_and_playback(made, tiny):
 def test_finished_runs_are_neither_trained_nor_measured_again(made, monkeypatch):
     plan, case, result = made
     before = contents(case.run)
-    monkeypatch.setattr(process, "train", None)
+    monkeypatch.setattr(process, "run", None)
     monkeypatch.setattr(playback_speed, "measure", None)
     assert benchmark.run_bench(plan, progress_kind="none")["results"] == result["results"]
     assert contents(case.run) == before
@@ -120,7 +120,7 @@ def test_remeasure_keeps_the_run_and_measures_it_again(made, tmp_path, monkeypat
     plan, case, result = made
     torch.save(lpips_weights.tensors("alex"), tmp_path / "alex.pth")
     plan = dataclasses.replace(plan, lpips=(tmp_path / "alex.pth",))
-    monkeypatch.setattr(process, "train", None)
+    monkeypatch.setattr(process, "run", None)
     monkeypatch.setattr(
         playback_speed, "measure", lambda *_: {"rigid": {**result["results"][0]["playback"], "fps": 123.0}}
     )
