@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from r5dgs_core.contact import futures, identify, simulation, stepping, tracks, world
+from r5dgs_core.contact import futures, identify, observed_track, simulation, stepping, world
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.motion_fit import model_selection
 from r5dgs_core.shapes import solid
@@ -55,7 +55,7 @@ def cube_world() -> world.World:
     return world.World((world.Body(solid.of(corners)),), plane, np.array([0.0, 0.0, -9.81]))
 
 
-def observe(toss: np.ndarray, until: str, place: world.World, rng: np.random.Generator) -> tracks.Track | None:
+def observe(toss: np.ndarray, until: str, place: world.World, rng: np.random.Generator) -> observed_track.Track | None:
     """Noisy poses of the beginning of a toss; None if they are fewer than three."""
     rows = np.arange(0, len(toss), OBSERVED)
     assert place.plane is not None
@@ -68,7 +68,9 @@ def observe(toss: np.ndarray, until: str, place: world.World, rng: np.random.Gen
     if count < 3:
         return None
     ones = np.ones(count)
-    return tracks.Track(rows[:count] / RATE, quats[:count], places[:count], PLACE_NOISE * ones, TURN_NOISE * ones)
+    return observed_track.Track(
+        rows[:count] / RATE, quats[:count], places[:count], PLACE_NOISE * ones, TURN_NOISE * ones
+    )
 
 
 def study(toss: np.ndarray, until: str, samples: int, seed: int) -> dict[str, Any] | None:
@@ -105,7 +107,7 @@ def _last(poses: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]
     return poses[0][-1], poses[1][-1]
 
 
-def _smooth(track: tracks.Track, end: float) -> tuple[np.ndarray, np.ndarray]:
+def _smooth(track: observed_track.Track, end: float) -> tuple[np.ndarray, np.ndarray]:
     """Prediction of the law that is fitted to the poses without contacts."""
     last = track.quats[-1], track.places[-1]
     quats = rotations.multiply(track.quats, rotations.conjugate(last[0]))

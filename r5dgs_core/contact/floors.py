@@ -10,7 +10,7 @@ import numpy as np
 
 from ..motion import rotations
 from . import world
-from .tracks import Track
+from .observed_track import Track
 from .world import Body, Plane
 
 _TOUCHED = 0.05  # lowest observed gap, in sizes, of a body that has touched the plane

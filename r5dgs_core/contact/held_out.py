@@ -15,8 +15,8 @@ from ..motion_fit import model_selection
 from ..scene.scene import Scene
 from . import scene_bodies, world
 from .identify import Fitter
+from .observed_track import Track
 from .scene_bodies import SceneBody
-from .tracks import Track
 from .world import Plane
 
 UNEXPLAINED = 3.0  # root mean square residual of the last poses, in units of the noise, above which a law is wrong

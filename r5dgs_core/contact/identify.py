@@ -18,8 +18,8 @@ import numpy as np
 from ..motion import levenberg_marquardt, robust_weights, rotations, se3
 from ..motion.history import UNKNOWN_TURN
 from . import world as worlds
+from .observed_track import Track
 from .simulation import Simulation
-from .tracks import Track
 from .world import Material, State
 
 PARAMETERS = 14

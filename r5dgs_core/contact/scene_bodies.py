@@ -13,7 +13,7 @@ from ..motion import models, rotations
 from ..scene import gravity, world_axes
 from ..scene.scene import MotionGroup, Scene
 from ..shapes import solid
-from .tracks import Track
+from .observed_track import Track
 
 _PLACE_NOISE, _TURN_NOISE = 0.003, 0.004  # of poses without known errors: in sizes, and rad
 _STILL = 0.05  # motion, in sizes, in the last three poses before a body set off; a law that misses more is wrong there

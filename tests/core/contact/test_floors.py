@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r5dgs_core.contact import floors, identify, simulation, stepping, tracks, world
+from r5dgs_core.contact import floors, identify, observed_track, simulation, stepping, world
 from r5dgs_core.motion import rotations
 from tests.support import contacts
 from tests.support.contacts import SIZE, G
@@ -15,7 +15,7 @@ GRAVITY = -G * UP
 def track(heights, times, noise=1e-3):
     places = np.stack([0.3 * times, 0 * times, heights], axis=1)
     ones = np.full(len(times), noise * SIZE)
-    return tracks.Track(times, rotations.identity(len(times)), places, ones, np.full(len(times), noise))
+    return observed_track.Track(times, rotations.identity(len(times)), places, ones, np.full(len(times), noise))
 
 
 def bounce(times, e=0.6, fall=0.3):

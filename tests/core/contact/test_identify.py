@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from r5dgs_core.contact import futures, identify, tracks, world
+from r5dgs_core.contact import futures, identify, observed_track, world
 from r5dgs_core.motion import rotations
 from r5dgs_core.motion.history import UNKNOWN_TURN
 from tests.support import contacts
@@ -24,7 +24,7 @@ def observed(until, seed=0, noise=0.005, height=0.09):
     quats, places = runs.poses(state, times)
     seen = int((times <= until).sum())
     turns = rotations.rotvecs_to_quats(rng.normal(0, noise, (seen, 3)))
-    track = tracks.Track(
+    track = observed_track.Track(
         times[:seen],
         rotations.multiply(turns, quats[:seen, 0]),
         places[:seen, 0] + rng.normal(0, noise * SIZE, (seen, 3)),

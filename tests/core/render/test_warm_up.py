@@ -88,7 +88,7 @@ def cache(tmp_path_factory):
     source = kernel_cache.cache_folder()
     folder = tmp_path_factory.mktemp("cache")
     shutil.copytree(source, folder / source.name)
-    for name in ("tiles.merge_pairs", "losses._moments"):
+    for name in ("tiles.merge_pairs", "losses._compare"):
         indices = list(folder.rglob(f"{name}-*.nbi"))  # one per checkout of this version
         assert indices
         for index in indices:
