@@ -20,6 +20,7 @@ _SOLID = 0.7  # opacity at which a pixel shows a surface
 _NEAR = 4.0  # horizontal distance from the bodies up to which the surface counts, in sizes of the largest
 _LAYER = 0.05  # thickness of the layer that counts as one plane, in sizes of the smallest body
 LEAST = 30  # points of a plane
+_SAME = 1e-6  # distance of cameras at one place, relative to the extent of all cameras
 _ROUNDS = 4
 _STEEPEST = 0.26  # largest angle between the normal and the up axis, rad
 
@@ -91,5 +92,10 @@ def surface(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _distinct(cameras: tuple[Camera, ...]) -> list[Camera]:
-    """One camera for each place."""
-    return list({tuple(camera.center.round(6)): camera for camera in cameras}.values())
+    """One camera for each place, to a millionth of the extent of all places."""
+    if not cameras:
+        return []
+    centers = np.array([camera.center for camera in cameras])
+    step = max(_SAME * float(np.ptp(centers, axis=0).max()), 1e-300)
+    places = np.rint((centers - centers[0]) / step)
+    return list({tuple(place): camera for place, camera in zip(places.tolist(), cameras, strict=True)}.values())
