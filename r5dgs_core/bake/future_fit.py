@@ -16,7 +16,8 @@ from ..scene.splats import to_opacities
 from ..scene.world_axes import UP_AXIS
 from . import pose_errors
 
-SCATTER = 0.5  # share of the usual errors of the poses below which laws do not differ, chosen on simulated tracks
+# Share of the usual errors of the poses below which laws do not differ (docs/results/predicted_motion.md).
+SCATTER = 0.35
 
 
 def share_gravity(
