@@ -45,7 +45,8 @@ def test_two_bodies_that_fall_together_fly_until_they_meet():
 @pytest.mark.parametrize(("gap", "speed", "pull"), [(1.0, 1.0, -1e-17), (1e-16, 10.0, -9.8), (2.0, 3.0, -9.8)])
 def test_a_body_that_rises_flies_until_it_has_come_down_again(gap, speed, pull):
     found = flights._fall(gap, speed, pull)
-    assert found == pytest.approx(2 * speed / -pull, rel=1e-9) or gap + speed * found + 0.5 * pull * found**2 < 1e-9
+    assert found > speed / -pull  # later than the highest point
+    assert abs(gap + speed * found + 0.5 * pull * found**2) < 1e-9 * speed * found
 
 
 @pytest.mark.parametrize("fixed", [False, True])

@@ -67,7 +67,8 @@ def test_the_format_of_the_developers_page_refuses_unsuitable_folders_and_select
 
 def check_folders_and_selections(found, scene, tmp_path):
     missing = tmp_path / "missing" / f"a{found.suffix}"
-    with pytest.raises(errors.SceneFileError, match="cannot be written|expected an existing folder"):
+    message = "expected an existing folder" if found.name == "r5dgs" else "cannot be written"
+    with pytest.raises(errors.SceneFileError, match=message):
         list(found.write(scene, missing, registry.Options((0.3,))))
     if found.has_objects:
         item = scene.object(2)  # an object that has lost its Gaussians
