@@ -1,6 +1,6 @@
 """Preferences of the extension: worker Python, timeout, text encoder and trusted folders.
 
-Preferences are read and written only in Blender's main thread. Other threads use a `Choice` created there. The search
+Preferences are read and written only in Blender's main thread. Other threads use a `Snapshot` created there. The search
 for a Python does not touch Blender's data, so it can run in any thread.
 """
 
@@ -29,11 +29,11 @@ ROOT = Path(__file__).resolve().parent.parent
 
 log = logging.getLogger(__name__)
 _found: str | None = None  # result of this session's search, "" if nothing was found, None before the search
-_chosen: "Choice | None" = None  # last snapshot of the preferences
+_last: "Snapshot | None" = None  # last snapshot of the preferences
 
 
 def _remember(_: bpy.types.AddonPreferences, context: bpy.types.Context) -> None:
-    choice()
+    snapshot()
 
 
 class R5DGS_AP_preferences(bpy.types.AddonPreferences):
@@ -114,8 +114,8 @@ def get() -> "R5DGS_AP_preferences | None":
 
 
 @dataclass(frozen=True)
-class Choice:
-    """Immutable snapshot of the preferences, safe to use from any thread.
+class Snapshot:
+    """Immutable copy of the preferences, safe to use from any thread.
 
     Attributes:
         chosen: Python set by the environment, the preferences or ``r5dgs config --user``, in this order; "" to search.
@@ -160,18 +160,18 @@ class Choice:
         return found or sys.executable
 
 
-def choice() -> Choice:
+def snapshot() -> Snapshot:
     """Return a snapshot of the preferences. Outside the main thread, this is the last snapshot taken there."""
-    global _chosen
-    if not _may_touch_blender() and _chosen is not None:
-        return _chosen
+    global _last
+    if not _may_touch_blender() and _last is not None:
+        return _last
     keep_found()
     preferences = get()
     chosen = os.environ.get(ENVIRONMENT, "").strip()
     if not chosen and preferences is not None:
         chosen = preferences.worker_python.strip()
     chosen = chosen or _of_user_settings()
-    _chosen = Choice(
+    _last = Snapshot(
         chosen=_absolute(chosen) if chosen else "",
         kept=preferences.found_python if preferences is not None else "",
         beside=tuple(_beside()),
@@ -179,7 +179,7 @@ def choice() -> Choice:
         trusted=_trusted(preferences),
         kernels=_kernels(),
     )
-    return _chosen
+    return _last
 
 
 def _kernels() -> str:
@@ -205,8 +205,8 @@ def _warn_once(message: str) -> None:
 
 
 def worker_python() -> str:
-    """Return the Python for the worker, see `Choice.python`. Blocks until the search has finished."""
-    found = choice().python()
+    """Return the Python for the worker, see `Snapshot.python`. Blocks until the search has finished."""
+    found = snapshot().python()
     keep_found()
     return found
 
@@ -228,7 +228,7 @@ def keep_found() -> None:
 
 
 def forget() -> None:
-    """Discard the search result, so that the next `Choice` searches again."""
+    """Discard the search result, so that the next `Snapshot` searches again."""
     global _found
     _found = None
     preferences = get()
@@ -273,7 +273,7 @@ def _beside() -> list[Path]:
 def register():
     """Register the preferences class and take a first snapshot for other threads."""
     bpy.utils.register_class(R5DGS_AP_preferences)
-    choice()
+    snapshot()
 
 
 def unregister():

@@ -43,7 +43,7 @@ def bake(context: bpy.types.Context, share: float) -> list[bpy.types.Object]:
             raise errors.ConfigError(f"{anchor.name}: its action is in the NLA; make it active again first")
         starts[anchor] = fcurves.pose_at(anchor, place, release)
     poses = _simulated(scene, anchors, release, end)
-    hand_over.take_away(context, proxies)
+    hand_over.remove_proxies(context, proxies)
     tails = {anchor: _tails(anchor, release, poses[:, k], starts[anchor], share) for k, anchor in enumerate(anchors)}
     for shadow in shadows:
         state = shadow.r5dgs_motion

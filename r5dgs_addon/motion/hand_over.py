@@ -97,7 +97,7 @@ def hand_over(context: bpy.types.Context, anchors: Sequence[bpy.types.Object], f
         return _create(context, bodies, frame)
 
 
-def take_away(context: bpy.types.Context, proxies: bpy.types.Collection) -> None:
+def remove_proxies(context: bpy.types.Context, proxies: bpy.types.Collection) -> None:
     """Remove the proxies and all that `hand_over` added; other rigid bodies of the scene are kept."""
     objects = list(proxies.objects)
     bpy.data.collections.remove(proxies)

@@ -70,7 +70,7 @@ def places(collection: bpy.types.Collection) -> list[Path]:
 
 def find(collection: bpy.types.Collection) -> SceneFileSearch:
     """Return the first existing path of `places` that may be read, or the path that the user must allow."""
-    trusted = [*folders(collection), *preferences.choice().trusted]
+    trusted = [*folders(collection), *preferences.snapshot().trusted]
     asked = None
     for place in places(collection):
         if may_read(place, trusted):

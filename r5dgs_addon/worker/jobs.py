@@ -26,12 +26,12 @@ class Job:
     """Sequence of worker requests that runs in its own thread, so that Blender's UI stays responsive.
 
     Args:
-        choice: Preferences that select the Python if no worker runs; the search for a Python runs in the thread, too.
+        settings: Preferences that select the Python if no worker runs; the search for a Python runs in the thread, too.
         steps: Tuples of status text, command and arguments, executed in order.
         key: A later job with the same key replaces this one while it waits; "" for none.
     """
 
-    def __init__(self, choice: preferences.Choice, steps: Steps, key: str = ""):
+    def __init__(self, settings: preferences.Snapshot, steps: Steps, key: str = ""):
         self.key = key
         self.python = ""  # Python of the worker, once known
         self.dropped = False  # True if the job was dropped before it started
@@ -42,7 +42,7 @@ class Job:
         self._begun = self._ended = False
         self._ending = threading.Event()
         self._guard = threading.Lock()
-        self._thread = threading.Thread(target=self._run, args=(choice, steps), name="r5dgs worker job", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(settings, steps), name="r5dgs worker job", daemon=True)
         self._thread.start()
 
     @property
@@ -97,25 +97,25 @@ class Job:
             _kill()
             self._thread.join(0.05)
 
-    def _run(self, choice: preferences.Choice, steps: Steps) -> None:
+    def _run(self, settings: preferences.Snapshot, steps: Steps) -> None:
         with _turn:
             with self._guard:
                 if self.dropped:
                     return
                 self._begun = True
             try:
-                if choice.known() is None:
+                if settings.known() is None:
                     self._step = SEARCHING
-                self.python = choice.python(self._ending.is_set)
+                self.python = settings.python(self._ending.is_set)
                 if self._ending.is_set():
                     raise errors.BackendError(
                         "worker: stopped during the search for a Python; the next request searches again"
                     )
                 self._step = "starting the worker"
                 running = _running(self.python)
-                running.greet(choice.timeout_s)
+                running.greet(settings.timeout_s)
                 for self._step, command, arguments in steps:
-                    self._answers.append(running.request(command, choice.timeout_s, **arguments))
+                    self._answers.append(running.request(command, settings.timeout_s, **arguments))
             except BaseException as error:  # re-raised by `answer`
                 self._error = error
             finally:  # set before the lock is released, because the thread itself may take a moment longer
@@ -143,7 +143,7 @@ def submit(key: str, steps: Steps) -> Job:
     """
     for job in _waiting(key):
         job.drop()
-    job = Job(preferences.choice(), steps, key)
+    job = Job(preferences.snapshot(), steps, key)
     with _state:
         _jobs[:] = [other for other in _jobs if not other.done] + [job]
     return job
@@ -174,11 +174,11 @@ def current(python: str | None = None) -> Worker:
     Raises:
         BackendError: The worker cannot be started.
     """
-    choice = preferences.choice()
+    settings = preferences.snapshot()
     python = python or preferences.worker_python()
     with _turn:
         running = _running(python)
-        running.greet(choice.timeout_s)
+        running.greet(settings.timeout_s)
         return running
 
 

@@ -66,7 +66,7 @@ class Worker:
         self._answers: queue.Queue = queue.Queue()
         self._stderr: collections.deque[str] = collections.deque(maxlen=STDERR_LINES)
         environment = find_python.environment(python)
-        if find_python.is_own(python) and (kernels := preferences.choice().kernels):
+        if find_python.is_own(python) and (kernels := preferences.snapshot().kernels):
             environment.setdefault("NUMBA_CACHE_DIR", kernels)
         known = environment.get("PYTHONPATH", "")
         # The extension's own copy of the core comes first, so that both sides have the same version.

@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from ..scene.scene import Scene
-from .scene_nodes import Piece
+from .scene_nodes import NodePiece
 
 FAR = 4.0  # distance of the background's origin, in extents of the scene
 _LEAST = 0.2  # length of the mean of the viewing directions, below which cameras look from all sides
 
 
-def origins(scene: Scene, pieces: list[Piece]) -> np.ndarray:
+def origins(scene: Scene, pieces: list[NodePiece]) -> np.ndarray:
     """Origin of the mesh of each piece in the frame of its group's anchor, a multiple of float32. [P, 3]"""
     found, away = np.zeros((len(pieces), 3)), _away(scene)
     for number, (rows, object_id, motion_id) in enumerate(pieces):

@@ -73,7 +73,7 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
 _FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
 
-def _numbered(pieces: list[scene_nodes.Piece]) -> list[scene_nodes.Piece]:
+def _numbered(pieces: list[scene_nodes.NodePiece]) -> list[scene_nodes.NodePiece]:
     """Pieces with an id of their own: all but static Gaussians of the background."""
     return [piece for piece in pieces if piece.group or piece.object_id]
 

@@ -13,7 +13,7 @@ from ..scene.scene import Scene
 from .registry import Options
 
 
-class Piece(NamedTuple):
+class NodePiece(NamedTuple):
     """Gaussians of one object in one motion group: their rows, the id of the object, the group."""
 
     rows: slice
@@ -32,7 +32,7 @@ def end(scene: Scene, options: Options) -> float:
     return max(scene.t_max, predictability.horizon(scene) if options.until is None else options.until)
 
 
-def pieces(scene: Scene, object_ids: Collection[int] | None) -> list[Piece]:
+def pieces(scene: Scene, object_ids: Collection[int] | None) -> list[NodePiece]:
     """Pieces of the selected objects (all if None), in the order of the rows.
 
     Raises:
@@ -43,7 +43,7 @@ def pieces(scene: Scene, object_ids: Collection[int] | None) -> list[Piece]:
     for start, stop, object_id in row_runs.runs(scene.gaussians.object_ids):
         if object_ids is None or object_id in object_ids:
             within = row_runs.runs(scene.gaussians.motion_ids[start:stop])
-            found += [Piece(slice(start + first, start + last), object_id, g) for first, last, g in within]
+            found += [NodePiece(slice(start + first, start + last), object_id, g) for first, last, g in within]
     return found
 
 

@@ -166,7 +166,7 @@ class _Tree:
             for t, value in zip(band.times, values, strict=True):
                 attribute.Set(float(value), code(self._scene, t))
 
-    def add_gaussians(self, piece: scene_nodes.Piece, factors: np.ndarray | None) -> None:
+    def add_gaussians(self, piece: scene_nodes.NodePiece, factors: np.ndarray | None) -> None:
         """Add the Gaussians of a piece; those that bend are a prim of their own, with time samples.
 
         Args:

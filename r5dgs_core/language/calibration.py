@@ -25,7 +25,7 @@ _MARGIN = 2.0  # distance of further matches below the best cosine, in standard 
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Thresholds:
     """Thresholds estimated from the cosines of nouns.
 
     Attributes:
@@ -39,7 +39,7 @@ class Calibration:
     margin: float
 
 
-def for_words(rows: np.ndarray, nouns: np.ndarray, objects: int) -> Calibration:
+def for_words(rows: np.ndarray, nouns: np.ndarray, objects: int) -> Thresholds:
     """Calibrate embeddings of phrases.
 
     Args:
@@ -50,10 +50,10 @@ def for_words(rows: np.ndarray, nouns: np.ndarray, objects: int) -> Calibration:
     words, things = common_nouns.words(), common_nouns.things()
     places = [words.index(thing) for thing in things]
     limit = _limit(standardize(nouns[places], nouns)[~common_nouns.relations()[places]], objects)
-    return _calibration(rows, nouns, limit)
+    return _thresholds(rows, nouns, limit)
 
 
-def for_pictures(rows: np.ndarray, nouns: np.ndarray, names: Sequence[Sequence[str]]) -> Calibration:
+def for_pictures(rows: np.ndarray, nouns: np.ndarray, names: Sequence[Sequence[str]]) -> Thresholds:
     """Calibrate embeddings of pictures.
 
     Args:
@@ -70,7 +70,7 @@ def for_pictures(rows: np.ndarray, nouns: np.ndarray, names: Sequence[Sequence[s
             false[row] = ~common_nouns.relations()[[words.index(noun) for noun in known]].any(0)
         else:
             false[row, np.argsort(above[row])[len(words) - round(_LIKELY_TRUE * len(words)) :]] = False
-    return _calibration(rows, nouns, _limit(above[false], len(rows)))
+    return _thresholds(rows, nouns, _limit(above[false], len(rows)))
 
 
 def standardize(rows: np.ndarray, nouns: np.ndarray) -> np.ndarray:
@@ -84,9 +84,9 @@ def _limit(false: np.ndarray, objects: int) -> float:
     return float(np.quantile(false, 1 - each)) if false.size else 0.0
 
 
-def _calibration(rows: np.ndarray, nouns: np.ndarray, limit: float) -> Calibration:
+def _thresholds(rows: np.ndarray, nouns: np.ndarray, limit: float) -> Thresholds:
     cosines = np.asarray(rows, np.float64) @ np.asarray(nouns, np.float64).T
     if not len(cosines):
-        return Calibration(limit, np.zeros(0), 0.0)
+        return Thresholds(limit, np.zeros(0), 0.0)
     spread = cosines.std(-1)
-    return Calibration(limit, cosines.mean(-1) + limit * spread, float(_MARGIN * spread.mean()))
+    return Thresholds(limit, cosines.mean(-1) + limit * spread, float(_MARGIN * spread.mean()))

@@ -197,7 +197,7 @@ def test_blenders_own_python_is_given_the_folder_of_the_bundled_numba(pythons, m
 
 def test_blenders_own_python_compiles_kernels_into_the_folder_of_the_extension(worker, preferences, monkeypatch):
     process, begun = importlib.import_module("r5dgs.r5dgs_addon.worker.process"), []
-    monkeypatch.setattr(preferences, "choice", lambda: preferences.Choice("", "", (), 1.0, kernels="/kernels"))
+    monkeypatch.setattr(preferences, "snapshot", lambda: preferences.Snapshot("", "", (), 1.0, kernels="/kernels"))
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
 
     def begin(command, env, **_):
@@ -276,12 +276,12 @@ def test_other_threads_use_cached_preferences_without_reading_them(preferences, 
     asked = []
     monkeypatch.setattr(preferences, "get", lambda: asked.append(threading.current_thread()) or kept)
     monkeypatch.setattr(pythons, "find", lambda *_, **__: sys.executable)
-    assert preferences.choice().timeout_s == 7
+    assert preferences.snapshot().timeout_s == 7
     kept.worker_timeout = 8
-    assert elsewhere_called(preferences.choice).timeout_s == 7
+    assert elsewhere_called(preferences.snapshot).timeout_s == 7
     assert elsewhere_called(preferences.worker_python) == sys.executable and kept.found_python == ""
     assert set(asked) == {threading.main_thread()}
-    assert preferences.choice().timeout_s == 8 and kept.found_python == sys.executable
+    assert preferences.snapshot().timeout_s == 8 and kept.found_python == sys.executable
 
 
 @pytest.fixture
