@@ -1,6 +1,6 @@
 """Growth of the cost of every phase with the size of the input. Linux only.
 
-    python -m benchmarks.scaling [AXIS ...] [--largest N] [--json FILE]
+    python -m benchmarks.scaling [AXIS ...] [--smallest N] [--largest N] [--json FILE]
 
 Axes: ``gaussians``, ``lines`` (of the images), ``views``, ``times``, ``objects``. On each axis one number grows, the
 others stay as in `BASE`. Each case is a capture of moving balls (`benchmarks.training.memory`), which a process of its
@@ -218,13 +218,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("axes", nargs="*", choices=[*AXES, []], metavar="AXIS", help=f"{', '.join(AXES)}; all if none")
     parser.add_argument("--largest", type=int, help="leave out larger cases")
+    parser.add_argument("--smallest", type=int, default=0, help="leave out smaller cases")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     found: dict[str, list[tuple[int, Row]]] = {}
     for axis in args.axes or AXES:
         rows = found.setdefault(axis, [])
         for case in AXES[axis]:
-            if args.largest is not None and size_of(case, axis) > args.largest:
+            if not args.smallest <= size_of(case, axis) <= (args.largest or math.inf):
                 continue
             with tempfile.TemporaryDirectory() as name:
                 folder = Path(name)
