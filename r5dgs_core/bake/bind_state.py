@@ -11,16 +11,19 @@ import dataclasses
 
 import numpy as np
 
+from ..errors import ConfigError
 from ..motion import rotations
 from ..motion.models import MotionModel
 from ..scene import spherical_harmonics, visibility
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
+from ..shapes import silhouette_hull, solid
 from ..train import observed_motion
 from ..train.representations import shading as shading_vectors
 from . import track_checks
 from .draft import BoundScene, Context, ObservedScene
 
+_TURNS = 0.05  # turn from the last pose, rad, up to which rotations may be errors; the pivot is then the middle
 _ARRAYS = ("means", "quats", "sh", "shading", "shading_rest", "residual_offsets", "residual_quats")  # of `Scene`
 _COLUMNS = ("means", "quats", "sh", "shading", "rest")  # of `Cloud`
 
@@ -44,7 +47,11 @@ def bind(observed: ObservedScene, context: Context) -> BoundScene:
         sh[members], shading[members], rest[members] = shading_vectors.rebind(
             turned, shading[members], rest[members], q, observed.light
         )
-        pivot = _pivot(means[members], opacities[members], center + d)
+        pivot = _middle(means[members], opacities[members], center + d)
+        if group.role == "body" and rotations.angle_between(group.quats, q).max() > _TURNS:
+            own = members & (cloud.object_ids == group.object_id)
+            found = _center_of_mass(means[own], quats[own], cloud.log_scales[own], opacities[own])
+            pivot = pivot if found is None else found
         poses = _relative(group.quats, path, center, pivot)
         if group.observed.any() and not motion.smooth:  # before an object is seen its pose is unknown
             first = int(np.argmax(group.observed))
@@ -165,8 +172,25 @@ def _motion_group(
     )
 
 
-def _pivot(means: np.ndarray, opacities: np.ndarray, fallback: np.ndarray) -> np.ndarray:
-    """Return the centre of a group: opacity-weighted mean per axis, without the outer 5 % at both ends."""
+def _center_of_mass(
+    means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, opacities: np.ndarray
+) -> np.ndarray | None:
+    """Return the centre of mass of an object's hull at uniform density, about which it turns in flight.
+
+    Unlike a mean of Gaussians, it does not depend on their density, which follows the texture and what cameras see.
+    Returns None if the object is nowhere solid.
+    """
+    if len(means) < 4:
+        return None
+    hull = silhouette_hull.of(means, quats, np.exp(log_scales.astype(np.float64)), opacities)
+    try:
+        return None if hull is None else solid.of(hull.vertices).center
+    except ConfigError:  # a flat hull
+        return None
+
+
+def _middle(means: np.ndarray, opacities: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+    """Return the opacity-weighted mean of a group's Gaussians, without the outer 5 % at both ends of each axis."""
     if len(means) < 3:
         return np.asarray(means.mean(0) if len(means) else fallback, np.float64)
     low, high = np.quantile(means, [0.05, 0.95], axis=0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.bake import bake
+from r5dgs_core.bake import bake, bind_state
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import CheckpointError, Interrupted
@@ -16,6 +16,7 @@ from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import scene_file, validation
+from r5dgs_core.shapes import solid
 from r5dgs_core.train import checkpoint, finish, normalization, run, run_folder
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
@@ -129,6 +130,29 @@ def test_objects_keep_their_motion_and_continue_it_past_t_max(baked, tiny):
             quats, displacements = scene_player.Player(baked).group_poses(t)
             found = group.pivot + rotations.rotate(quats[k], arm) + displacements[k]
             assert np.linalg.norm(found - tiny.center(k, t)) < tolerance * travel, (k, t)
+
+
+def test_a_body_that_turns_has_its_pivot_in_the_middle_of_its_volume_not_of_its_gaussians(baked):
+    turning = 0
+    for hull in baked.hulls:
+        group = baked.groups[hull.motion_id]
+        if rotations.angle_between(baked.tracks.poses[group.id, :, :4], rotations.identity()).max() > 0.05:
+            center = solid.of(hull.vertices).center
+            assert np.linalg.norm(group.pivot - center) < 0.02 * group.model.radius
+            turning += 1
+    assert turning
+
+
+def test_the_centre_of_mass_does_not_follow_the_density_of_gaussians():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(4000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points = points[rng.random(4000) < np.where(points[:, 0] > 0, 0.9, 0.2)]  # most on one side of a ball
+    quats, scales = rotations.identity(len(points)), np.full((len(points), 3), np.log(0.1))
+    middle = bind_state._middle(points, np.ones(len(points)), np.zeros(3))
+    found = bind_state._center_of_mass(points, quats, scales, np.full(len(points), 0.9))
+    assert middle[0] > 0.2 and found is not None and np.abs(found).max() < 0.05
+    assert bind_state._center_of_mass(points[:3], quats[:3], scales[:3], np.ones(3)) is None
 
 
 def test_anchors_are_members_near_the_pivot(baked):
