@@ -312,6 +312,21 @@ def bounces(rng: np.random.Generator) -> Motion:
     return Motion(path, seen, speed * (1 + 1 / keep))
 
 
+def bounces_on_rough_floor(rng: np.random.Generator) -> Motion:
+    """The same, and each impact until `T_MAX` changes its spin."""
+    smooth = bounces(rng)
+    starts, stops = (0.0, *smooth.events), (*smooth.events, np.inf)
+    spins = 1.5 * rng.normal(size=(len(starts), 3))
+
+    def path(t: np.ndarray) -> Poses:
+        turns = turned(np.zeros((len(t), 3)))
+        for start, stop, w in zip(starts, stops, spins, strict=True):
+            turns = turned(w * (np.clip(t, start, stop) - start)[:, None]) * turns
+        return smooth.path(t)[0], turns
+
+    return dataclasses.replace(smooth, path=path)
+
+
 def grid(poses: int = POSES) -> np.ndarray:
     """Observed times, evenly spaced with the last at `T_MAX`."""
     return np.linspace(0.0, T_MAX, poses)

@@ -31,6 +31,7 @@ MOTIONS: dict[str, Maker] = {
     "friction, stops inside": motions.rolls_until(0.35, 0.6),
     "friction, slides": motions.slides_until(0.8, 1.0),
     "bounces": motions.bounces,
+    "bounces, rough floor": motions.bounces_on_rough_floor,
     "one bounce": events.within(events.bounces_once, 0.25, 0.5),
     "damped spring": motions.damped_spring,
     "damped pendulum": motions.damped_pendulum,

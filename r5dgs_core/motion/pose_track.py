@@ -22,11 +22,13 @@ class Window:
         first: Time of the first pose.
         low, high: Lowest and highest frequency of an oscillation: a quarter of a period in the window, and four poses
             per period. Less than a quarter period cannot be distinguished from a constant acceleration.
+        up: Unit vector against gravity, or None if it is unknown.
     """
 
     first: float = -1.0
     low: float = 0.5 * math.pi
     high: float = 8 * math.pi
+    up: tuple[float, float, float] | None = None
 
     @property
     def middle(self) -> float:
@@ -57,25 +59,28 @@ class PoseTrack:
         quats: Unit wxyz relative to the bind state. [S, 4]
         displacements: Displacements of the pivot. [S, 3]
         weights: Pose weights, > 0. [S]
+        up: See `Window`.
     """
 
     tau: np.ndarray
     quats: np.ndarray
     displacements: np.ndarray
     weights: np.ndarray
+    up: tuple[float, float, float] | None = None
 
     def __len__(self) -> int:
         return len(self.tau)
 
     def rows(self, index: np.ndarray | slice) -> PoseTrack:
         """Select poses by index."""
-        return PoseTrack(self.tau[index], self.quats[index], self.displacements[index], self.weights[index])
+        return PoseTrack(self.tau[index], self.quats[index], self.displacements[index], self.weights[index], self.up)
 
     @functools.cached_property
     def window(self) -> Window:
         """Window of all poses."""
         span = float(self.tau[-1] - self.tau[0])
-        return Window(float(self.tau[0]), 0.5 * math.pi / span, 0.5 * math.pi / float(np.median(np.diff(self.tau))))
+        highest = 0.5 * math.pi / float(np.median(np.diff(self.tau)))
+        return Window(float(self.tau[0]), 0.5 * math.pi / span, highest, self.up)
 
     @functools.cached_property
     def turns(self) -> np.ndarray:

@@ -118,6 +118,7 @@ def fit(
         rotations.make_continuous(rotations.normalize(quats[used])),
         displacements[used] / radius,
         weights[used] / weights[used].mean(),
+        None if up is None else tuple(np.asarray(up, np.float64) / np.linalg.norm(up)),
     )
     if candidates is None and inertia is not None and torque_free_rotation.tumbles(np.asarray(inertia, np.float64)):
         family = (*family, replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64)))

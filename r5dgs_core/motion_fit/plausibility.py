@@ -24,6 +24,20 @@ def rises(solution: FittedCandidate, up: np.ndarray | None) -> bool:
     return bool(abs(v @ up) > STEEP * np.linalg.norm(v) * np.linalg.norm(up))
 
 
+def leans(solution: FittedCandidate, up: np.ndarray | None) -> bool:
+    """Return True if a body bounces off a floor that is not level."""
+    candidate = solution.candidate.law
+    if up is None or candidate.kind != "bounce":
+        return False
+    a = candidate.rates(solution.law_theta).a
+    return bool(-a @ up < STEEP * np.linalg.norm(a) * np.linalg.norm(up))
+
+
+def is_possible(solution: FittedCandidate, up: np.ndarray | None) -> bool:
+    """Return True if gravity allows a motion: neither `rises` nor `leans`."""
+    return not rises(solution, up) and not leans(solution, up)
+
+
 def runs_away(solution: FittedCandidate, track: PoseTrack) -> bool:
     """Return True if the body would move or turn much further past t_max than in any equal observed time."""
     ends = np.searchsorted(track.tau, track.tau + _AHEAD)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..motion import models
 from ..motion.pose_track import PoseTrack
-from . import backtest, breaks, model_scores, noise, plausibility, slips
+from . import backtest, breaks, model_scores, noise, plausibility, rough_bounces, slips
 from . import candidates as families
 from .candidates import Candidate, FittedCandidate, Noise
 from .model_scores import NoiseLevel
@@ -93,18 +93,21 @@ def select(
         slipped = _refined(slipped, best, track, level, finer)
         searched = isinstance(best.candidate, breaks.BreakCandidate)
         broken = breaks.search(track, finer) if searched else _refined(broken, best, track, level, finer)
+        if not any(isinstance(s.candidate, rough_bounces.RoughBounces) for s in broken):
+            broken += rough_bounces.search(track, finer, found)
         level = finer
     noise_level = NoiseLevel.of((*found, *broken, *slipped), _floor(level, least))
-    laws = [s for s in found if _determined(s, noise_level) and not plausibility.rises(s, up)] or found[:1]
+    laws = [s for s in found if _determined(s, noise_level) and plausibility.is_possible(s, up)] or found[:1]
     plausible = [s for s in laws if not plausibility.runs_away(s, track)] or laws[:1]
     chosen = _simplest(plausible, noise_level, track, level)
     smooth = [s for s in plausible if not s.candidate.events(s.theta)]
     if chosen.candidate.events(chosen.theta) and smooth:
         other = _simplest(smooth, noise_level, track, level)
         chosen = other if noise_level.score(chosen) + model_scores.STRONG > noise_level.score(other) else chosen
+    broken = [s for s in broken if not plausibility.leans(s, up)]
     if broken:
         best = min(broken, key=noise_level.score)
-        if noise_level.score(best) + _margin(best) < min(noise_level.score(s) for s in plausible):
+        if all(noise_level.score(best) + _margin(best, s) < noise_level.score(s) for s in plausible):
             chosen = best
     if slipped:
         best = min(slipped, key=noise_level.score)
@@ -131,7 +134,8 @@ def _try_all(
     found = found or [s for s in [families.solve(families.STATIC, track, level)] if s is not None]
     if not try_breaks or len(track) < _FEW:
         return found, [], []
-    return found, breaks.search(track, level, hopeless), slips.search(track, level, hopeless)
+    broken = [*breaks.search(track, level, hopeless), *rough_bounces.search(track, level, found, hopeless)]
+    return found, broken, slips.search(track, level, hopeless)
 
 
 def _hopeless(best: FittedCandidate) -> float:
@@ -147,8 +151,10 @@ def _misfit(solutions: Sequence[FittedCandidate]) -> tuple[float, float]:
     return float(place), float(turn)
 
 
-def _margin(broken: FittedCandidate) -> float:
-    """Minimum evidence for a break; small jumps need more, because drifting tracks imitate them."""
+def _margin(broken: FittedCandidate, law: FittedCandidate) -> float:
+    """Minimum evidence for a break against a law; small jumps need more, because drifting tracks imitate them."""
+    if isinstance(broken.candidate, rough_bounces.RoughBounces):
+        return model_scores.NEAR if law.candidate.kind == broken.candidate.kind else model_scores.STRONG
     assert isinstance(broken.candidate, breaks.BreakCandidate)
     return model_scores.STRONG * max(1.0, _SMALL_JUMP / max(broken.candidate.jump(broken.theta), 1e-3)) ** 2
 
@@ -209,7 +215,8 @@ def _cut(
         None if this is not clearly better than the best single candidate.
     """
     track, found = whole.track, []
-    for solution in sorted(broken, key=lambda s: s.loss)[:_CUTS]:
+    single = [s for s in broken if isinstance(s.candidate, breaks.BreakCandidate)]
+    for solution in sorted(single, key=lambda s: s.loss)[:_CUTS]:
         gap = solution.candidate.poses_with_choices - breaks.MIN_POSES_AFTER
         rows = (slice(0, gap), slice(gap, None))
         sides = [track.rows(row) for row in rows]

@@ -32,8 +32,11 @@ class Bounce(MotionKind):
     tooltip = "Flies and bounces off a floor that is perpendicular to its acceleration, lower each time"
     word = "bounce"
     fields = ("velocity", "acceleration", "angular_velocity", "bounce_time", "restitution")
-    fits = {"bounces": ("w", "v", "a", "bounce", "logit_rho")}
-    blocks = {"bounce": Block(1, 3.0), "logit_rho": Block(1, 3.0)}
+    fits = {
+        "bounces, level": ("w", "v", "fall", "bounce", "logit_rho"),  # on a level floor, if the up axis is known
+        "bounces": ("w", "v", "a", "bounce", "logit_rho"),
+    }
+    blocks = {"fall": Block(1, 100.0), "bounce": Block(1, 3.0), "logit_rho": Block(1, 3.0)}
 
     def motion(self, rates: Rates, span: np.ndarray) -> Curve:
         g, up = _gravity(rates.a)
@@ -52,7 +55,8 @@ class Bounce(MotionKind):
 
     def rates(self, parts: Mapping[str, np.ndarray], window: Window) -> Rates:
         """ "v" is the velocity just after a bounce at the time "bounce" of the window."""
-        g, up = _gravity(parts["a"])
+        a = _acceleration(parts, window)
+        g, up = _gravity(a)
         rho = _restitution(parts)
         speed, along = _split(parts["v"], up)
         number, start = _flight(-parts["bounce"], speed, np.maximum(g, _TINY), rho)
@@ -63,7 +67,7 @@ class Bounce(MotionKind):
         resting = number >= _RESTING
         return Rates(
             v=np.where(resting, along, v),
-            a=parts["a"],
+            a=a,
             w=parts["w"],
             bounce_time=np.where(resting, 0.0, ahead),
             restitution=rho,
@@ -72,7 +76,7 @@ class Bounce(MotionKind):
     def observed(
         self, parts: Mapping[str, np.ndarray], tau: np.ndarray, window: Window, inertia: np.ndarray | None
     ) -> se3.Pose:
-        g, up = _gravity(parts["a"])
+        g, up = _gravity(_acceleration(parts, window))
         speed, along = _split(parts["v"], up)
         rho = _restitution(parts)
 
@@ -88,7 +92,7 @@ class Bounce(MotionKind):
     def starts(self, blocks: Sequence[str], track: PoseTrack, window: Window) -> list[first_guesses.Guess]:
         """Fit two parabolas with a common acceleration that meet between two poses; guesses for at most two bounces."""
         count, tau = len(track), track.tau
-        if count < 8:
+        if count < 8 or ("fall" in blocks and window.up is None):
             return []
         gaps = np.arange(2, count - 1)
         times = (tau[gaps - 1, None] + np.array(_PLACES) * np.diff(tau)[gaps - 1, None]).reshape(-1)
@@ -102,6 +106,9 @@ class Bounce(MotionKind):
         found: list[tuple[float, first_guesses.Guess]] = []
         for row in np.argsort(misses, kind="stable"):
             e, after, before, a = fits[row]
+            if "fall" in blocks:
+                fall = -a @ np.array(window.up)
+                a = _acceleration({"fall": fall[None]}, window)
             g, up = _gravity(a)
             rise, fall = float(after @ up), float(before @ up)
             if not (rise > 0.05 and fall < -0.05 and float(g[0]) > 0.1):
@@ -110,15 +117,26 @@ class Bounce(MotionKind):
                 continue
             rho = np.clip(rise / -fall, 0.1, 0.95)
             d = after * -times[row] + 0.5 * a * times[row] ** 2 + e
-            guess = {"r": np.zeros(3), "e": d, "w": track.spin, "v": after, "a": a}
+            guess = {"r": np.zeros(3), "e": d, "w": track.spin, "v": after, "a": a, "fall": g}
             guess |= {"bounce": times[row : row + 1], "logit_rho": np.log(np.array([rho / (1 - rho)]))}
             found.append((float(times[row]), guess))
             if len(found) == 2:
                 break
         return [guess for _, guess in found]
 
+    def last_impacts(self, parts: Mapping[str, np.ndarray], window: Window) -> tuple[np.ndarray, np.ndarray]:
+        """Times <= 0 of the last impact before t_max and of the one before it; t_max for a body that rests. [..., 1]"""
+        g, up = _gravity(_acceleration(parts, window))
+        speed, _ = _split(parts["v"], up)
+        g, rho = np.maximum(g, _TINY), _restitution(parts)
+        number, start = _flight(-parts["bounce"], speed, g, rho)
+        resting = number >= _RESTING
+        before = _start(np.where(resting, 0.0, number - 1), speed, g, rho)
+        last, earlier = (np.where(resting, 0.0, np.minimum(parts["bounce"] + x, 0.0)) for x in (start, before))
+        return last, earlier
+
     def events(self, parts: Mapping[str, np.ndarray], window: Window) -> list[tuple[str, np.ndarray]]:
-        g, up = _gravity(parts["a"])
+        g, up = _gravity(_acceleration(parts, window))
         speed, _ = _split(parts["v"], up)
         rho, gravity = _restitution(parts), np.maximum(g, _TINY)
         first = float(_flight(window.first - parts["bounce"], speed, gravity, rho)[0].reshape(-1)[0])
@@ -149,6 +167,14 @@ class Bounce(MotionKind):
 
     def spins(self, model: MotionModel) -> bool:
         return bool(model.angular_velocity.any())
+
+
+def _acceleration(parts: Mapping[str, np.ndarray], window: Window) -> np.ndarray:
+    """Gravity, along the up axis if its strength alone is free. [..., 3]"""
+    if "a" in parts:
+        return parts["a"]
+    assert window.up is not None
+    return -parts["fall"] * np.array(window.up)
 
 
 def _gravity(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -55,3 +55,14 @@ def test_friction_cannot_stop_a_body_that_slides_on_a_vertical_line(v, holds):
     assert plausibility.rises(law, 5 * Z) == holds
     assert not plausibility.rises(law, None)
     assert not plausibility.rises(solution("translation", v=v), Z)
+
+
+LEANING = [(-Z, False), (-Z + 0.4 * X, False), (-Z + 0.6 * X, True), (Z, True), (X, True)]
+
+
+@pytest.mark.parametrize(("a", "leans"), LEANING)
+def test_a_body_bounces_off_level_floors_alone_if_the_up_axis_is_known(a, leans):
+    law = solution("bounces", a=9 * a, v=-5 * a)
+    assert plausibility.leans(law, 2 * Z) == leans == (not plausibility.is_possible(law, 2 * Z))
+    assert not plausibility.leans(law, None)
+    assert not plausibility.leans(solution("ballistic + spin", a=a), Z)
