@@ -190,7 +190,9 @@ def _passing(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray |
         others = (n for n in range(len(bodies)) if n != number)
         depths = [_overlap(bodies[number], paths[number], bodies[n], paths[n]) for n in others]
         found[number] = max(depths, default=0.0)
-    sinking = [] if up is None else [n for n in moving if _sinks(scene, bodies[n], paths[n], up)]
+    # A law of bounces has its own floor, from the impacts that were seen.
+    landing = [n for n in moving if bodies[n].smooth.kind != "bounce"]
+    sinking = [] if up is None else [n for n in landing if _sinks(scene, bodies[n], paths[n], up)]
     plane = scene_world.plane(scene, bodies, end, up) if sinking and up is not None else None
     for number in sinking if plane is not None else ():
         assert plane is not None

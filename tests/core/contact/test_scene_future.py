@@ -45,6 +45,16 @@ def test_a_falling_box_comes_to_rest_on_the_floor_and_keeps_its_smooth_motion(fa
     assert np.linalg.norm(models.evaluate(box.model, 9.0)[1] - models.evaluate(box.model, 2.0)[1]) < 1e-9
 
 
+@pytest.mark.parametrize(("kind", "simulated"), [("bounce", False), ("ballistic_spin", True)])
+def test_a_body_bounces_on_off_the_floor_that_its_impacts_have_shown(kind, simulated):
+    model, center = contact_scenes.falling(0.4)
+    depth = center[2] - 0.45 * SIZE  # its floor is 0.05 sizes lower than the one that is seen
+    landing = (-1.5 + np.sqrt(1.5**2 + 2 * contact_scenes.G * depth)) / contact_scenes.G
+    model = dataclasses.replace(model, kind=kind, bounce_time=landing, restitution=0.8, angular_velocity=np.zeros(3))
+    found = scene_future.predict(contact_scenes.scene((model, center)), FEW)
+    assert ("box 1" in found.penetrations) == simulated == ("box 1" in found.taken)
+
+
 def test_the_band_widens_at_the_first_impact(fallen):
     _, found = fallen
     band = found.groups[1].history.band
