@@ -17,7 +17,7 @@ from ..scene.world_axes import UP_AXIS
 from . import pose_errors
 
 # Share of the usual errors of the poses below which laws do not differ (docs/results/predicted_motion.md).
-SCATTER = 0.35
+SCATTER = 0.5
 
 
 def share_gravity(
