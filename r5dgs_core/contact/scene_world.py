@@ -24,6 +24,7 @@ SAMPLES = 32
 _LEAST_POSES = 3
 _MISFIT = 30.0  # mean squared residual in units of the noise above which contacts do not explain the poses
 _STANDS = 0.15  # the same of a body that stands on it; others are held by something
+_CORNERS = 8  # of a box
 _ROUNDS = 6  # of shrinking bodies that overlap
 
 
@@ -209,8 +210,12 @@ def make(
 
 
 def _as_box(body: SceneBody) -> SceneBody:
-    """The body with the shape of a box if its hull is nearly one; the user's obstacles stay as they are."""
-    corners = boxes.of(body.solid.vertices) if body.group.id else None
+    """The body with the shape of a box if its hull is nearly one; the user's obstacles stay as they are.
+
+    Hulls of this release are boxes already; those of older scene files bulge over the faces.
+    """
+    vertices = body.solid.vertices
+    corners = boxes.of_hull(vertices) if body.group.id and len(vertices) > _CORNERS else None
     return body if corners is None else dataclasses.replace(body, solid=solid.of(corners))
 
 

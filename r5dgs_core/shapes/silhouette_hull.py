@@ -56,7 +56,7 @@ def of(
         return None
     vertices = corners[convex_hull.spread(corners, directions.sphere(1024), most)]
     vertices = _with_volume_of(vertices, corners)
-    return None if vertices is None else SilhouetteHull(vertices, _error(vertices, found))
+    return None if vertices is None else SilhouetteHull(vertices, error(vertices, found))
 
 
 def _intersection(found: list[Silhouette]) -> np.ndarray | None:
@@ -64,8 +64,7 @@ def _intersection(found: list[Silhouette]) -> np.ndarray | None:
     from scipy.optimize import linprog
     from scipy.spatial import HalfspaceIntersection, QhullError
 
-    towards = np.concatenate([directions.circle(silhouettes.SIDES) @ one.basis for one in found])
-    reach = np.concatenate([one.sides for one in found])
+    towards, reach = silhouettes.tangents(found)
     middle = np.linalg.lstsq(towards, reach, rcond=None)[0]
     reach = reach - towards @ middle
     size = np.abs(reach).max()
@@ -94,8 +93,8 @@ def _with_volume_of(vertices: np.ndarray, corners: np.ndarray) -> np.ndarray | N
     return middle + np.cbrt(wanted / own) * (vertices - middle)
 
 
-def _error(vertices: np.ndarray, found: list[Silhouette]) -> float:
-    """Area between the outlines of a hull and the silhouettes over the length of the outlines, in the mean."""
+def error(vertices: np.ndarray, found: list[Silhouette]) -> float:
+    """Return the area between the outlines of a hull and the silhouettes over the length of the outlines, in the mean."""
     sides = directions.circle(silhouettes.SIDES)
     areas, lengths = [], []
     for one in found:

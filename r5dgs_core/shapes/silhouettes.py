@@ -43,14 +43,17 @@ class Silhouette:
     sides: np.ndarray
 
 
-def of(means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray) -> list[Silhouette]:
-    """Return the silhouettes in which the Gaussians reach the opacity `LEVEL`: their largest connected part each.
+def of(
+    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, level: float = LEVEL
+) -> list[Silhouette]:
+    """Return the silhouettes in which the Gaussians reach an opacity: their largest connected part each.
 
     Args:
         means: Centres. [N, 3]
         quats: wxyz. [N, 4]
         scales: Standard deviations. [N, 3]
         opacities: Opacities from 0 to 1. [N]
+        level: Opacity at the outline.
     """
     seen = np.flatnonzero(opacities > _FAINT)
     if not len(seen):
@@ -59,11 +62,24 @@ def of(means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.n
     centers = means[seen].astype(np.float64)
     axes = rotations.quats_to_rotmats(rotations.normalize(quats[seen].astype(np.float64)))
     axes = axes * scales[seen].astype(np.float64)[:, None, :]
-    drawn = (_silhouette(centers, axes, opacities[seen], towards) for towards in directions.sphere(2 * VIEWS)[:VIEWS])
+    views = directions.sphere(2 * VIEWS)[:VIEWS]
+    drawn = (_silhouette(centers, axes, opacities[seen], towards, level) for towards in views)
     return [one for one in drawn if one is not None]
 
 
-def _silhouette(centers: np.ndarray, axes: np.ndarray, opacities: np.ndarray, towards: np.ndarray) -> Silhouette | None:
+def tangents(found: list[Silhouette]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the planes that touch an object at the outlines of its silhouettes.
+
+    Returns:
+        Their outward unit normals [P, 3], and the distances of the planes from the origin along them. [P]
+    """
+    normals = np.concatenate([directions.circle(SIDES) @ one.basis for one in found])
+    return normals, np.concatenate([one.sides for one in found])
+
+
+def _silhouette(
+    centers: np.ndarray, axes: np.ndarray, opacities: np.ndarray, towards: np.ndarray, level: float
+) -> Silhouette | None:
     """Silhouette along a direction, or None. Columns of ``axes`` [N, 3, 3] are the scaled axes of the Gaussians."""
     basis = _basis(towards)
     points, flat = centers @ basis.T, np.einsum("ai,nij->naj", basis, axes)
@@ -75,10 +91,10 @@ def _silhouette(centers: np.ndarray, axes: np.ndarray, opacities: np.ndarray, to
     step = (high - low).max() / CELLS
     shape = tuple(np.ceil((high - low) / step).astype(int) + 1)
     alpha = _draw((points - low) / step, covariances / step**2, opacities, shape)
-    mask = _largest_part(alpha >= LEVEL)
+    mask = _largest_part(alpha >= level)
     if mask is None:
         return None
-    outline = _crossings(np.where(mask | (alpha < LEVEL), alpha, 0.0), mask)
+    outline = _crossings(np.where(mask | (alpha < level), alpha, 0.0), mask, level)
     if len(outline) < 6:
         return None
     sides = (outline * step + low) @ directions.circle(SIDES).T
@@ -138,12 +154,12 @@ def _largest_part(mask: np.ndarray) -> np.ndarray | None:
     return labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
 
 
-def _crossings(alpha: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Points at which the opacity passes `LEVEL` between adjacent cells, interpolated linearly, in cells. [P, 2]"""
+def _crossings(alpha: np.ndarray, mask: np.ndarray, level: float) -> np.ndarray:
+    """Points at which the opacity passes a level between adjacent cells, interpolated linearly, in cells. [P, 2]"""
     found = []
     for axis in (0, 1):
         a, inside = np.moveaxis(alpha, axis, 0), np.moveaxis(mask, axis, 0)
         i, j = np.nonzero(inside[1:] != inside[:-1])
-        along = i + (LEVEL - a[i, j]) / (a[i + 1, j] - a[i, j])
+        along = i + (level - a[i, j]) / (a[i + 1, j] - a[i, j])
         found.append(np.stack([along, j] if axis == 0 else [j, along], axis=1))
     return np.concatenate(found)

@@ -20,7 +20,7 @@ def sides(corners):
 
 def test_the_corners_of_a_box_are_its_own():
     corners = rotations.rotate(TURN[None], CORNERS * SIDES) + CENTER
-    found = boxes.of(corners)
+    found = boxes.of_hull(corners)
     nearest = np.linalg.norm(found[:, None] - corners, axis=2).min(axis=1)
     assert nearest.max() < 1e-3
 
@@ -35,7 +35,7 @@ def test_the_silhouettes_of_a_box_bulge_over_its_faces_and_give_the_box():
     hull = silhouette_hull.of(means, quats, scales, np.full(len(means), 0.9))
     wide = np.ptp(rotations.rotate(rotations.conjugate(TURN)[None], hull.vertices), axis=0)
     assert (wide > 1.08 * SIDES).any()
-    found = boxes.of(hull.vertices)
+    found = boxes.of_hull(hull.vertices)
     np.testing.assert_allclose(sides(found), SIDES, rtol=0.06)
     np.testing.assert_allclose(found.mean(axis=0), CENTER, atol=0.01)
 
@@ -50,4 +50,4 @@ def prism(count, height):
     "vertices", [directions.sphere(64), prism(24, 1.0), prism(6, 0.8), CORNERS[:7]], ids=["ball", "can", "nut", "cut"]
 )
 def test_other_shapes_are_no_boxes(vertices):
-    assert boxes.of(vertices) is None
+    assert boxes.of_hull(vertices) is None
