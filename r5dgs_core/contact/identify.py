@@ -257,7 +257,7 @@ class Fitter:
 
     def at(self, estimate: Estimate, time: float) -> State:
         """State of an estimate at a later time."""
-        self.simulation.touch(self._materials(estimate.material))
+        self.simulation.set_materials(self._materials(estimate.material))
         self.simulation.load(self._all(estimate.state))
         return self.simulation.state_at(time - estimate.time).one(self.body)
 

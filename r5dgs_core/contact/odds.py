@@ -50,7 +50,7 @@ def of(scene: Scene, count: int, seed: int = 0) -> list[Odds]:
         return []
     runs, futures = made.draft(scene.t_max, duration), []
     for state, materials in made.draws(scene.t_max, list(found.materials), wishes):
-        runs.touch(materials)
+        runs.set_materials(materials)
         future = recording.record(runs, state, duration)
         if not runs.failed:
             futures.append(future)

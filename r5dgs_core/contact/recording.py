@@ -61,6 +61,7 @@ class Recording:
     frequency: float
 
 
+@np.errstate(over="ignore")  # huge speeds of a simulation that is about to fail have no square
 def record(simulation: Simulation, state: State, duration: float) -> Recording:
     """Simulate from a state for a duration, or until all bodies rest."""
     simulation.load(state)

@@ -116,7 +116,7 @@ def _simulated(
         state.velocities[number] += wishes.pushes.get(body.group.id, np.zeros(3))
     duration = end - scene.t_max
     runs = Simulation(made.world, made.stepping(state, duration))
-    runs.touch(materials)
+    runs.set_materials(materials)
     found = recording.record(runs, state, _BEYOND * duration)  # it ends when all bodies rest
     if runs.failed:
         return Prediction(scene.groups, depths, {}, (*lines, "no contacts are predicted: the simulation failed"))

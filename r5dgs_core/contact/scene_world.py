@@ -112,7 +112,7 @@ class SceneWorld:
         quats = np.empty((len(times), wishes.samples, len(self.bodies), 4))
         places = np.empty((len(times), wishes.samples, len(self.bodies), 3))
         for n, (state, used) in enumerate(self.draws(t_max, materials, wishes)):
-            runs.touch(used)
+            runs.set_materials(used)
             quats[:, n], places[:, n] = runs.poses(state, times)
         good = np.isfinite(places).all(axis=(0, 2, 3))
         rows = range(len(self.bodies))

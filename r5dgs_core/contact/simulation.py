@@ -70,9 +70,9 @@ class Simulation:
         self._flights = Flights(world, self.unit)
         moments = self.model.body_inertia[self.model.dof_bodyid[::6]]
         self._steady = bool((np.ptp(moments, axis=1) <= ROUND * moments.max(axis=1)).all())
-        self.touch([body.material for body in world.bodies])
+        self.set_materials([body.material for body in world.bodies])
 
-    def touch(self, materials: Sequence[Material]) -> None:
+    def set_materials(self, materials: Sequence[Material]) -> None:
         """Set the materials of the B bodies."""
         model, frequency, least = self.model, self.stepping.frequency, self.stepping.least_restitution
         for pair, bodies in enumerate(self._pairs):
@@ -192,7 +192,7 @@ class Simulation:
         rest, failed = np.empty(shape), np.zeros(len(starts), bool)
         for n, (start, speed) in enumerate(zip(starts, speeds, strict=True)):
             if materials:
-                self.touch(materials[n])
+                self.set_materials(materials[n])
             self._reset(start, speed)
             for row, time in enumerate(times.tolist()):
                 self.advance(time)

@@ -17,6 +17,7 @@ def test_a_body_that_slides_into_another_touches_it_first_in_every_future():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("error:overflow:RuntimeWarning")
 def test_futures_whose_simulation_failed_are_left_out(monkeypatch):
     scene = contact_scenes.with_units(contact_scenes.scene(contact_scenes.sliding(1.5), contact_scenes.resting(0.7)))
     sound = scene_world.SceneWorld.draws
