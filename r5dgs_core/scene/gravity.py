@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from .scene import Scene
 STANDARD = 9.80665  # m / s^2
 _FLIGHTS = ("translation", "ballistic_spin", "free_top", "bounce")  # kinds whose acceleration may be gravity
 _DOWNWARD = 0.94  # least cosine between the acceleration of a falling body and the downward axis: 20 degrees
+_FALL = 0.5  # height of the fall in the observed time, in radii of the body, below which it tells nothing of gravity
 _AGREES = 0.1  # relative difference of observed motions from the gravity of the units up to which they agree with it
 
 
@@ -20,11 +21,12 @@ def of(scene: Scene) -> np.ndarray | None:
     """Return the acceleration of falling bodies, or None if it is unknown: no body falls, and units are missing. [3]
 
     The units give its exact value; a few observed poses give it within some per cent. If they differ by more, the
-    observed motions count, as a scene may be in slow motion. It is vertical if the world has an up axis, as the tilt of
-    a few observed poses is mostly noise, on which a ball would roll for ever.
+    observed motions count, as a scene may be in slow motion. Bodies that hardly fall in the observed time do not count:
+    a ball that rolls over a table seems to rise or fall by the errors of its poses. Gravity is vertical if the world
+    has an up axis, as the tilt of a few observed poses is mostly noise, on which a ball would roll for ever.
     """
     up = cameras.WORLD_TO_BLENDER[scene.world_convention][2]
-    found = of_motions((group.smooth or group.model for group in scene.groups if group.role == "body"), up)
+    found = of_motions(_seen(scene), up)
     seconds, meters = scene.units.seconds_per_unit, scene.units.meters_per_unit
     known = None if seconds is None or meters is None else STANDARD * seconds**2 / meters
     if found is None:
@@ -33,6 +35,15 @@ def of(scene: Scene) -> np.ndarray | None:
         found = (found @ up) * up
     seen = float(np.linalg.norm(found))
     return found if known is None or abs(seen - known) > _AGREES * known else known / seen * found
+
+
+def _seen(scene: Scene) -> Iterator[MotionModel]:
+    """Motions of the bodies that their accelerations move visibly in the observed time."""
+    half_square = 0.5 * float(np.ptp(scene.tracks.times)) ** 2 if len(scene.tracks.times) else 0.0
+    for group in scene.groups:
+        model = group.smooth or group.model
+        if group.role == "body" and half_square * float(np.linalg.norm(model.acceleration)) >= _FALL * model.radius:
+            yield model
 
 
 def of_motions(models: Iterable[MotionModel], up: np.ndarray) -> np.ndarray | None:

@@ -59,3 +59,10 @@ def test_without_a_fall_it_is_the_earths_in_the_units_of_the_scene_or_unknown():
 def test_units_tell_it_more_exactly_than_motions_that_agree_with_them(meters, pull):
     scene = with_motions(THROWN, units=Units(1.0, meters))
     np.testing.assert_allclose(gravity.of(scene), [0, 0, -pull], rtol=1e-9)
+
+
+def test_a_ball_that_rolls_tells_nothing_of_gravity_although_its_heights_drift():
+    drifting = MotionModel("translation", velocity=[1.0, 0, 0], acceleration=[0, 0, -0.2], radius=0.2)
+    assert gravity.of(with_motions(drifting)) is None
+    np.testing.assert_allclose(gravity.of(with_motions(drifting, units=Units(1.0, 1.0))), [0, 0, -9.80665])
+    assert gravity.of(with_motions(dataclasses.replace(drifting, acceleration=np.array([0, 0, -2.0])))) is not None
