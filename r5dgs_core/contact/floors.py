@@ -1,7 +1,8 @@
 """Height of the ground under a body, from the body's own poses.
 
-The plane of the pictures is about a pixel off. A body that rests or slides is as high as its ground. A body that
-bounces is above it in all pictures; its ground is where the paths before and after the impact meet.
+The plane of the pictures is about a pixel off. A body that rests, slides or rolls is as high as its ground; at its last
+poses, as its height drifts with the errors of its poses. A body that bounces is above its ground in all pictures; its
+ground is where the paths before and after the impact meet.
 """
 
 from __future__ import annotations
@@ -18,17 +19,31 @@ _ROWS = 3  # poses of a path before or after an impact
 _CLEAR = 6.0  # change of the speed in an impact, in units of its noise
 _CLOSE = 0.15  # largest height of an impact over the plane, in sizes
 _LOWER = 0.05  # depth below it, in sizes, at which a body was never seen
+_LAST = 6  # poses of a body that stays on its ground
+_STEADY = 0.25  # largest acceleration of their heights, in units of gravity
+_FLAT = 0.05  # largest range of their heights, in sizes
 _SMOOTH = 3.0  # residual of a path, in units of the noise
 
 
 def of(body: Body, below: Plane, track: Track, gravity: np.ndarray) -> float | None:
     """Return the height of a moving body's ground along the normal of a plane, or None if its poses do not show it."""
-    size = body.solid.size
-    lowest = float(world.gaps(body, below, track.places, track.quats).min(initial=np.inf))
-    impact = _impact(body, below, track, float(np.linalg.norm(gravity)))
+    size, g = body.solid.size, float(np.linalg.norm(gravity))
+    gaps = world.gaps(body, below, track.places, track.quats)
+    lowest = float(gaps.min(initial=np.inf))
+    if lowest < _TOUCHED * size and _stays(gaps, track.times, g, size):
+        return below.height + float(np.median(gaps[-_LAST:]))
+    impact = _impact(body, below, track, g)
     if impact is not None and impact < _CLOSE * size and impact - _LOWER * size < lowest:
         return below.height + impact
     return below.height + lowest if lowest < _TOUCHED * size else None
+
+
+def _stays(gaps: np.ndarray, times: np.ndarray, g: float, size: float) -> bool:
+    """Return True if the last poses are those of a body that stays on its ground. [S], [S]"""
+    gaps, times = gaps[-_LAST:], times[-_LAST:] - times[-1]
+    if len(gaps) < _LAST or np.ptp(gaps) > _FLAT * size:
+        return False
+    return abs(2 * np.polyfit(times, gaps, 2)[0]) < _STEADY * g
 
 
 def _impact(body: Body, below: Plane, track: Track, g: float) -> float | None:

@@ -23,7 +23,7 @@ UNEXPLAINED = 3.0  # root mean square residual of the last poses, in units of th
 BETTER = 1.0  # difference of such residuals of held-out poses that counts
 _LAST = 6  # poses that a law must explain
 _HELD, _LEAST_HELD = 0.2, 2  # share and number of held-out poses
-_CLOSE = 0.05  # height over the lowest observed place, in sizes, of a body in contact
+_CLOSE = 0.05  # height over the lowest of the last places, in sizes, of a body in contact
 _STANDS = 0.15  # the same over the plane of the lowest place
 
 
@@ -46,8 +46,8 @@ class Comparison:
 
     @property
     def good(self) -> bool:
-        """True if contacts explain the poses."""
-        return self.better or self.contact < UNEXPLAINED
+        """True if contacts explain the poses, or no worse than the smooth law does."""
+        return self.contact < max(UNEXPLAINED, self.smooth)
 
     def text(self) -> str:
         """Residuals in words."""
@@ -78,9 +78,9 @@ def in_contact(scene: Scene, body: SceneBody, plane: Plane | None) -> bool:
     if plane is None:
         return False
     track = scene_bodies.track(scene, body)
-    heights = world.gaps(world.Body(body.solid), plane, track.places, track.quats)
+    heights = world.gaps(world.Body(body.solid), plane, track.places, track.quats)[-_LAST:]
     size, lowest = body.solid.size, float(heights.min())
-    return abs(lowest) < _STANDS * size and bool(np.median(heights[-_LAST:]) - lowest < _CLOSE * size)
+    return abs(lowest) < _STANDS * size and bool(np.median(heights) - lowest < _CLOSE * size)
 
 
 def compare(fitter: Fitter, up: np.ndarray) -> Comparison:

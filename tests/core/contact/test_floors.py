@@ -45,6 +45,15 @@ def test_a_body_that_rests_is_as_high_as_its_ground_and_one_in_flight_tells_noth
     assert floors.of(box, plane, above, GRAVITY) is None
 
 
+def test_the_ground_of_a_body_that_stays_on_it_is_that_of_its_last_poses_although_its_heights_drift():
+    times, ball = np.linspace(0, 0.6, 19), contacts.ball([0, 0, 0])
+    drift = SIZE * (0.1 * np.minimum(times / 0.3, 1.0) + 0.002 * np.sin(40 * times))
+    drift[-2:] += 0.005 * SIZE  # a kink like that of an impact
+    seen = track(ball.ball_radius + drift, times, 1e-4)
+    found = floors.of(ball, world.Plane(UP, 0.05 * SIZE), seen, GRAVITY)
+    assert found == pytest.approx(float(np.median(drift[-6:])), abs=1e-9)
+
+
 @pytest.mark.parametrize("noise", [1e-3, 1e-4], ids=["noisy", "exact"])
 def test_friction_and_restitution_are_fitted_if_no_pose_is_close_to_the_ground(noise):
     pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")

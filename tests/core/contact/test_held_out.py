@@ -112,3 +112,25 @@ def test_a_body_that_accelerates_over_the_floor_by_itself_keeps_its_motion():
     scene = contact_scenes.with_units(contact_scenes.scene((law, place), (models.STATIC, place + [1.0, 0, 0])))
     found = scene_future.predict(scene, Wishes(samples=1))
     assert found.penetrations and not found.taken and found.groups is scene.groups
+
+
+def test_a_body_whose_heights_drift_is_in_contact_and_one_in_flight_is_not():
+    scene = contact_scenes.scene(contact_scenes.sliding(1.0))
+    body, plane = scene_bodies.of(scene)[0][0], world.Plane(UP, 0.0)
+
+    def with_heights(heights):
+        poses = scene.tracks.poses.copy()
+        poses[1, :, 6] += heights
+        moved = dataclasses.replace(scene, tracks=dataclasses.replace(scene.tracks, poses=poses))
+        return held_out.in_contact(moved, body, plane)
+
+    since = TIMES - TIMES[-1]
+    assert with_heights(0.2 * SIZE * since)
+    assert not with_heights(-0.5 * G * (since + 0.15) ** 2 + 0.05 * SIZE)
+    assert not with_heights(np.full(len(since), 0.3 * SIZE))
+
+
+def test_contacts_are_good_if_they_explain_the_poses_or_no_worse_than_the_smooth_law():
+    compare = held_out.Comparison
+    assert compare(1.0, 2.9).good and compare(8.0, 7.5).good and not compare(8.0, 8.5).good
+    assert not compare(8.0, 7.5).better and compare(8.0, 6.5).better
