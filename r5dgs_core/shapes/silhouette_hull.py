@@ -94,7 +94,7 @@ def _with_volume_of(vertices: np.ndarray, corners: np.ndarray) -> np.ndarray | N
 
 
 def error(vertices: np.ndarray, found: list[Silhouette]) -> float:
-    """Return the area between the outlines of a hull and the silhouettes over the length of the outlines, in the mean."""
+    """Return the mean ratio of the area between outlines of a hull and silhouettes to the length of the outlines."""
     sides = directions.circle(silhouettes.SIDES)
     areas, lengths = [], []
     for one in found:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import rotations
-from r5dgs_core.shapes import boxes, directions, silhouette_hull
+from r5dgs_core.shapes import boxes, directions, silhouette_hull, silhouettes
 
 SIDES = np.array([0.3, 0.45, 0.6])
 TURN = rotations.normalize(np.array([0.8, 0.3, -0.4, 0.2]))
@@ -37,6 +37,10 @@ def test_the_silhouettes_of_a_box_bulge_over_its_faces_and_give_the_box():
     assert (wide > 1.08 * SIDES).any()
     found = boxes.of_hull(hull.vertices)
     np.testing.assert_allclose(sides(found), SIDES, rtol=0.06)
+    np.testing.assert_allclose(found.mean(axis=0), CENTER, atol=0.01)
+    outlines = silhouettes.of(means, quats, scales, np.full(len(means), 0.9))
+    found = boxes.of(*silhouettes.tangents(outlines))
+    np.testing.assert_allclose(sides(found), SIDES, rtol=0.04)
     np.testing.assert_allclose(found.mean(axis=0), CENTER, atol=0.01)
 
 

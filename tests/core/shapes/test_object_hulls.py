@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
+from r5dgs_core.render import viewpoints
 from r5dgs_core.scene import scene_file
 from r5dgs_core.scene.hull import Hull
-from r5dgs_core.shapes import object_hulls
-from tests.support import scenes
+from r5dgs_core.shapes import object_hulls, solid
+from tests.support import contact_scenes, scenes, solid_gaussians
 
 
 def mixed():
@@ -46,6 +47,31 @@ def test_hulls_enclose_the_solid_gaussians_of_their_object():
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         beyond = (means @ towards.T).max(0) - (hull.vertices @ towards.T).max(0)
         assert beyond.max() < 0.02
+
+
+def box_scene():
+    """A scene of a box of Gaussians, seen by one camera."""
+    scene = contact_scenes.scene(contact_scenes.resting())
+    rows = scene.gaussians.object_ids == 1
+    box = solid_gaussians.box((0.5, 0.4, 0.3), int(rows.sum()))
+    arrays = {name: getattr(scene.gaussians, name).copy() for name in ("means", "quats", "log_scales")}
+    for name, values in zip(arrays, (box[0], box[1], np.log(box[2])), strict=True):
+        arrays[name][rows] = values
+    return dataclasses.replace(scene.with_arrays(**arrays), cameras=(viewpoints.resized(scene.cameras[0], 200),))
+
+
+def test_boxes_are_as_large_as_in_pictures_with_their_low_pass_filter():
+    coarse = box_scene()
+    camera, place = coarse.cameras[0], coarse.gaussians.means[coarse.gaussians.object_ids == 1].mean(axis=0)
+    depth = camera.T_cam_world[2, :3] @ place + camera.T_cam_world[2, 3]
+    variance = 0.3 * (depth / camera.intrinsics[0, 0]) ** 2
+    larger = 0.5 * np.log(np.exp(2 * coarse.gaussians.log_scales) + variance)
+    filtered = dataclasses.replace(coarse.with_arrays(log_scales=larger.astype(np.float32)), cameras=())
+    sharp = dataclasses.replace(coarse, cameras=())
+    (first,), (second,), (small,) = (object_hulls.of(one) for one in (coarse, filtered, sharp))
+    assert len(first.vertices) == len(small.vertices) == 8
+    np.testing.assert_allclose(first.vertices, second.vertices, atol=1e-5)
+    assert solid.of(small.vertices).volume < 0.98 * solid.of(first.vertices).volume
 
 
 def test_hulls_are_an_optional_feature_of_scene_files(tmp_path):
