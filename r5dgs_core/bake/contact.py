@@ -60,5 +60,24 @@ def _rows(found: Prediction) -> list[dict[str, Any]]:
             body, own = simulated[name]  # the id, as users change names
             row |= {"object_id": body.group.object_id}
             row |= {"friction": own.friction, "restitution": restitution.limited(own.restitution)}
+            row |= {"simulation": numbers} if (numbers := _simulation(found, name)) else {}
         rows.append(row)
     return rows
+
+
+def _simulation(found: Prediction, name: str) -> dict[str, Any]:
+    """Ground of a body and MuJoCo's numbers of its contacts, scene units; empty if its support has an edge."""
+    assert found.world is not None and found.recording is not None
+    made, number = found.world.world, [body.name for body in found.world.bodies].index(name)
+    if made.plane is None or made.edge is not None or len(found.recording.times) < 2:
+        return {}
+    floor = made.bodies[number].floor
+    normal = restitution.reference(found.materials[number].restitution, found.recording.frequency)
+    return {
+        "normal": made.plane.normal.tolist(),
+        "height": made.plane.height if floor is None else floor,
+        "solref": list(normal),
+        "solreffriction": list(restitution.grip(normal)),
+        "flat_foot": not found.world.bodies[number].moves,
+        "timestep": float(found.recording.times[1] - found.recording.times[0]),
+    }

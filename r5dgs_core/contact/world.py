@@ -9,9 +9,6 @@ import numpy as np
 from ..motion import rotations
 from ..shapes.solid import Solid
 
-_ROUND = 0.045  # deviation of the distances of a ball's vertices from its centre, over their mean, at most
-_FULL = 0.8  # volume of a ball's hull over that of the ball through its vertices, at least
-
 
 @dataclass(frozen=True)
 class Material:
@@ -47,10 +44,7 @@ class Body:
     @property
     def ball_radius(self) -> float | None:
         """Radius of the ball of equal volume if the body is nearly a ball, whose facets would keep it from rolling."""
-        distances = np.linalg.norm(self.solid.vertices - self.solid.center, axis=1)
-        radius = float(np.cbrt(3 * self.solid.volume / (4 * np.pi)))
-        full = radius**3 > _FULL * distances.mean() ** 3
-        return radius if full and distances.std() < _ROUND * distances.mean() else None
+        return self.solid.ball_radius
 
 
 @dataclass(frozen=True)

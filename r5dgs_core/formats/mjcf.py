@@ -16,6 +16,8 @@ from .rigid_bodies import RigidBody
 
 KEY = "start"  # name of the keyframe
 _TORSION = (0.005, 0.0001)  # MuJoCo's torsional and rolling friction
+_TOGETHER, _ON_GROUND = 1, 2  # bits of the contacts between bodies, and of those with the common ground
+_IMPEDANCE = (0.99, 0.99, 0.001, 0.5, 2.0)  # constant, so that solref alone determines the restitution
 
 
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
@@ -33,8 +35,12 @@ def model(scene: Scene, bodies: list[RigidBody], height: float | None) -> Elemen
     """Return the element ``mujoco`` of a scene and its bodies, over the ground at a height if there is one."""
     root = ElementTree.Element("mujoco", model=scene.name)
     add = ElementTree.SubElement
+    simulated = [body.contacts for body in bodies if body.contacts is not None]
     # RK4 is exact for a parabola, and the elliptic cone for friction in any direction.
     option = {"timestep": numbers([rigid_bodies.time_step(scene)]), "integrator": "RK4", "cone": "elliptic"}
+    if simulated:  # as the scene's motions were simulated
+        step = min(one.timestep for one in simulated)
+        option |= {"timestep": numbers([step]), "integrator": "Euler", "jacobian": "dense"}
     add(root, "option", option, gravity=numbers(rigid_bodies.gravity(scene)))
     defaults = add(root, "default")
     add(defaults, "geom", type="mesh", condim="3", friction=numbers([rigid_bodies.FRICTION, *_TORSION]))
@@ -42,18 +48,14 @@ def model(scene: Scene, bodies: list[RigidBody], height: float | None) -> Elemen
     if height is not None:
         # Of two geoms, the larger friction counts: that of the body.
         place = {"pos": numbers([0, 0, height]), "size": "0 0 1", "friction": numbers([0, *_TORSION])}
-        add(world, "geom", place, name=rigid_bodies.GROUND, type="plane")
+        affinity = {"contype": "0", "conaffinity": str(_ON_GROUND)} if simulated else {}
+        add(world, "geom", place | affinity, name=rigid_bodies.GROUND, type="plane")
     for body in bodies:
-        corners = numbers(body.solid.vertices.ravel())
-        add(assets, "mesh", name=body.name, vertex=corners, face=" ".join(map(str, body.solid.triangles.ravel())))
-        element = add(world, "body", name=body.name, pos=numbers(body.position), quat=numbers(body.quat))
-        if body.moves:
-            add(element, "freejoint", name=body.name)
-        inertia = numbers(body.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
-        add(element, "inertial", pos="0 0 0", mass=numbers([body.mass]), fullinertia=inertia)
-        shape = add(element, "geom", name=body.name, mesh=body.name)
-        if body.friction != rigid_bodies.FRICTION:
-            shape.set("friction", numbers([body.friction, *_TORSION]))
+        shape = _add_body(assets, world, body)
+        if simulated and body.contacts is None:
+            shape.set("contype", str(_TOGETHER | _ON_GROUND))
+    if simulated:
+        _add_contacts(root, world, [body for body in bodies if body.contacts is not None])
     moving = [body for body in bodies if body.moves]
     if moving:
         places = np.concatenate([[*body.position, *body.quat] for body in moving])
@@ -61,6 +63,46 @@ def model(scene: Scene, bodies: list[RigidBody], height: float | None) -> Elemen
         rates = [[*body.velocity, *rotations.rotate(rotations.conjugate(body.quat), body.spin)] for body in moving]
         add(add(root, "keyframe"), "key", name=KEY, qpos=numbers(places), qvel=numbers(np.concatenate(rates)))
     return root
+
+
+def _add_body(assets: ElementTree.Element, world: ElementTree.Element, body: RigidBody) -> ElementTree.Element:
+    """Add a body and return its geometry: a sphere if it is nearly one, whose facets would keep it from rolling."""
+    add, radius, inertia = ElementTree.SubElement, body.solid.ball_radius, body.inertia
+    element = add(world, "body", name=body.name, pos=numbers(body.position), quat=numbers(body.quat))
+    if body.moves:
+        add(element, "freejoint", name=body.name)
+    if radius is not None:
+        inertia = 0.4 * body.mass * radius**2 * np.eye(3)
+    moments = numbers(inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+    add(element, "inertial", pos="0 0 0", mass=numbers([body.mass]), fullinertia=moments)
+    if radius is not None:
+        shape = add(element, "geom", name=body.name, type="sphere", size=numbers([radius]))
+    else:
+        corners = numbers(body.solid.vertices.ravel())
+        add(assets, "mesh", name=body.name, vertex=corners, face=" ".join(map(str, body.solid.triangles.ravel())))
+        shape = add(element, "geom", name=body.name, mesh=body.name)
+    if body.friction != rigid_bodies.FRICTION:
+        shape.set("friction", numbers([body.friction, *_TORSION]))
+    return shape
+
+
+def _add_contacts(root: ElementTree.Element, world: ElementTree.Element, bodies: list[RigidBody]) -> None:
+    """Add the contacts of bodies that were simulated: with a ground of their own each, and with each other."""
+    add, pairs = ElementTree.SubElement, ElementTree.SubElement(root, "contact")
+    for number, body in enumerate(bodies):
+        own = body.contacts
+        assert own is not None
+        ground = f"{rigid_bodies.GROUND} of {body.name}"
+        place = {"pos": numbers(own.height * own.normal), "zaxis": numbers(own.normal), "size": "0 0 1"}
+        add(world, "geom", place, name=ground, type="plane", contype="0", conaffinity="0")
+        for name, other in ((ground, body), *((other.name, other) for other in bodies[:number])):
+            assert other.contacts is not None
+            softer = min((body, other), key=lambda one: 1.0 if one.restitution is None else one.restitution).contacts
+            assert softer is not None
+            mu = numbers([max(body.friction, other.friction)] * 2 + [_TORSION[0]] + [_TORSION[1]] * 2)
+            numbers_of = {"solref": softer.solref, "solreffriction": softer.solreffriction, "solimp": _IMPEDANCE}
+            pair = {key: numbers(values) for key, values in numbers_of.items()}
+            add(pairs, "pair", pair, geom1=name, geom2=body.name, condim="3", friction=mu)
 
 
 def numbers(values: Iterable[float]) -> str:
@@ -72,9 +114,9 @@ FORMAT = registry.Format(
     name="mjcf",
     label="MuJoCo Model",
     suffix=".xml",
-    keeps="convex hulls as rigid bodies with mass, inertia, fitted friction, gravity, ground and a keyframe of poses "
-    "and velocities",
-    loses="Gaussians, colours, learned motion, restitution, joints, concave shapes, shape of the ground, cameras",
+    keeps="convex hulls and balls as rigid bodies with mass, inertia, fitted friction, simulated contacts, gravity, "
+    "ground and a keyframe of poses and velocities",
+    loses="Gaussians, colours, learned motion, joints, concave shapes, shape of the ground, cameras",
     write=export,
     per_frame=True,
     losses=rigid_bodies.simulator_losses,

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from .. import errors
-from ..motion import rotations
+from ..motion import models, rotations
 from ..playback import object_poses
 from ..scene import cameras
 from ..scene import gravity as gravities
@@ -27,6 +27,27 @@ _NEAR = 0.2  # of the size: distance up to which the centre of rotation in fligh
 
 
 @dataclass(frozen=True)
+class Contacts:
+    """Ground of a body and MuJoCo's numbers of its contacts, as they were simulated, in the units of a file, z up.
+
+    Attributes:
+        normal: Upward unit normal of the ground. [3]
+        height: Height of the ground along the normal.
+        solref: Minus stiffness and minus damping.
+        solreffriction: The same of friction.
+        timestep: Time step.
+        flat_foot: True if the lowest part of the body was pressed flat, as it rested at t_max.
+    """
+
+    normal: np.ndarray
+    height: float
+    solref: tuple[float, float]
+    solreffriction: tuple[float, float]
+    timestep: float
+    flat_foot: bool
+
+
+@dataclass(frozen=True)
 class RigidBody:
     """A hull in the units of a file, z up. Its frame has its origin at the centre of mass.
 
@@ -40,6 +61,7 @@ class RigidBody:
         moves: False for an object without motion of its own.
         friction: Coulomb coefficient of its contacts, `FRICTION` if it is unknown.
         restitution: Speed after an impact over the speed before it, or None if it is unknown.
+        contacts: Ground and contacts of the simulation of its motion, or None if it was not simulated.
     """
 
     name: str
@@ -51,6 +73,7 @@ class RigidBody:
     moves: bool
     friction: float = FRICTION
     restitution: float | None = None
+    contacts: Contacts | None = None
 
     @property
     def mass(self) -> float:
@@ -80,9 +103,11 @@ def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
     start = {(one.object_id, one.group): one for one in object_poses.at(scene, (t,))}
     turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
     axes, length, time = rotations.rotmats_to_quats(turn), scene.units.meters_per_unit or 1.0, _time_unit(scene)
-    found, materials = [], _materials(scene)
+    found, materials, simulated = [], _materials(scene), _simulated(scene)
     for (hull, body), name in zip(chosen, names, strict=True):
-        group = scene.groups[hull.motion_id]
+        group, contacts = scene.groups[hull.motion_id], simulated.get(hull.object_id)
+        if contacts is not None and contacts.flat_foot:
+            body = solid.of(solid.with_flat_foot(body.vertices, turn.T @ contacts.normal)[0])
         center = _center_of_mass(group, body, turn[2])
         pose, rates = (one.get((hull.object_id, hull.motion_id)) for one in (start, poses))
         position, quat, velocity, spin = center, rotations.identity(), np.zeros(3), np.zeros(3)
@@ -91,6 +116,8 @@ def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
             arm = rotations.rotate(quat, center - group.home)
             spin = rates.angular_velocities[0]
             position, velocity = pose.positions[0] + arm, rates.velocities[0] + np.cross(spin, arm)
+        if contacts is not None and t >= scene.t_max:
+            position, quat, velocity, spin = _simulated_state(group, center, t - scene.t_max)
         local = solid.of(length * (body.vertices - center) @ turn.T)
         found.append(
             RigidBody(
@@ -102,6 +129,7 @@ def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
                 turn @ spin / time,
                 hull.motion_id > 0,
                 *materials.get(hull.object_id, (FRICTION, None)),
+                contacts,
             )
         )
     return found
@@ -159,6 +187,31 @@ def _materials(scene: Scene) -> dict[int, tuple[float, float | None]]:
     return found
 
 
+def _simulated(scene: Scene) -> dict[int, Contacts]:
+    """Ground and contacts of the simulated bodies, by id of the object."""
+    turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
+    length, time, found = scene.units.meters_per_unit or 1.0, _time_unit(scene), {}
+    for row in scene.needs:
+        number, own = row.get("object_id"), row.get("simulation")
+        if row.get("name") == "contact" and isinstance(number, int) and isinstance(own, dict):
+            with contextlib.suppress(KeyError, TypeError, ValueError):  # needs are free JSON objects
+                found[number] = Contacts(
+                    normal=turn @ np.array(own["normal"], np.float64),
+                    height=length * float(own["height"]),
+                    solref=_scaled(own["solref"], time),
+                    solreffriction=_scaled(own["solreffriction"], time),
+                    timestep=time * float(own["timestep"]),
+                    flat_foot=bool(own["flat_foot"]),
+                )
+    return found
+
+
+def _scaled(reference: Sequence[float], time: float) -> tuple[float, float]:
+    """Minus stiffness and minus damping in another unit of time."""
+    stiffness, damping = reference
+    return stiffness / time**2, damping / time
+
+
 def _hulls(scene: Scene) -> tuple[Hull, ...]:
     return scene.hulls or object_hulls.of(scene)
 
@@ -180,6 +233,17 @@ def _without_offset(group: MotionGroup) -> MotionGroup:
     """Group whose motion past t_max starts on its fitted curve: offsets fade, and are no motion of a free body."""
     model = dataclasses.replace(group.model, offset_rotvec=np.zeros(3), offset_displacement=np.zeros(3))
     return dataclasses.replace(group, model=model)
+
+
+def _simulated_state(
+    group: MotionGroup, center: np.ndarray, tau: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Position, rotation, velocity and spin of a simulated body; in playback, it moves there from its last pose."""
+    model = group.model
+    quat, moved, spin, velocity = models.curve(model, tau)
+    quat = rotations.multiply(quat, rotations.rotvecs_to_quats(model.offset_rotvec))
+    arm = rotations.rotate(quat, center - group.pivot)
+    return group.pivot + moved + model.offset_displacement + arm, quat, velocity + np.cross(spin, arm), spin
 
 
 def _center_of_mass(group: MotionGroup, body: Solid, up: np.ndarray) -> np.ndarray:

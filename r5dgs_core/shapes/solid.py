@@ -11,6 +11,8 @@ from .. import errors
 FOOT = 0.03  # of the size: height of the lowest layer of a hull that is pressed flat
 _MOST_FOOT = 0.12
 _MOST_OF_HEIGHT = 0.25  # the same as a share of the height of a hull that is thin
+_ROUND = 0.045  # deviation of the distances of a ball's vertices from its centre, over their mean, at most
+_FULL = 0.8  # volume of a ball's hull over that of the ball through its vertices, at least
 _MARGIN = 0.02  # of the size: distance of the centre of mass from the border of the foot
 
 
@@ -45,6 +47,14 @@ class Solid:
     def size(self) -> float:
         """Longest side of its box."""
         return float(np.ptp(self.vertices, axis=0).max())
+
+    @property
+    def ball_radius(self) -> float | None:
+        """Radius of the ball of equal volume if the body is nearly a ball, whose facets would keep it from rolling."""
+        distances = np.linalg.norm(self.vertices - self.center, axis=1)
+        radius = float(np.cbrt(3 * self.volume / (4 * np.pi)))
+        full = radius**3 > _FULL * distances.mean() ** 3
+        return radius if full and distances.std() < _ROUND * distances.mean() else None
 
 
 def of(points: np.ndarray) -> Solid:
