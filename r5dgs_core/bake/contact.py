@@ -7,10 +7,9 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
-from ..contact import held_out, restitution, scene_future
+from ..contact import held_out, restitution, scene_future, slipped_rotations
 from ..contact.scene_future import Prediction
 from ..errors import BackendError, Interrupted, R5dgsError
-from . import pose_errors
 from .draft import Context, Draft, Need
 
 NAME = "contact"
@@ -22,7 +21,7 @@ def apply(draft: Draft, context: Context) -> Draft:
     if context.wanted.contact == "off":
         return draft
     try:
-        found = scene_future.predict(pose_errors.with_slips(draft.scene, draft.slipped))
+        found = scene_future.predict(slipped_rotations.unknown(draft.scene, draft.slipped))
     except BackendError as error:
         log.warning("a predicted motion passes through another body or the ground; %s", error)
         return draft

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -268,20 +268,6 @@ def with_unseen(errors: PoseErrors, unseen: Unseen) -> PoseErrors:
     turn, count = np.array(errors.turn), len(unseen.axes)
     every = np.sqrt(((3 - count) * turn**2 + count * UNKNOWN**2) / 3) if count < 3 else UNKNOWN
     return dataclasses.replace(errors, turn=tuple(np.where(np.isinf(turn), turn, every).tolist()))
-
-
-def with_slips(scene: Scene, slipped: Mapping[int, Sequence[tuple[float, float]]]) -> Scene:
-    """Return the scene with the error `UNKNOWN` of the rotations that slipped, given by group as in `draft.Draft`."""
-    groups = list(scene.groups)
-    for index, spans in slipped.items():
-        past, times = groups[index].history, scene.tracks.times
-        if past.errors is not None:
-            turn = np.array(past.errors.turn)
-            for first, last in spans:
-                turn[(times > first) & (times < last) & (turn < UNKNOWN)] = UNKNOWN
-            errors = dataclasses.replace(past.errors, turn=tuple(turn.tolist()))
-            groups[index] = dataclasses.replace(groups[index], history=dataclasses.replace(past, errors=errors))
-    return dataclasses.replace(scene, groups=tuple(groups))
 
 
 def weights(errors: PoseErrors, observed: np.ndarray, radius: float, turns: bool) -> np.ndarray:

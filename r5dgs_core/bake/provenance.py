@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from ..contact import slipped_rotations
 from ..errors import DatasetError
 from ..playback import residuals
 from ..train import checkpoint_content, train_views, view_psnr
@@ -31,6 +32,7 @@ def apply(draft: Draft, context: Context) -> Draft:
             "finished": state.finished,
         },
         **_on_training_views(draft, context),
+        **slipped_rotations.record(draft.slipped),
     }
     if cameras := context.cameras(draft.scene.gaussians.means):
         record["cameras"] = cameras

@@ -13,6 +13,7 @@ from ..motion import models, rotations
 from ..scene import gravity, world_axes
 from ..scene.scene import MotionGroup, Scene
 from ..shapes import solid
+from . import slipped_rotations
 from .observed_track import Track
 
 _PLACE_NOISE, _TURN_NOISE = 0.003, 0.004  # of poses without known errors: in sizes, and rad
@@ -61,8 +62,13 @@ def of(scene: Scene) -> tuple[list[SceneBody], list[str]]:
 
 
 def without_contacts(scene: Scene) -> Scene:
-    """Return the scene with its smooth motions. The band of a motion with contacts is left out."""
-    return dataclasses.replace(scene, groups=tuple(_smoothed(group) for group in scene.groups))
+    """Return the scene with its smooth motions, whose rotations that slipped are marked as unknown.
+
+    The band of a motion with contacts is left out.
+    """
+    smooth = dataclasses.replace(scene, groups=tuple(_smoothed(group) for group in scene.groups))
+    slipped = slipped_rotations.recorded(scene)
+    return slipped_rotations.unknown(smooth, slipped) if slipped else smooth
 
 
 def _smoothed(group: MotionGroup) -> MotionGroup:
