@@ -46,8 +46,8 @@ class Comparison:
 
     @property
     def good(self) -> bool:
-        """True if contacts explain the poses, or no worse than the smooth law does."""
-        return self.contact < max(UNEXPLAINED, self.smooth)
+        """True if contacts explain the poses, or not worse than the smooth law by more than the noise."""
+        return self.contact < max(UNEXPLAINED, self.smooth + BETTER)
 
     def text(self) -> str:
         """Residuals in words."""
