@@ -7,7 +7,7 @@ from r5dgs_core.motion import rotations
 from r5dgs_core.shapes import balls, directions, silhouettes, solid
 from tests.support import solid_gaussians
 
-NORMALS = directions.sphere(800)
+NORMALS = directions.sphere(300)
 CENTER = np.array([1.0, -2.0, 0.5])
 RADIUS = 0.3
 
@@ -17,7 +17,7 @@ def planes(points):
     return NORMALS, (NORMALS @ points.T).max(axis=1)
 
 
-def sphere(count=2000):
+def sphere(count=500):
     return CENTER + RADIUS * directions.sphere(count)
 
 
@@ -47,7 +47,7 @@ def cylinder(height):
 
 
 def others():
-    dome = directions.sphere(2000)
+    dome = directions.sphere(500)
     return {
         "cube": np.sign(directions.sphere(64)),
         "can": cylinder(0.8),
