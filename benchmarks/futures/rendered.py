@@ -32,6 +32,7 @@ from r5dgs_core.evaluation import evaluate, ground_truth_poses, metrics
 from r5dgs_core.evaluation.ground_truth_poses import Body
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import warm_up
+from r5dgs_core.scene import predictability
 from r5dgs_core.scene.scene import Scene
 
 from ..training import timed_training
@@ -66,7 +67,7 @@ def object_rows(scene: Scene, dataset: Dataset) -> list[dict[str, Any]]:
                 "worst_turn": float(turns[seen].max()),
                 "future": float(100 * places[-1] / body.size),
                 "future_turn": float(turns[-1]),
-                "warning": body.group.history.warning(),
+                "warning": body.group.history.warning(predictability.horizon(scene)),
                 **later_errors(body, body.times[after], places[after], turns[after]),
             }
         )

@@ -7,15 +7,20 @@ from collections.abc import Iterable
 import bpy
 
 from ...r5dgs_core.scene import predictability
-from ..scene import object_names
-from . import physics
+from ..scene import object_names, timeline
+from . import extrapolate, physics
 
 
 def of_anchor(anchor: bpy.types.Object | None) -> str:
-    """Warning of an anchor, such as "not predictable past 0.85 (hit at 0.55)"; "" if there is none or it was edited."""
+    """Warning of an anchor, such as "not predictable past 0.85 (hit at 0.55)".
+
+    It is "" if the motion is predictable up to the end of the scene's keys, or was edited.
+    """
     if anchor is None or not physics.has_motion(anchor):
         return ""
-    warning = physics.history(anchor).warning()
+    collection = extrapolate.scene_of(anchor)
+    end = math.inf if collection is None else timeline.of_collection(collection).t_end
+    warning = physics.history(anchor).warning(end)
     return warning if warning and physics.band(anchor) is not None else ""
 
 

@@ -136,16 +136,19 @@ class History:
         segments = tuple(s.transformed(turn, scale) for s in self.segments)
         return replace(self, segments=segments, band=band, errors=errors)
 
-    def warning(self) -> str:
-        """Reason to distrust the prediction, such as "not predictable past 0.85 (hit at 0.55)", or ""."""
-        if self.band is None or self.band.predictable_until is None:
+    def warning(self, end: float = math.inf) -> str:
+        """Reason to distrust the prediction, such as "not predictable past 0.85 (hit at 0.55)".
+
+        Returns "" if the motion is predictable up to the scene time ``end``.
+        """
+        if self.band is None or self.band.predictable_until is None or self.band.predictable_until >= end:
             return ""
         last = f" ({self.events[-1].text()})" if self.events else ""
         return f"not predictable past {self.band.predictable_until:.2f}{last}"
 
-    def text(self) -> str:
-        """Events and warning in words, or ""."""
-        warning = self.warning()
+    def text(self, end: float = math.inf) -> str:
+        """Events and warning, if there is one before the scene time ``end``, in words; or ""."""
+        warning = self.warning(end)
         words = [event.text() for event in (self.events[:-1] if warning else self.events)]
         return ", ".join([*words, *([warning] if warning else [])])
 

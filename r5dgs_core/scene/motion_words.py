@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..motion.models import KINDS
+from . import predictability
 from .scene import MotionGroup, Scene
 
 STILL = 0.05  # maximum motion of a still object, as a share of its radius
@@ -14,7 +15,7 @@ STILL = 0.05  # maximum motion of a still object, as a share of its radius
 
 def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
     """Return the motion of an object past t_max in words, by its motion models; "pinned" if no group can move."""
-    words = []
+    words, end = [], predictability.horizon(scene)
     for number, group in enumerate(groups, start=1):
         if group.joint is not None:
             words.append(f"part {number}: {group.joint.text()}")
@@ -22,7 +23,7 @@ def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
             words.append("still")
         else:
             words.append(KINDS[group.model.kind].word)
-        if history := group.history.text():
+        if history := group.history.text(end):
             words[-1] += f"; {history}"
     return ", ".join(dict.fromkeys(words)) or "pinned"
 

@@ -32,7 +32,8 @@ class Outlook:
     """Reliability of an object's motion. An attribute is None if it is unknown.
 
     Attributes:
-        warning: Reason to distrust the prediction, such as "not predictable past 0.85 (hit at 0.55)", or "".
+        warning: Reason to distrust the prediction up to `horizon`, such as "not predictable past 0.85 (hit at 0.55)",
+            or "".
         half_width: Half width of the confidence band at `horizon`, world units.
         half_width_percent: The same, in % of the object's size.
         rotation_error_deg: Errors of the observed rotations, degrees.
@@ -80,7 +81,10 @@ def outlooks(scene: Scene) -> dict[int, Outlook]:
 
 
 def warnings(scene: Scene) -> list[str]:
-    """Return a line per object whose motion is not predictable: "ball: not predictable past 0.85 (hit at 0.55)"."""
+    """Return a line per object whose motion is not predictable up to `horizon`.
+
+    For example, "ball: not predictable past 0.85 (hit at 0.55)".
+    """
     found = outlooks(scene)
     return [f"{item.name}: {found[item.id].warning}" for item in scene.objects if found[item.id].warning]
 
@@ -93,7 +97,7 @@ def _outlook(groups: Sequence[MotionGroup], end: float) -> Outlook:
         widths = [float(band.widths(np.array([end]))[0]) for _, band in bands]
         shares = [width / _size(group) for (group, _), width in zip(bands, widths, strict=True)]
         worst = int(np.argmax(shares))
-        result = Outlook(first[0].history.warning(), widths[worst], 100 * shares[worst])
+        result = Outlook(first[0].history.warning(end), widths[worst], 100 * shares[worst])
     errors = [(group, own) for group in groups if (own := group.history.errors) is not None]
     if errors:
         turns = [error for _, own in errors if (error := _error(np.degrees(own.turn))) is not None]

@@ -177,6 +177,13 @@ def test_the_list_of_objects_and_loading_warn_of_motion_that_is_not_predictable(
     assert blender.ops.r5dgs.explain_warning(object_id=mug) == {"CANCELLED"}
 
 
+def test_a_motion_that_is_predictable_up_to_the_last_key_has_no_warning(blender, mug):
+    warnings = motions.addon("motion.warnings")
+    for end, warning in ((0.94, ""), (1.2, "not predictable past 0.95 (hit at 0.50)")):
+        assert blender.ops.r5dgs.extrapolate_until(t_end=end) == {"FINISHED"}
+        assert warnings.of_anchor(mug) == warning
+
+
 def test_the_panel_shows_the_errors_of_the_observed_poses(blender, tmp_path):
     made = scenes.make_scene(n=300, objects=3, seed=1)
     errors = History(errors=PoseErrors((0.01, 0.01, 0.02), (0.01, 0.02, np.inf)))

@@ -112,6 +112,8 @@ def test_the_warning_names_the_last_event():
     assert HIT.text() == "set off at 0.31, not predictable past 1.10 (hit at 0.55)"
     trusted = dataclasses.replace(HIT, band=dataclasses.replace(BAND, predictable_until=None))
     assert trusted.warning() == "" and trusted.text() == "set off at 0.31, hit at 0.55"
+    assert HIT.warning(1.2) == HIT.warning() and HIT.text(1.2) == HIT.text()
+    assert HIT.warning(1.1) == "" and HIT.text(1.1) == trusted.text()
     assert EMPTY.text() == ""
 
 

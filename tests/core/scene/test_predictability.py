@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion.history import UNKNOWN_TURN, Band, Event, History, PoseErrors
-from r5dgs_core.scene import predictability
+from r5dgs_core.scene import motion_words, predictability
 from tests.support import scenes
 
 BAND = Band((0.75, 1.0, 1.5), (0.01, 0.2, 0.3), (0.0, 0.1, 0.5), predictable_until=0.85)
@@ -26,6 +26,16 @@ def test_a_warning_names_object_time_and_cause():
     name = scene.object(scene.groups[1].object_id).name
     assert predictability.warnings(scene) == [f"{name}: not predictable past 0.85 (hit at 0.55)"]
     assert predictability.warnings(scenes.make_scene()) == []
+
+
+def test_a_motion_that_is_predictable_up_to_the_horizon_has_no_warning():
+    scene = scenes.make_scene()
+    end = predictability.horizon(scene)
+    for until, is_late in ((end - 0.01, False), (end, True), (end + 0.2, True)):
+        found = with_histories(History(HIT.events, band=dataclasses.replace(BAND, predictable_until=until)))
+        outlook = predictability.outlooks(found)[found.groups[1].object_id]
+        assert (outlook.warning == "") == is_late
+        assert ("not predictable" in motion_words.motion_of(found, found.groups[1:2])) != is_late
 
 
 def test_the_half_width_is_that_of_the_horizon():
