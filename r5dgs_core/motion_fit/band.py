@@ -1,7 +1,8 @@
 """Confidence band of a predicted motion, and the time up to which it can be trusted.
 
 The variance of a point of the body comes from the covariance of the parameters and from the distance to other
-candidates, each weighted by its evidence. Notation: H times past t_max; variances are in squared radii.
+candidates, each weighted by its evidence, and from what the law leaves out. Notation: H times past t_max; variances are
+in squared radii.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from ..motion import rotations, se3
 from ..motion.history import MAX_KNOTS, Band
-from . import backtest
+from . import backtest, law_errors
 from .candidates import FittedCandidate, Noise
 from .fitted_motion import fade_time
 from .model_scores import NoiseLevel
@@ -51,12 +52,13 @@ def confidence_band(selected: Selected, variance: float, drift: Noise) -> Widths
     chosen, noise_level, noise = selected.chosen, selected.noise_level, selected.noise
     place, turn = _variance(chosen, variance, tau)
     place2, turn2 = _spread(chosen, selected.solutions, noise_level, tau)
+    bent, bent_turn = law_errors.squares(chosen, selected.track, noise, tau)
     fading = np.exp(-2 * tau / fade_time(chosen))  # of the bind state, which is a noisy pose
     last = noise_level.level * fading
     scale = min(max(backtest.relative_error(chosen, selected.track, noise, variance), 1.0), _MAX_SCALE)
     growth = 3 * (0.5 + tau) ** 2
-    turn = scale * turn + turn2 + 3 * noise.turn**2 * last + growth * drift.turn**2
-    place = scale * place + place2 + 3 * noise.place**2 * last + growth * drift.place**2
+    turn = scale * turn + turn2 + bent_turn + 3 * noise.turn**2 * last + growth * drift.turn**2
+    place = scale * place + place2 + bent + 3 * noise.place**2 * last + growth * drift.place**2
     width = _MULTIPLE * np.sqrt(place + 2 / 3 * turn)
     wide = np.flatnonzero(width > WIDE)
     return Widths(tau, width, _MULTIPLE * np.sqrt(turn), _crossing(tau, width, int(wide[0])) if len(wide) else None)
