@@ -1,8 +1,8 @@
 """Confidence band of a predicted motion, and the time up to which it can be trusted.
 
 The variance of a point of the body comes from the covariance of the parameters and from the distance to other
-candidates, each weighted by its evidence, and from what the law leaves out. Notation: H times past t_max; variances are
-in squared radii.
+candidates, each weighted by its plausibility, and from what the law leaves out. Notation: H times past t_max; variances
+are in squared radii.
 """
 
 from __future__ import annotations
@@ -16,18 +16,20 @@ import numpy as np
 from ..motion import rotations, se3
 from ..motion.history import MAX_KNOTS, Band
 from . import backtest, law_errors
+from . import candidates as families
 from .candidates import FittedCandidate, Noise
 from .fitted_motion import fade_time
 from .model_scores import NoiseLevel
 from .search import Selected
 
 LEVEL = 0.95
-WIDE = 0.7  # half width above which a motion is not predictable, in radii
+WIDE = 0.4  # half width above which a motion is not predictable, in radii
 _SOON = 1 / 3  # time past t_max, in spans
 _MULTIPLE = 1.4  # half width at `LEVEL` / standard deviation, calibrated on simulated motions
 _DRIFT = 5.0  # drift of a track over its span, in units of the lower bound of its noise
 _LINE = math.sqrt(12.0)  # drift at a constant rate over the span, in standard deviations
-_SOFT = 4.0  # difference of scores that reduces a candidate's weight by e
+_SOFT = 3.5  # difference of losses that reduces a candidate's weight by e
+_OUTLIER = families.SOFTNESS  # maximum loss of a pose in this difference
 _FARTHEST = 8.0  # maximum counted distance of another candidate, in radii
 _MAX_SCALE = 36.0  # maximum factor on the covariance from the errors of earlier predictions
 
@@ -132,10 +134,20 @@ def _variance(solution: FittedCandidate, variance: float, tau: np.ndarray) -> tu
 def _spread(
     chosen: FittedCandidate, all_solutions: Sequence[FittedCandidate], noise_level: NoiseLevel, tau: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean squared distances of other candidates' positions and rotations from the chosen one's, by evidence. [H]"""
-    scores = [noise_level.score(s) for s in all_solutions]
-    best = min(scores)
-    weights = np.exp(-(np.array(scores) - best) / _SOFT)
+    """Mean squared distances of other candidates' positions and rotations from the chosen one's, by plausibility. [H]
+
+    Two rules keep laws in the band that the scores, which choose a law, exclude too surely. Parameters have the cost of
+    Akaike's criterion for few data, which does not grow with the number of poses, because few poses may show a
+    parameter, such as a rate after a break. The loss of a pose is limited, because one pose does not tell an outlier
+    from an impact. Events at any of the poses cost as much for laws that contain them as for breaks.
+
+    Source: Hurvich and Tsai 1989 for the cost.
+    """
+    losses = np.stack([s.losses for s in all_solutions]) / noise_level.variance
+    count, parameters = 6 * losses.shape[1], np.array([s.parameters for s in all_solutions])
+    costs = np.minimum(losses, _OUTLIER).sum(1) + 2 * parameters * count / np.maximum(count - parameters - 1, 1)
+    costs += 2 * math.log(losses.shape[1]) * np.array([bool(s.candidate.events(s.theta)) for s in all_solutions])
+    weights = np.exp(-(costs - costs.min()) / _SOFT)
     weights = np.where(weights < math.exp(-6.0), 0.0, weights)
     index = next(i for i, s in enumerate(all_solutions) if s is chosen)
     weights[index] = max(weights[index], 0.5)

@@ -74,8 +74,9 @@ def covariance_factor(solution: FittedCandidate, track: PoseTrack, noise: Noise,
     """Factor of the parameters' covariance for noise of an unknown correlation, at least that of the evidence.
 
     It is the mean of s2 (1 + rho) / (1 - rho), weighted by the restricted likelihood of rho, the correlation of
-    neighbouring poses. Unlike rho in `_inflation`, this one also includes slow noise that the fit follows. Outliers are
-    left out: beside them, the small weight of one pose would look like correlated noise.
+    neighbouring poses, times a prior 1 - rho, because few poses hardly tell large correlations apart. Unlike rho in
+    `_inflation`, this one also includes slow noise that the fit follows. Outliers are left out: beside them, the small
+    weight of one pose would look like correlated noise.
 
     Args:
         solution: The chosen solution, fitted to the track.
@@ -109,7 +110,7 @@ def covariance_factor(solution: FittedCandidate, track: PoseTrack, noise: Noise,
         return noise_level.variance
     variances = (losses / free * (1 + _RHOS) / (1 - _RHOS))[used]
     likelihoods = -0.5 * logs[used]
-    shares = np.exp(likelihoods - likelihoods.max())
+    shares = (1 - _RHOS[used]) * np.exp(likelihoods - likelihoods.max())
     return max(noise_level.variance, float(shares @ variances / shares.sum()))
 
 

@@ -63,9 +63,54 @@ def test_another_candidate_spreads_the_band_by_its_squared_distance_and_evidence
     chosen, other = moving((2, 1, 3), (0, 0, 0.5)), moving((3, -1, 3), (0, 0, 1.3), residuals=worse)
     assert level.score(other) - level.score(chosen) == pytest.approx(gap)
     place, turn = band._spread(chosen, [other, chosen], level, AHEAD)
-    share = math.exp(-gap / 4) / (1 + math.exp(-gap / 4))
+    share = math.exp(-gap / 3.5) / (1 + math.exp(-gap / 3.5))
     np.testing.assert_allclose(place, share * 5 * AHEAD**2, atol=1e-12)
     np.testing.assert_allclose(turn, share * (0.8 * AHEAD) ** 2, atol=1e-12)
+
+
+def falling(count):
+    """Fall from the state of `moving` with v = (2, 0, 0), by an acceleration of 1 along each axis."""
+    law = candidates.BY_NAME["ballistic + spin"]
+    parts = {name: np.zeros(3) for name in ("r", "e", *law.blocks)} | {"v": np.array([2.0, 0, 0]), "a": np.ones(3)}
+    return solved(law, law.pack(parts), residuals=np.zeros((count, 6)))
+
+
+FALL = 3 * (0.5 * AHEAD**2) ** 2  # its squared distance from straight motion
+
+
+def akaike(parameters, numbers):
+    return 2 * parameters + 2 * parameters * (parameters + 1) / (numbers - parameters - 1)
+
+
+@pytest.mark.parametrize("count", [7, 30])
+def test_parameters_cost_the_band_what_akaike_s_criterion_for_few_data_says(count):
+    chosen = moving((2, 0, 0), residuals=np.zeros((count, 6)))
+    place, _ = band._spread(chosen, [chosen, falling(count)], NoiseLevel(count, 1.0, 1.0), AHEAD)
+    share = 1 / (1 + math.exp((akaike(15, 6 * count) - akaike(12, 6 * count)) / 3.5))
+    np.testing.assert_allclose(place, share * FALL, atol=1e-12)
+
+
+@pytest.mark.parametrize("miss", [100.0, 1e4])
+def test_one_pose_excludes_a_candidate_no_more_than_an_outlier_does(miss):
+    residuals = np.zeros((30, 6))
+    residuals[-1, 0] = miss
+    chosen, straight = falling(30), moving((2, 0, 0), residuals=residuals)
+    place, _ = band._spread(chosen, [straight, chosen], NoiseLevel(30, 1.0, 1.0), AHEAD)
+    share = 1 / (1 + math.exp((candidates.SOFTNESS + akaike(12, 180) - akaike(15, 180)) / 3.5))
+    np.testing.assert_allclose(place, share * FALL, atol=1e-12)
+    residuals[-2, 0] = miss
+    place, _ = band._spread(chosen, [moving((2, 0, 0), residuals=residuals), chosen], NoiseLevel(30, 1.0, 1.0), AHEAD)
+    np.testing.assert_array_equal(place, 0)
+
+
+def test_a_candidate_with_an_event_costs_the_choice_of_a_pose():
+    chosen = moving((2, 0, 0), residuals=np.zeros((30, 6)))
+    broken = breaks.BreakCandidate("start", "ballistic_spin", ("v", "w", "c"), low=-0.3, high=-0.2)
+    parts = {name: np.zeros(3) for name in ("r", "e", *broken.blocks)} | {"v": np.array([1.0, 0, 0]), "c": np.zeros(1)}
+    other = solved(broken, broken.pack(parts), residuals=np.zeros((30, 6)))
+    place, _ = band._spread(chosen, [chosen, other], NoiseLevel(30, 1.0, 1.0), AHEAD)
+    share = 1 / (1 + math.exp((akaike(13, 180) + 2 * math.log(30) - akaike(12, 180)) / 3.5))
+    np.testing.assert_allclose(place, share * AHEAD**2, atol=1e-12)
 
 
 def test_a_candidate_without_evidence_does_not_spread_the_band():
@@ -137,11 +182,11 @@ def test_a_drift_at_a_constant_rate_grows_from_the_middle_of_the_window():
     np.testing.assert_allclose(place, 3 * (rate[0] ** 2 + 2 / 3 * rate[1] ** 2) * away**2, atol=1e-10)
 
 
-def test_a_prediction_is_trusted_until_its_half_width_is_seven_tenths_of_the_radius():
+def test_a_prediction_is_trusted_until_its_half_width_is_a_fifth_of_the_size():
     times, radius = (2.0, 2.5, 3.0), 0.2
     found = band.trusted(Band(times, (0.02, 0.12, 0.18), (0.0, 0.0, 0.0)), radius)
-    assert np.interp(found.predictable_until, times, found.half_width) == pytest.approx(0.7 * radius)
-    assert band.trusted(Band(times, (0.02, 0.12, 0.13), (0.0, 0.0, 0.0)), radius).predictable_until is None
+    assert np.interp(found.predictable_until, times, found.half_width) == pytest.approx(2 * radius / 5)
+    assert band.trusted(Band(times, (0.02, 0.07, 0.075), (0.0, 0.0, 0.0)), radius).predictable_until is None
     assert band.trusted(Band(times, (0.15, 0.16, 0.18), (0.0, 0.0, 0.0)), radius).predictable_until == 2.0
 
 

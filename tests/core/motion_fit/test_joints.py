@@ -155,7 +155,7 @@ def test_a_part_is_as_uncertain_as_its_parent_and_its_own_motion():
     times = (0.75, 1.0, 1.5)
     parent = Band(times, (0.01, 0.03, 0.08), (0.0, 0.1, 0.2))
     own = Band(times, (0.0, 0.04, 0.05), (0.02, 0.03, 0.04))
-    found = joint_fit.carried(parent, own, 0.5, 0.2)
+    found = joint_fit.carried(parent, own, 0.5, 0.25)
     np.testing.assert_allclose(found.half_width, np.hypot([0.01, 0.08, 0.18], own.half_width))
     np.testing.assert_allclose(found.half_angle, np.hypot(parent.half_angle, own.half_angle))
     assert 1.0 < found.predictable_until < 1.5

@@ -191,7 +191,7 @@ def test_the_covariance_factor_averages_generalized_least_squares_over_the_corre
         rest = observed - columns @ np.linalg.solve(normal, columns.T @ inverse @ observed)
         loss, free = rest @ inverse @ rest, 6 * count - 9
         logs = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(normal)[1] + free * np.log(loss)
-        likelihoods.append(-0.5 * logs)
+        likelihoods.append(-0.5 * logs + np.log(1 - rho))  # the prior
         variances.append(loss / free * (1 + rho) / (1 - rho))
     shares = np.exp(np.array(likelihoods) - max(likelihoods))
     least = model_scores.NoiseLevel(count, 1e-6, 1.0)
