@@ -96,8 +96,8 @@ def fit(
         least_noise: Lower bounds of the noise of displacements (per component, world units) and rotations (rad), for
             noise that the scatter about a smooth motion does not show.
         drift: Standard deviations of displacements and rotations due to a slow drift; they widen the band alone.
-        up: Upward direction, or None if unknown. A body that slows down on a vertical line falls back; on any other
-            line, and if ``up`` is None, friction may stop it. [3]
+        up: Upward direction, or None if unknown. Bodies bounce off level floors, and on a vertical line, friction
+            stops none. [3]
 
     Returns:
         The fit. With fewer than four poses of positive weight, at most a velocity and a spin; with one, static.
@@ -113,13 +113,9 @@ def fit(
     if used.sum() < 2 or times[used][-1] == times[used][0]:
         return _static(radius)
     span = float(times[-1] - times[used][0])
-    track = PoseTrack(
-        (times[used] - times[-1]) / span,
-        rotations.make_continuous(rotations.normalize(quats[used])),
-        displacements[used] / radius,
-        weights[used] / weights[used].mean(),
-        None if up is None else tuple(np.asarray(up, np.float64) / np.linalg.norm(up)),
-    )
+    turns = rotations.make_continuous(rotations.normalize(quats[used]))
+    shares = weights[used] / weights[used].mean()
+    track = PoseTrack((times[used] - times[-1]) / span, turns, displacements[used] / radius, shares, _unit(up))
     if candidates is None and inertia is not None and torque_free_rotation.tumbles(np.asarray(inertia, np.float64)):
         family = (*family, replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64)))
     family = tuple(replace(candidate, window=track.window) for candidate in family)
@@ -189,6 +185,13 @@ def _check(times: np.ndarray, quats: np.ndarray, displacements: np.ndarray, weig
         raise ValueError("weights: expected >= 0")
     if not (math.isfinite(radius) and radius > 0):
         raise ValueError(f"radius: expected > 0, got {radius}")
+
+
+def _unit(up: np.ndarray | None) -> tuple[float, float, float] | None:
+    if up is None:
+        return None
+    x, y, z = np.asarray(up, np.float64) / np.linalg.norm(up)
+    return float(x), float(y), float(z)
 
 
 def _named(name: str, inertia: np.ndarray | None) -> Candidate:

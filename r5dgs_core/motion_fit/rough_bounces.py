@@ -106,6 +106,15 @@ def search(
     return found
 
 
+def added(
+    broken: Sequence[FittedCandidate], track: PoseTrack, noise: Noise, laws: Sequence[FittedCandidate]
+) -> list[FittedCandidate]:
+    """Return candidates with breaks, and the results of `search` if none of them is a bounce."""
+    if any(isinstance(s.candidate, RoughBounces) for s in broken):
+        return list(broken)
+    return [*broken, *search(track, noise, laws)]
+
+
 def _starts(own: RoughBounces, smooth: FittedCandidate, track: PoseTrack) -> list[np.ndarray]:
     """First guesses from a fit of the smooth floor and from its own first guesses, with the spins of each flight."""
     law, kind, found = smooth.candidate, models.KINDS[smooth.candidate.kind], []

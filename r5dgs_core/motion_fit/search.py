@@ -93,8 +93,7 @@ def select(
         slipped = _refined(slipped, best, track, level, finer)
         searched = isinstance(best.candidate, breaks.BreakCandidate)
         broken = breaks.search(track, finer) if searched else _refined(broken, best, track, level, finer)
-        if not any(isinstance(s.candidate, rough_bounces.RoughBounces) for s in broken):
-            broken += rough_bounces.search(track, finer, found)
+        broken = rough_bounces.added(broken, track, finer, found)
         level = finer
     noise_level = NoiseLevel.of((*found, *broken, *slipped), _floor(level, least))
     laws = [s for s in found if _determined(s, noise_level) and plausibility.is_possible(s, up)] or found[:1]
