@@ -74,7 +74,7 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     end = predictability.horizon(scene) if wishes.until is None else wishes.until
     pull = gravity.of(scene) if wishes.gravity is None else wishes.gravity
     up = world_axes.UP_AXIS.get(scene.world_convention)
-    passing = _passing(scene, bodies, end, up)
+    passing, sinking = _passing(scene, bodies, end, up)
     depths = {bodies[number].name: depth for number, depth in passing.items()}
     pushed = {number for number, body in enumerate(bodies) if body.group.id in wishes.pushes}
     doubtful = _doubtful(scene, bodies, passing, end, up) - pushed
@@ -92,7 +92,8 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
         reason = "gravity is unknown: no body was seen to fall, and the scene has no up axis or no units"
         return Prediction(scene.groups, depths, {}, (*lines, f"no contacts are predicted: {reason}"))
     judged = {n: n in leaving or n in passing and not held_out.is_unexplained(scene, bodies[n]) for n in doubtful}
-    made = scene_world.make(scene, bodies, tried, pushed, judged, pull, end, leave).weighted(wishes.masses)
+    sinking -= leaving | pushed
+    made = scene_world.make(scene, bodies, tried, pushed, judged, pull, end, leave, sinking).weighted(wishes.masses)
     found = _simulated(scene, made, wishes, end, depths, [*lines, *made.lines])
     return found if leave is None else dataclasses.replace(found, leaving=bodies[leave.number].name)
 
@@ -180,8 +181,14 @@ def _band(
     return history.Band(tuple(times.tolist()), tuple(widths.tolist()), tuple(angles.tolist()), BAND_LEVEL, until)
 
 
-def _passing(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray | None) -> dict[int, float]:
-    """Penetration, in sizes, of the smooth motion of each body that passes through the plane or another body."""
+def _passing(
+    scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray | None
+) -> tuple[dict[int, float], set[int]]:
+    """Penetration, in sizes, of the smooth motion of each body that passes through the plane or another body.
+
+    Returns:
+        The penetrations by number, and the numbers of bodies that pass through the plane alone.
+    """
     tau = np.linspace(0, max(end - scene.t_max, 0.0), _TIMES)
     paths = [scene_bodies.predicted(body, tau) for body in bodies]
     moving = [number for number, body in enumerate(bodies) if body.moves]
@@ -194,6 +201,7 @@ def _passing(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray |
     landing = [n for n in moving if bodies[n].smooth.kind != "bounce"]
     sinking = [] if up is None else [n for n in landing if _sinks(scene, bodies[n], paths[n], up)]
     plane = scene_world.plane(scene, bodies, end, up) if sinking and up is not None else None
+    hitting = {number for number, depth in found.items() if depth > PENETRATION * bodies[number].solid.size}
     for number in sinking if plane is not None else ():
         assert plane is not None
         body, track = world.Body(bodies[number].solid), scene_bodies.track(scene, bodies[number])
@@ -202,7 +210,8 @@ def _passing(scene: Scene, bodies: list[SceneBody], end: float, up: np.ndarray |
             found[number], lowest - float(world.gaps(body, plane, paths[number][1], paths[number][0]).min())
         )
     sizes = {number: bodies[number].solid.size for number in found}
-    return {number: depth / sizes[number] for number, depth in found.items() if depth > PENETRATION * sizes[number]}
+    deep = {number: depth / sizes[number] for number, depth in found.items() if depth > PENETRATION * sizes[number]}
+    return deep, deep.keys() - hitting
 
 
 def _doubtful(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -164,6 +164,7 @@ def make(
     gravity: np.ndarray,
     end: float,
     leave: edges.Leave | None = None,
+    sinking: Collection[int] = (),
 ) -> SceneWorld:
     """Build the world of the bodies whose motion may be simulated.
 
@@ -177,6 +178,8 @@ def make(
         gravity: Acceleration of a falling body. [3]
         end: Scene time up to which to simulate.
         leave: A body that moves off its support, which then has an edge.
+        sinking: Those of them whose smooth motion only sinks into the plane. If contacts predict held-out poses worse,
+            its slope is an error of the law, so they keep this motion.
     """
     up = world_axes.UP_AXIS[scene.world_convention]
     below, edge = (plane(scene, bodies, end, up), None) if leave is None else (leave.plane, leave.edge)
@@ -195,6 +198,9 @@ def make(
                 compared = held_out.compare(fitter, up)
                 enough = compared.good if doubtful[number] else compared.better
                 reason = "" if enough else f"contacts are not clearly better: {compared.text()}"
+            elif not reason and number in sinking and held_out.is_possible(scene, body):
+                test = held_out.compare(fitter, up)
+                reason = f"contacts are worse: {test.text()}" if test.worse else ""
             if estimate is not None and not reason:
                 fits[len(chosen)] = fitter, estimate
                 comparisons |= {} if compared is None else {len(chosen): compared}

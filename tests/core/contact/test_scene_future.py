@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r5dgs_core.contact import scene_future, scene_world, simulation, world
+from r5dgs_core.contact import held_out, scene_future, scene_world, simulation, world
 from r5dgs_core.contact.scene_world import Wishes
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.motion.history import Band, History
@@ -53,6 +53,16 @@ def test_a_body_bounces_on_off_the_floor_that_its_impacts_have_shown(kind, simul
     model = dataclasses.replace(model, kind=kind, bounce_time=landing, restitution=0.8, angular_velocity=np.zeros(3))
     found = scene_future.predict(contact_scenes.scene((model, center)), FEW)
     assert ("box 1" in found.penetrations) == simulated == ("box 1" in found.taken)
+
+
+@pytest.mark.parametrize(("smooth", "contact", "taken"), [(1.0, 8.0, False), (1.0, 2.5, True), (20.0, 19.0, True)])
+def test_a_body_that_sinks_into_the_ground_keeps_its_law_if_contacts_predict_held_out_poses_worse(
+    fallen, monkeypatch, smooth, contact, taken
+):
+    monkeypatch.setattr(held_out, "compare", lambda *_: held_out.Comparison(smooth, contact))
+    found = scene_future.predict(fallen[0], FEW)
+    assert ("box 1" in found.taken) == taken
+    assert taken or "contacts are worse" in found.lines[0]
 
 
 def test_the_band_widens_at_the_first_impact(fallen):
