@@ -9,6 +9,7 @@ its parts at some knots and to another part at others. After a repair, the neigh
 series of slipped knots is repaired from its ends. Other knots keep their poses bit for bit.
 
 A knot is checked when it enters training, because a fast body is easily lost then, and in some rounds over all knots.
+Balls are aligned as a whole, by their texture (`ball_repair`), once all times have entered and near the end of the run.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from ..motion import rotations
 from ..motion.se3 import Pose
 from ..raster.arrays import to_host
-from . import registration
+from . import ball_repair, registration
 from .registration import BodyRegistration
 from .representations.tracks import TracksRepresentation
 from .trainer import Trainer
@@ -28,6 +29,7 @@ from .trainer import Trainer
 log = logging.getLogger(__name__)
 
 ROUNDS = (0.45, 0.7)  # shares of the run after which all knots are checked; both follow the trial of residuals
+BALLS = 0.8  # share of the run after which balls are aligned again
 JUMP = np.radians(8.0)  # angle from the prediction above which a knot is suspicious
 UNUSUAL = 1.5  # image error above which a knot is suspicious, relative to the median over the knots of the body
 CLEARLY = 0.93  # largest image error of a new pose that is accepted, relative to that of the present one
@@ -69,6 +71,10 @@ def after_step(trainer: Trainer, entered: tuple[int, int]) -> None:
     total = trainer.config.train.iterations
     if first == 0 and last == len(trainer.times) - 1 and trainer.iteration in {int(x * total) for x in ROUNDS}:
         repair(trainer)
+    if trainer.iteration == trainer.config.curriculum.steps(total)[1] + 1:
+        ball_repair.repair(trainer, ball_repair.FAR)
+    if trainer.iteration == int(BALLS * total):
+        ball_repair.repair(trainer)
 
 
 def repair(trainer: Trainer) -> int:

@@ -38,7 +38,8 @@ class TrainSection:
         probe_views: Maximum number of held-out views to measure.
         shading: Learn the change of an object's colours as it turns in fixed light.
         shadows: Learn shadow Gaussians, which follow their objects on the supporting plane.
-        repair: Register rotations of the tracks again that have slipped into a neighbouring minimum.
+        repair: Register rotations of the tracks again that have slipped into a neighbouring minimum, and align those of
+            balls by their texture.
     """
 
     iterations: int = 6000
