@@ -35,11 +35,12 @@ def of(normals: np.ndarray, reach: np.ndarray) -> np.ndarray | None:
     if x[3] <= 0:
         return None
     middle, scale = x[:3], float(x[3])
-    columns, shifted, x = columns / scale, (reach - normals @ middle) / scale, np.array([0.0, 0.0, 0.0, scale])
+    shifted, x = (reach - normals @ middle) / scale, np.array([0.0, 0.0, 0.0, 1.0])
     for factor in _ROUNDS:
         x = least_squares(lambda y: columns @ y - shifted, x, loss="cauchy", f_scale=factor * _SOFT).x
     deviations = columns @ x - shifted
     if np.median(np.abs(deviations)) > _ALIKE or np.mean(deviations > _ALIKE) > _FLAT:
         return None
     corners = directions.sphere(MAX_VERTICES)
-    return middle + x[:3] + float(x[3]) * np.cbrt(4 / 3 * np.pi / ConvexHull(corners).volume) * corners
+    radius = float(x[3]) * np.cbrt(4 / 3 * np.pi / ConvexHull(corners).volume)
+    return middle + scale * (x[:3] + radius * corners)
