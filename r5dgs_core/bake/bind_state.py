@@ -23,7 +23,7 @@ from ..train.representations import shading as shading_vectors
 from . import track_checks
 from .draft import BoundScene, Context, ObservedScene
 
-_TURNS = 0.05  # turn from the last pose, rad, up to which rotations may be errors; the pivot is then the middle
+_TURN, _MOVE = 0.05, 0.1  # rad and radii from the last pose, up to which the motion of a body may be an error
 _ARRAYS = ("means", "quats", "sh", "shading", "shading_rest", "residual_offsets", "residual_quats")  # of `Scene`
 _COLUMNS = ("means", "quats", "sh", "shading", "rest")  # of `Cloud`
 
@@ -48,7 +48,7 @@ def bind(observed: ObservedScene, context: Context) -> BoundScene:
             turned, shading[members], rest[members], q, observed.light
         )
         pivot = _middle(means[members], opacities[members], center + d)
-        if group.role == "body" and rotations.angle_between(group.quats, q).max() > _TURNS:
+        if group.role == "body" and _moves(group.quats, path, _radius(means[members], opacities[members], pivot)):
             own = members & (cloud.object_ids == group.object_id)
             found = _center_of_mass(means[own], quats[own], cloud.log_scales[own], opacities[own])
             pivot = pivot if found is None else found
@@ -170,6 +170,12 @@ def _motion_group(
         group.follow_matrix,
         seen=(float(seen[0]), float(seen[-1])) if len(seen) else None,
     )
+
+
+def _moves(quats: np.ndarray, path: np.ndarray, radius: float) -> bool:
+    """Return True if the poses of a body differ from the last one by more than their errors."""
+    turned = rotations.angle_between(quats, quats[-1]).max()
+    return bool(turned > _TURN or np.linalg.norm(path - path[-1], axis=1).max() > _MOVE * radius)
 
 
 def _center_of_mass(
