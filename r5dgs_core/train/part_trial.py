@@ -3,7 +3,8 @@
 The paths of the Gaussians in the trial of residuals propose the parts (`part_clusters`). The parts are then trained
 from the first time outwards, as at the start of a run: a knot that enters gets poses that its neighbours predict, which
 are registered to the images. Members join the part with whose motion they stay inside the masks and keep their colours.
-The body is divided if its parts explain held-out views clearly better than residuals after as many steps.
+The body is divided if its parts explain held-out views clearly better than residuals after as many steps. A smaller
+difference is enough if joints connect the parts, because parts of a body that bends have no joints.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from ..model import track_state
 from ..model.residual_field import ResidualField
 from ..motion import rotations
 from ..motion.se3 import Pose
+from ..motion_fit import joints, noise
 from ..raster.arrays import to_host
 from ..scene import cameras, spherical_harmonics
-from . import part_clusters, registration, train_views
+from . import observed_motion, part_clusters, registration, train_views
 from .checkpoint import Checkpoint
 from .registration import BodyRegistration
 from .representations import residual
@@ -41,7 +43,8 @@ WIDE = 3  # number of knots in training from which members may join another part
 OUTSIDE = 0.25  # cost of a member outside the masks of its object, squared colour
 JOINS = 0.97  # maximum cost in another part, relative to that in the own part
 NEIGHBOURS = 8  # members over which costs are averaged
-BETTER = 0.7  # maximum error of the parts, relative to that of residuals; measured: arm 0.65, waving flag 0.72
+BETTER = 0.7  # maximum error of the parts, relative to that of residuals
+JOINED = 0.9  # the same of parts that joints connect
 
 
 def divide(
@@ -87,9 +90,36 @@ def divide(
     log.info(
         "object %d: %d parts, error %.4g on held-out views, %.4g with residuals", object_id, len(parts), error, limit
     )
-    if error > BETTER * limit:
+    if error > JOINED * limit or (error > BETTER * limit and not are_joined(trainer, parts)):
         return None
     return dataclasses.replace(state, tensors=trainer.state().tensors)
+
+
+def are_joined(trainer: Trainer, parts: Sequence[int]) -> bool:
+    """Return True if joints connect all parts of a body, according to their tracks."""
+    if not all((trainer.gaussians.motion_ids == part).any() for part in parts):
+        return False
+    links = [_link(trainer, part) for part in parts]
+    costs = np.full((len(parts), len(parts)), np.inf)
+    for a, b in np.ndindex(costs.shape):
+        if a != b:
+            place, turn = np.hypot(noise.of_images(links[a].radius), noise.of_images(links[b].radius)).tolist()
+            found = joints.find(trainer.times, links[a], links[b], least_noise=(place, turn))
+            costs[a, b] = np.inf if found is None else found.cost
+    return joints.parents(costs, 0).count(None) == 1
+
+
+@torch.no_grad()
+def _link(trainer: Trainer, part: int) -> joints.Link:
+    """Poses of a part relative to those at the last knot."""
+    assert isinstance(trainer.motion, TracksRepresentation)
+    tracks = trainer.motion.tracks
+    quats = rotations.normalize(to_host(tracks.knot_quats())[part].astype(np.float64))
+    moves = to_host(tracks.params["translations"])[part].astype(np.float64)
+    center = to_host(tracks.centers)[part].astype(np.float64)
+    points = to_host(trainer.gaussians.params["means"][trainer.gaussians.motion_ids == part]).astype(np.float64)
+    turns = rotations.multiply(quats, rotations.conjugate(quats[-1]))
+    return joints.Link(turns, moves - moves[-1], center + moves[-1], observed_motion.radius(points, center))
 
 
 @torch.no_grad()
