@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
+from scipy import linalg, ndimage
 
 from ..scene import cameras
 from .train_views import TrainView
@@ -24,6 +24,9 @@ FINE = 0.02  # error of a point at which it counts half in the last fits, radii
 SMOOTH = 0.1  # weight of squared second differences of the centres, against one point of an outline
 CLOSE = 0.08  # largest error of a point of a ball's outline, radii
 OUTSIDE = 0.05  # largest share of the points of a ball that lie farther outside
+MIN_POINTS = 8  # smallest number of points of a view that counts for the depth
+APART = np.radians(5.0)  # smallest angle between the directions of two such views
+LEAST_MEASURED = 0.5  # smallest share of the knots at which the depth of a ball is known
 INSIDE = 0.25  # largest share of them that lie farther inside, where something hides the ball
 
 
@@ -35,11 +38,13 @@ class Outlines:
         knots: Knot of each point. [E]
         eyes: Centre of its camera. [E, 3]
         rays: Unit direction to it. [E, 3]
+        measured: Knots at which cameras in different directions show the body, so that its depth is known. [S] bool
     """
 
     knots: np.ndarray
     eyes: np.ndarray
     rays: np.ndarray
+    measured: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -49,10 +54,12 @@ class Ball:
     Attributes:
         centers: Its centres at the knots. [S, 3]
         radius: Its radius.
+        measured: Knots at which the outlines determine the centre; at others it is interpolated. [S] bool
     """
 
     centers: np.ndarray
     radius: float
+    measured: np.ndarray
 
 
 def box(mask: np.ndarray, object_id: int) -> tuple[slice, slice] | None:
@@ -88,15 +95,21 @@ def gather(groups: Sequence[Sequence[TrainView]], object_ids: Sequence[int]) -> 
                 where = None if mask is None else box(mask, object_id)
                 if mask is not None and where is not None:
                     own.append((s, view.camera.center, outline(view, mask, object_id, *where)))
-    return [_joined(own) for own in found]
+    return [_joined(own, len(groups)) for own in found]
 
 
-def _joined(parts: Sequence[tuple[int, np.ndarray, np.ndarray]]) -> Outlines:
-    """Join the knots, camera centres and rays of the outlines of views."""
-    counts = [len(rays) for _, _, rays in parts]
-    knots = np.repeat(np.array([s for s, _, _ in parts], int), counts)
-    eyes = np.repeat(np.array([eye for _, eye, _ in parts]).reshape(-1, 3), counts, axis=0)
-    return Outlines(knots, eyes, np.concatenate([np.zeros((0, 3)), *(rays for _, _, rays in parts)]))
+def _joined(parts: Sequence[tuple[int, np.ndarray, np.ndarray]], count: int) -> Outlines:
+    """Join the knots, camera centres and rays of the outlines of views; ``count`` is the number of knots."""
+    sizes = [len(rays) for _, _, rays in parts]
+    knots = np.repeat(np.array([s for s, _, _ in parts], int), sizes)
+    eyes = np.repeat(np.array([eye for _, eye, _ in parts]).reshape(-1, 3), sizes, axis=0)
+    directions: list[list[np.ndarray]] = [[] for _ in range(count)]
+    for s, _, rays in parts:
+        if len(rays) >= MIN_POINTS:
+            mean = rays.mean(0)
+            directions[s].append(mean / np.linalg.norm(mean))
+    measured = np.array([len(ways) > 1 and np.min(ways @ np.transpose(ways)) < np.cos(APART) for ways in directions])
+    return Outlines(knots, eyes, np.concatenate([np.zeros((0, 3)), *(rays for _, _, rays in parts)]), measured)
 
 
 def second_differences(times: np.ndarray) -> np.ndarray:
@@ -118,30 +131,60 @@ def fit(outlines: Outlines, centers: np.ndarray, times: np.ndarray) -> Ball | No
         times: Knots. [S]
     """
     count, knots = len(times), outlines.knots
-    if count < 3 or len(knots) < 3 * count:
+    if count < 3 or len(knots) < 3 * count or outlines.measured.sum() < max(3, LEAST_MEASURED * count):
         return None
-    bend = np.kron(second_differences(times), np.eye(3))
-    smooth = np.zeros((3 * count + 1, 3 * count + 1))
-    smooth[:-1, :-1] = SMOOTH * bend.T @ bend
+    bend = second_differences(times)
+    smooth = np.zeros((9, 3 * count))  # upper bands of the normal matrix of smooth centres
+    for k in range(3):
+        products = np.einsum("ms,ms->s", bend[:, : count - k], bend[:, k:])
+        smooth[8 - 3 * k, 3 * k :] = SMOOTH * np.repeat(products, 3)
+    smooth[8] += 1e-6
     radius = float(np.quantile(np.linalg.norm(_arms(outlines, centers), axis=1), 0.75))
     for k in range(ROUNDS):
+        if not radius > 0:
+            return None
         arms = _arms(outlines, centers)
         distances = np.linalg.norm(arms, axis=1)
         wide = radius * max(0.1 * 0.6**k, FINE)
         weights = 1 / (1 + ((distances - radius) / wide) ** 2)
-        slopes = np.zeros((len(knots), 3 * count + 1))
-        for axis in range(3):
-            slopes[np.arange(len(knots)), 3 * knots + axis] = arms[:, axis] / np.maximum(distances, 1e-9)
-        slopes[:, -1] = -1
-        normal = slopes.T @ (weights[:, None] * slopes) + smooth + 1e-6 * np.eye(3 * count + 1)
-        now = np.append(centers.ravel(), radius)
-        change = np.linalg.solve(normal, slopes.T @ (weights * (distances - radius)) + smooth @ now)
-        centers, radius = centers - change[:-1].reshape(count, 3), float(radius - change[-1])
-    if radius <= 0 or not np.isfinite(centers).all():
+        ways = arms / np.maximum(distances, 1e-9 * radius)[:, None]
+        change, growth = _step(knots, weights, ways, distances - radius, smooth, SMOOTH * bend.T @ (bend @ centers))
+        centers, radius = centers - change, radius - growth
+    if not (radius > 0 and np.isfinite(centers).all()):
         return None
     errors = np.linalg.norm(_arms(outlines, centers), axis=1) / radius - 1
     is_round = np.mean(errors > CLOSE) <= OUTSIDE and np.mean(errors < -CLOSE) <= INSIDE
-    return Ball(centers, radius) if is_round else None
+    return Ball(centers, radius, outlines.measured) if is_round else None
+
+
+def _step(
+    knots: np.ndarray,
+    weights: np.ndarray,
+    ways: np.ndarray,
+    misses: np.ndarray,
+    smooth: np.ndarray,
+    rough: np.ndarray,
+) -> tuple[np.ndarray, float]:
+    """Return the least-squares steps of the centres [S, 3] and of the radius, to be subtracted.
+
+    Args:
+        knots: Knots of the points. [E]
+        weights: Their weights. [E]
+        ways: Derivatives of their distances with respect to the centre. [E, 3]
+        misses: Distances minus the radius. [E]
+        smooth: Upper bands of the normal matrix of smooth centres. [9, 3 S]
+        rough: Gradient of the roughness. [S, 3]
+    """
+    count = len(rough)
+    bands, weighted = smooth.copy(), weights[:, None] * ways
+    for i in range(3):
+        for j in range(i, 3):
+            bands[8 - (j - i), j::3] += np.bincount(knots, weighted[:, i] * ways[:, j], count)
+    border = -np.stack([np.bincount(knots, weighted[:, i], count) for i in range(3)], 1).ravel()
+    slope = np.stack([np.bincount(knots, weighted[:, i] * misses, count) for i in range(3)], 1) + rough
+    along, across = linalg.solveh_banded(bands, np.stack([slope.ravel(), border], 1)).T
+    growth = float((-weights @ misses - border @ along) / (weights.sum() + 1e-6 - border @ across))
+    return (along - growth * across).reshape(count, 3), growth
 
 
 def _arms(outlines: Outlines, centers: np.ndarray) -> np.ndarray:

@@ -9,10 +9,12 @@ were learned with wrong rotations are smeared. Other bodies, and balls whose tra
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 
 import numpy as np
 import torch
+from scipy import ndimage
 
 from ..model.tracks import Tracks
 from ..motion import rotations
@@ -27,7 +29,8 @@ from .trainer import Trainer
 
 log = logging.getLogger(__name__)
 
-VIEWS, EVERY, FEWEST = 6, 400, 3  # most views of a knot, and of all knots if each has at least the last number
+VIEWS, FEWEST = 6, 3  # most views of a knot, in short and in long captures
+EVERY = 400  # number of views of all knots above which a capture is long
 PIXELS = 6000  # largest number of compared pixels of a ball
 MIN_PIXELS = 400  # smallest number
 STEEPEST = 0.3  # smallest cosine of the angle between the surface and the ray that counts
@@ -52,16 +55,33 @@ def repair(trainer: Trainer, least: float = APART) -> int:
     owners = motion.tracks.owners.tolist()
     bodies = [k for k in range(1, motion.tracks.bodies) if k not in bent and owners.count(owners[k]) == 1]
     ids = [int(trainer.object_ids[owners[body]]) for body in bodies]
+    if not bodies:
+        return 0
     groups, count = _by_knot(trainer), 0
     for body, object_id, outlines in zip(bodies, ids, ball_outlines.gather(groups, ids), strict=True):
         places = trainer.places.centers[owners[body] - 1]
         ball = ball_outlines.fit(outlines, places, trainer.times)
+        ball = None if ball is None else _completed(motion.tracks, body, ball)
         found = None if ball is None else find(trainer, motion.tracks, body, _pixels(groups, object_id, ball), least)
         if ball is not None and found is not None:
             _write(trainer, motion.tracks, body, ball, found)
             count += 1
             log.info("object %d: rotations of a ball aligned by its texture", object_id)
     return count
+
+
+def _offset(tracks: Tracks, body: int, ball: Ball) -> np.ndarray:
+    """Return the centre of a ball relative to that of its track, in the frame of the body. [3]"""
+    moved = to_host(tracks.centers)[body] + to_host(tracks.params["translations"])[body].astype(np.float64)
+    offsets = rotations.rotate(rotations.conjugate(_quats(tracks, body)), ball.centers - moved)
+    return np.median(offsets[ball.measured], axis=0)
+
+
+def _completed(tracks: Tracks, body: int, ball: Ball) -> Ball:
+    """Return a ball with the centres of its track at knots at which the outlines do not determine them."""
+    moved = to_host(tracks.centers)[body] + to_host(tracks.params["translations"])[body].astype(np.float64)
+    tracked = moved + rotations.rotate(_quats(tracks, body), np.broadcast_to(_offset(tracks, body, ball), moved.shape))
+    return dataclasses.replace(ball, centers=np.where(ball.measured[:, None], ball.centers, tracked))
 
 
 def find(trainer: Trainer, tracks: Tracks, body: int, pixels: SurfacePixels, least: float) -> Alignment | None:
@@ -102,7 +122,7 @@ def _pixels(groups: list[list[TrainView]], object_id: int, ball: Ball) -> Surfac
             camera = cameras.crop(
                 view.camera, columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start
             )
-            inside = np.flatnonzero(_core(mask[rows, columns] == object_id))
+            inside = np.flatnonzero(ndimage.binary_erosion(mask[rows, columns] == object_id))
             inside = inside[np.linspace(0, len(inside) - 1, min(len(inside), most)).astype(int)]
             rays = cameras.pixel_rays(camera).reshape(-1, 3)[inside]
             away = ball.centers[s] - camera.center
@@ -116,20 +136,13 @@ def _pixels(groups: list[list[TrainView]], object_id: int, ball: Ball) -> Surfac
     return SurfacePixels(np.concatenate(knots), np.concatenate(directions), np.concatenate(colors))
 
 
-def _core(mask: np.ndarray) -> np.ndarray:
-    """Return the pixels of a mask whose four neighbours belong to it. [H, W] bool"""
-    wide = np.pad(mask, 1)
-    return mask & wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]
-
-
 @torch.no_grad()
 def _write(trainer: Trainer, tracks: Tracks, body: int, ball: Ball, found: Alignment) -> None:
     """Write a path and rotations into the track of a body; its frame stays nearest to the present one."""
     old = _quats(tracks, body)
     quats = ball_texture.in_frame_of(found.quats, old)
     center = to_host(tracks.centers)[body].astype(np.float64)
-    moves = to_host(tracks.params["translations"])[body].astype(np.float64)
-    own = np.median(rotations.rotate(rotations.conjugate(old), ball.centers - center - moves), axis=0)
+    own = _offset(tracks, body, ball)
     if rotations.angle_between(quats, old).max() > FAR:
         own = np.zeros(3)
         _place(trainer, tracks, body, ball, found, quats)

@@ -69,7 +69,9 @@ def after_step(trainer: Trainer, entered: tuple[int, int]) -> None:
                 knots = knots[(knots >= first) & (knots <= last)]
                 _repair_knot(trainer, int(row) + 1, s, knots, UNUSUAL * float(usual[row]))
     total = trainer.config.train.iterations
-    if first == 0 and last == len(trainer.times) - 1 and trainer.iteration in {int(x * total) for x in ROUNDS}:
+    if first > 0 or last < len(trainer.times) - 1:
+        return
+    if trainer.iteration in {int(x * total) for x in ROUNDS}:
         repair(trainer)
     if trainer.iteration == trainer.config.curriculum.steps(total)[1] + 1:
         ball_repair.repair(trainer, ball_repair.FAR)

@@ -107,8 +107,10 @@ class Bounce(MotionKind):
         for row in np.argsort(misses, kind="stable"):
             e, after, before, a = fits[row]
             if "fall" in blocks:
-                fall = -a @ np.array(window.up)
-                a = _acceleration({"fall": fall[None]}, window)
+                pull = -a @ np.array(window.up)
+                if pull <= 0:
+                    continue
+                a = _acceleration({"fall": pull[None]}, window)
             g, up = _gravity(a)
             rise, fall = float(after @ up), float(before @ up)
             if not (rise > 0.05 and fall < -0.05 and float(g[0]) > 0.1):

@@ -70,6 +70,43 @@ def test_outlines_give_path_and_radius_of_a_ball(hide):
     assert np.linalg.norm(ball.centers - [path(t) for t in TIMES], axis=1).max() < 0.05 * RADIUS
 
 
+@pytest.mark.parametrize("cameras_per_time", [1, 2])
+def test_depth_needs_two_cameras_in_different_directions_at_most_times(cameras_per_time):
+    def some(k, s, mask):
+        return mask & (k == (s if cameras_per_time == 1 else s % 2) or (cameras_per_time == 2 and k == 2))
+
+    assert (fitted(ball_mask, some) is not None) == (cameras_per_time == 2)
+
+
+def test_times_without_outlines_are_not_measured():
+    def gap(k, s, mask):
+        return mask & (s != 2)
+
+    ball = fitted(ball_mask, gap)
+    assert ball is not None and ball.measured.tolist() == [True, True, False, True, True]
+
+
+def test_a_step_solves_the_least_squares_problem():
+    rng = np.random.default_rng(0)
+    knots, weights = rng.integers(0, 5, 200), rng.uniform(0.1, 1, 200)
+    ways, misses, rough = rng.normal(size=(200, 3)), rng.normal(size=200), rng.normal(size=(5, 3))
+    bend = np.kron(ball_outlines.second_differences(TIMES), np.eye(3))
+    normal = bend.T @ bend
+    bands = np.zeros((9, 15))
+    for k in range(9):
+        bands[8 - k, k:] = np.diagonal(normal, k)
+    found, growth = ball_outlines._step(knots, weights, ways, misses, bands, rough)
+    slopes = np.zeros((200, 16))
+    for axis in range(3):
+        slopes[np.arange(200), 3 * knots + axis] = ways[:, axis]
+    slopes[:, -1] = -1
+    dense = slopes.T @ (weights[:, None] * slopes)
+    dense[:15, :15] += normal
+    dense[15, 15] += 1e-6
+    expected = np.linalg.solve(dense, slopes.T @ (weights * misses) + np.append(rough.ravel(), 0))
+    np.testing.assert_allclose(np.append(found.ravel(), growth), expected, atol=1e-9)
+
+
 def test_a_cube_is_no_ball():
     assert fitted(cube_mask) is None
 

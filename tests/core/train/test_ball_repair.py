@@ -7,6 +7,7 @@ import torch
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.motion import rotations
 from r5dgs_core.train import ball_repair, checkpoint
+from r5dgs_core.train.ball_outlines import Ball
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
@@ -51,18 +52,30 @@ def test_drift_of_a_ball_is_undone(trainer, rate):
 
 
 def test_a_repair_changes_the_ball_alone(trainer):
-    before = trainer.state().tensors
     drift(trainer, 9.0)
-    ball_repair.repair(trainer)
+    before = {name: tensor.clone() for name, tensor in trainer.state().tensors.items()}
+    assert ball_repair.repair(trainer) == 1
     after = trainer.state().tensors
     others = trainer.gaussians.motion_ids != BALL
+    assert not torch.equal(after["tracks.base_quats"][BALL], before["tracks.base_quats"][BALL])
     for name, tensor in before.items():
-        if name.startswith("gaussians."):
-            assert torch.equal(after[name][others], tensor[others])
-        elif name in ("tracks.base_quats", "tracks.rotvecs", "tracks.translations"):
-            assert torch.equal(after[name][BRICK], tensor[BRICK])
-        elif not name.startswith("adam."):
-            assert torch.equal(after[name], tensor)
+        if tensor.ndim and len(tensor) == len(others):
+            assert torch.equal(after[name][others], tensor[others]), name
+        elif any(part in name for part in ("base_quats", "rotvecs", "translations")) and tensor.ndim:
+            assert torch.equal(after[name][BRICK], tensor[BRICK]), name
+        else:
+            assert torch.equal(after[name], tensor), name
+
+
+def test_a_ball_keeps_its_path_at_times_without_outlines(trainer):
+    tracks = trainer.motion.tracks
+    centers = np.zeros((len(trainer.times), 3))
+    measured = np.arange(len(trainer.times)) != 2
+    ball = ball_repair._completed(tracks, BALL, Ball(centers, 1.0, measured))
+    moved = (tracks.centers[BALL] + tracks.params["translations"][BALL]).detach().numpy().astype(np.float64)
+    offset = ball_repair._offset(tracks, BALL, Ball(centers, 1.0, measured))
+    np.testing.assert_array_equal(ball.centers[measured], 0)
+    np.testing.assert_allclose(ball.centers[2], moved[2] + rotations.rotate(quats(trainer)[2], offset), atol=1e-6)
 
 
 def test_a_sound_track_keeps_its_bits(trainer):
