@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -65,8 +66,14 @@ def edit(
         groups=groups,
         lookup=lookup,
         hulls=scene.hulls if same and all(cluster.id == cluster.source.id for cluster in clusters) else (),
+        needs=scene.needs if same else tuple(_without_simulation(row) for row in scene.needs),
     )
     return _with_representatives(result), notes
+
+
+def _without_simulation(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Row of the needs table without the ground of a simulation, which is in world coordinates."""
+    return {name: value for name, value in row.items() if name != "simulation"}
 
 
 def _objects(scene: Scene, table: Mapping[int, SceneObject], object_ids: np.ndarray) -> tuple[SceneObject, ...]:

@@ -311,6 +311,16 @@ def test_names_and_tints_are_stored_and_names_stay_unique():
     np.testing.assert_array_equal(result.gaussians.sh[~rows], scene.gaussians.sh[~rows])
 
 
+@pytest.mark.parametrize("where", ["before", "after"])
+def test_moved_scenes_lose_the_ground_of_their_simulations(where):
+    contact = {"name": "contact", "object_id": 1, "friction": 0.2}
+    simulated = {**contact, "simulation": {"normal": [0, 0, 1], "height": 0.025}}
+    scene = dataclasses.replace(rich_scene(), needs=({"name": "motion"}, simulated))
+    down = {number: matrix_of(np.eye(3), (0, 0, -5.0)) for number in range(-1, 4)}
+    assert edit(scene, pieces_of(scene))[0].needs == scene.needs
+    assert edit(scene, pieces_of(scene, **{where: down}))[0].needs == ({"name": "motion"}, contact)
+
+
 def test_everything_may_be_deleted():
     result, _ = edit(rich_scene(), [])
     assert len(result.gaussians.means) == 0 and [item.id for item in result.objects] == [0]
