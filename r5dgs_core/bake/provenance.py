@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from ..contact import slipped_rotations
 from ..errors import DatasetError
 from ..playback import residuals
+from ..scene import slipped_rotations
 from ..train import checkpoint_content, train_views, view_psnr
 from ..train.identity import label_cleanup
 from . import image_evidence

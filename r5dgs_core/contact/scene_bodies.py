@@ -10,10 +10,9 @@ import numpy as np
 
 from .. import errors
 from ..motion import models, rotations
-from ..scene import gravity, world_axes
+from ..scene import gravity, slipped_rotations, world_axes
 from ..scene.scene import MotionGroup, Scene
 from ..shapes import solid
-from . import slipped_rotations
 from .observed_track import Track
 
 _PLACE_NOISE, _TURN_NOISE = 0.003, 0.004  # of poses without known errors: in sizes, and rad

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..playback import group_dynamics
+from ..scene import slipped_rotations
 from ..scene.lookup_table import LookupTable
 from ..scene.scene import MotionGroup, Scene, SceneObject
 from . import edited_gaussians, edited_motion, piece_clusters
@@ -66,6 +67,7 @@ def edit(
         groups=groups,
         lookup=lookup,
         hulls=scene.hulls if same and all(cluster.id == cluster.source.id for cluster in clusters) else (),
+        provenance=slipped_rotations.renumbered(scene, [cluster.source.id for cluster in clusters]),
         needs=scene.needs if same else tuple(_without_simulation(row) for row in scene.needs),
     )
     return _with_representatives(result), notes

@@ -9,7 +9,7 @@ from r5dgs_core.editing import edited_scene
 from r5dgs_core.editing.edited_scene import Piece
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.playback import scene_player
-from r5dgs_core.scene import row_runs, scene_file, validation
+from r5dgs_core.scene import row_runs, scene_file, slipped_rotations, validation
 from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, LookupTable
 from tests.support.scenes import make_scene
 
@@ -319,6 +319,16 @@ def test_moved_scenes_lose_the_ground_of_their_simulations(where):
     down = {number: matrix_of(np.eye(3), (0, 0, -5.0)) for number in range(-1, 4)}
     assert edit(scene, pieces_of(scene))[0].needs == scene.needs
     assert edit(scene, pieces_of(scene, **{where: down}))[0].needs == ({"name": "motion"}, contact)
+
+
+def test_records_of_slipped_rotations_stay_with_their_groups():
+    record = slipped_rotations.record({1: [(0.1, 0.2)], 2: [(0.3, np.inf)], 3: [(-np.inf, 0.4)]})
+    scene = dataclasses.replace(rich_scene(), provenance={"hash": "ab", **record})
+    assert edit(scene, pieces_of(scene))[0].provenance == scene.provenance
+    result, _ = edit(scene, [piece for piece in pieces_of(scene) if piece.object_id != 1])
+    assert [group.object_id for group in result.groups[:3]] == [0, 2, 3] and result.provenance["hash"] == "ab"
+    assert slipped_rotations.recorded(result) == {1: [(0.3, np.inf)], 2: [(-np.inf, 0.4)]}
+    assert slipped_rotations.RECORD not in edit(scene, [])[0].provenance
 
 
 def test_everything_may_be_deleted():

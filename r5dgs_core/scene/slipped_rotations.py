@@ -1,4 +1,4 @@
-"""Observed rotations that slipped by a turn: wrong for contacts, which do not know it, though a smooth law may.
+"""Observed rotations that slipped by a turn. Fits of smooth motions allow for slips; fits of contacts do not.
 
 Baking finds them with the smooth laws and records them in the provenance of a scene.
 """
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..motion.history import UNKNOWN_TURN
-from ..scene.scene import Scene
+from .scene import Scene
 
 RECORD = "slipped_rotations"  # key of the provenance
 
@@ -30,12 +30,27 @@ def record(slipped: Spans) -> dict[str, Any]:
 def recorded(scene: Scene) -> Spans:
     """Return the first and last time of rotations that slipped, by group, from the provenance of a scene."""
     found: dict[int, list[tuple[float, float]]] = {}
-    with contextlib.suppress(AttributeError, TypeError, ValueError):  # the provenance is a free JSON object
+    # The provenance is a free JSON object.
+    with contextlib.suppress(AttributeError, TypeError, ValueError, OverflowError):
         for index, spans in scene.provenance.get(RECORD, {}).items():
             limits = [(-math.inf if a is None else float(a), math.inf if b is None else float(b)) for a, b in spans]
             if 0 < int(index) < len(scene.groups):
                 found[int(index)] = limits
     return found
+
+
+def renumbered(scene: Scene, sources: Sequence[int]) -> dict[str, Any]:
+    """Return the provenance of a scene with other groups.
+
+    Args:
+        scene: The scene with the former groups.
+        sources: Former number of each new group. [G]
+    """
+    if RECORD not in scene.provenance or list(sources) == list(range(len(scene.groups))):
+        return scene.provenance
+    found = recorded(scene)
+    others = {name: value for name, value in scene.provenance.items() if name != RECORD}
+    return others | record({new: found[old] for new, old in enumerate(sources) if old in found})
 
 
 def unknown(scene: Scene, slipped: Spans) -> Scene:
