@@ -24,7 +24,7 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     """Write the bodies at each time. Implements `registry.Format.write`."""
     height = rigid_bodies.ground_height(scene)
     for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
-        tree = model(scene, rigid_bodies.of(scene, t, options), height)
+        tree = model(scene, rigid_bodies.of(scene, t, options, as_simulated=True), height)
         ElementTree.indent(tree)
         with registry.writing(target):
             atomic_files.write(target, ElementTree.tostring(tree, "utf-8", xml_declaration=True) + b"\n")

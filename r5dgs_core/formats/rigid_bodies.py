@@ -86,8 +86,15 @@ class RigidBody:
         return DENSITY * self.solid.inertia
 
 
-def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
+def of(scene: Scene, t: float, options: registry.Options, as_simulated: bool = False) -> list[RigidBody]:
     """Return the bodies of the selected objects at a scene time, in metres and seconds if the scene stores these units.
+
+    Args:
+        scene: The scene.
+        t: The time.
+        options: Selection of the objects.
+        as_simulated: True for the contacts of simulated bodies and, from t_max on, their shapes and states in the
+            simulation; False for those of playback.
 
     Raises:
         ConfigError: No selected object has a hull.
@@ -103,7 +110,7 @@ def of(scene: Scene, t: float, options: registry.Options) -> list[RigidBody]:
     start = {(one.object_id, one.group): one for one in object_poses.at(scene, (t,))}
     turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
     axes, length, time = rotations.rotmats_to_quats(turn), scene.units.meters_per_unit or 1.0, _time_unit(scene)
-    found, materials, simulated = [], _materials(scene), _simulated(scene)
+    found, materials, simulated = [], _materials(scene), _simulated(scene, t) if as_simulated else {}
     for (hull, body), name in zip(chosen, names, strict=True):
         group, contacts = scene.groups[hull.motion_id], simulated.get(hull.object_id)
         if contacts is not None and contacts.flat_foot:
@@ -187,13 +194,18 @@ def _materials(scene: Scene) -> dict[int, tuple[float, float | None]]:
     return found
 
 
-def _simulated(scene: Scene) -> dict[int, Contacts]:
-    """Ground and contacts of the simulated bodies, by id of the object."""
+def _simulated(scene: Scene, t: float) -> dict[int, Contacts]:
+    """Ground and contacts of the simulated bodies, by id of the object.
+
+    Before t_max, bodies whose foot was pressed flat for the simulation have the shape, and so the ground, of others.
+    """
     turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
     length, time, found = scene.units.meters_per_unit or 1.0, _time_unit(scene), {}
     for row in scene.needs:
         number, own = row.get("object_id"), row.get("simulation")
         if row.get("name") == "contact" and isinstance(number, int) and isinstance(own, dict):
+            if t < scene.t_max and own.get("flat_foot"):
+                continue
             with contextlib.suppress(KeyError, TypeError, ValueError):  # needs are free JSON objects
                 found[number] = Contacts(
                     normal=turn @ np.array(own["normal"], np.float64),

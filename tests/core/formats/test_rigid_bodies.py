@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.bake import contact
-from r5dgs_core.contact import scene_future, scene_world
 from r5dgs_core.formats import ground, hulls, mjcf, registry, rigid_bodies, urdf
 from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.playback.scene_player import Player
 from r5dgs_core.scene import cameras
 from r5dgs_core.scene.units import Units
-from r5dgs_core.shapes import directions, object_hulls, solid
+from r5dgs_core.shapes import object_hulls, solid
 from tests.support import contact_scenes, scenes, solid_gaussians
 
 MODEL = MotionModel(
@@ -246,43 +244,3 @@ def test_the_ground_is_below_all_observed_places_and_missing_if_nothing_rests(th
     lowest = min(float(corners[:, 2].min()) for corners in posed(scene, scene.t_max))
     assert ground.height(scene, scene.hulls) == pytest.approx(lowest) and lowest < -0.05
     assert ground.height(thrown, thrown.hulls) is None and ground.MISSING in mjcf.FORMAT.losses(thrown, OPTIONS)
-
-
-def bouncing_ball():
-    """A ball in free fall, as a motion and a hull."""
-    model, place = contact_scenes.falling()
-    scene = contact_scenes.scene((model, place))
-    ball = place + 0.5 * contact_scenes.SIZE * directions.sphere(64)
-    return dataclasses.replace(scene, hulls=(dataclasses.replace(scene.hulls[0], vertices=ball),))
-
-
-def sliding_pair():
-    """A box that slides into one that rests."""
-    return contact_scenes.scene(contact_scenes.sliding(1.5), contact_scenes.resting(0.8))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("make", "until"),
-    [(lambda: contact_scenes.scene(contact_scenes.falling()), 0.45), (bouncing_ball, 1.0), (sliding_pair, 0.6)],
-    ids=["box", "ball", "pair"],  # a tumbling box amplifies rounding errors at each impact
-)
-def test_mujoco_replays_the_simulated_contacts_of_the_file(make, until, tmp_path):
-    mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
-    scene = dataclasses.replace(make(), units=Units(seconds_per_unit=0.7, meters_per_unit=1.2))  # g = 4.0
-    found = scene_future.predict(scene, scene_world.Wishes(samples=1))
-    expected, bodies = found.recording, found.world.bodies
-    assert {body.name for body in bodies} == found.taken.keys() and any(touch.change for touch in expected.touches)
-    scene = dataclasses.replace(scene, groups=found.groups, needs=contact.needs((), found))
-    (path,) = mjcf.export(scene, tmp_path / "a.xml", registry.Options((scene.t_max,)))
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    assert model.opt.timestep == pytest.approx(0.7 * np.diff(expected.times)[0], rel=1e-9)
-    steps = np.linspace(0, np.searchsorted(expected.times, until), 16).astype(int)
-    for before, row in itertools.pairwise(steps):
-        mujoco.mj_step(model, data, row - before)
-        for number, body in enumerate(bodies):
-            place = data.qpos[model.jnt_qposadr[model.joint(body.name).id] :][:3] / 1.2
-            apart = np.linalg.norm(place - expected.places[row, number])
-            assert apart < 1e-3 * contact_scenes.SIZE, (body.name, expected.times[row])
