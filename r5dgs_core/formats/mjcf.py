@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from xml.etree import ElementTree
@@ -17,6 +18,7 @@ from .rigid_bodies import RigidBody
 KEY = "start"  # name of the keyframe
 _TORSION = (0.005, 0.0001)  # MuJoCo's torsional and rolling friction
 _TOGETHER, _ON_GROUND = 1, 2  # bits of the contacts between bodies, and of those with the common ground
+_DAMPING = 0.49723939470  # damping ratio of contacts with the restitution assumed for fixed bodies, 0.3
 _IMPEDANCE = (0.99, 0.99, 0.001, 0.5, 2.0)  # constant, so that solref alone determines the restitution
 
 
@@ -55,7 +57,7 @@ def model(scene: Scene, bodies: list[RigidBody], height: float | None) -> Elemen
         if simulated and body.contacts is None:
             shape.set("contype", str(_TOGETHER | _ON_GROUND))
     if simulated:
-        _add_contacts(root, world, [body for body in bodies if body.contacts is not None])
+        _add_contacts(root, world, bodies)
     moving = [body for body in bodies if body.moves]
     if moving:
         places = np.concatenate([[*body.position, *body.quat] for body in moving])
@@ -87,22 +89,37 @@ def _add_body(assets: ElementTree.Element, world: ElementTree.Element, body: Rig
 
 
 def _add_contacts(root: ElementTree.Element, world: ElementTree.Element, bodies: list[RigidBody]) -> None:
-    """Add the contacts of bodies that were simulated: with a ground of their own each, and with each other."""
+    """Add the contacts of bodies that were simulated: with a ground of their own each, and with all bodies."""
     add, pairs = ElementTree.SubElement, ElementTree.SubElement(root, "contact")
-    for number, body in enumerate(bodies):
+    simulated = [body for body in bodies if body.contacts is not None]
+    others = [body for body in bodies if body.contacts is None]
+    for number, body in enumerate(simulated):
         own = body.contacts
         assert own is not None
         ground = f"{rigid_bodies.GROUND} of {body.name}"
         place = {"pos": numbers(own.height * own.normal), "zaxis": numbers(own.normal), "size": "0 0 1"}
         add(world, "geom", place, name=ground, type="plane", contype="0", conaffinity="0")
-        for name, other in ((ground, body), *((other.name, other) for other in bodies[:number])):
-            assert other.contacts is not None
-            softer = min((body, other), key=lambda one: 1.0 if one.restitution is None else one.restitution).contacts
-            assert softer is not None
+        for name, other in ((ground, body), *((other.name, other) for other in (*simulated[:number], *others))):
             mu = numbers([max(body.friction, other.friction)] * 2 + [_TORSION[0]] + [_TORSION[1]] * 2)
-            numbers_of = {"solref": softer.solref, "solreffriction": softer.solreffriction, "solimp": _IMPEDANCE}
-            pair = {key: numbers(values) for key, values in numbers_of.items()}
+            pair = {key: numbers(values) for key, values in _softer(body, other).items()}
             add(pairs, "pair", pair, geom1=name, geom2=body.name, condim="3", friction=mu)
+
+
+def _softer(body: RigidBody, other: RigidBody) -> dict[str, Iterable[float]]:
+    """Numbers of the contact of a simulated body with another body: those of the smaller restitution.
+
+    Simulations assume one for fixed bodies.
+    """
+    own = body.contacts
+    assert own is not None
+    if other.contacts is None:
+        damping = min(own.solref[1], -2 * _DAMPING * math.sqrt(-own.solref[0]))
+        solref, grip = (own.solref[0], damping), (own.solreffriction[0], min(own.solreffriction[1], damping))
+    else:
+        softer = min((body, other), key=lambda one: 1.0 if one.restitution is None else one.restitution).contacts
+        assert softer is not None
+        solref, grip = softer.solref, softer.solreffriction
+    return {"solref": solref, "solreffriction": grip, "solimp": _IMPEDANCE}
 
 
 def numbers(values: Iterable[float]) -> str:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core.bake import contact
-from r5dgs_core.contact import scene_future, scene_world
+from r5dgs_core.contact import restitution, scene_future, scene_world
+from r5dgs_core.contact.world import Material
 from r5dgs_core.formats import mjcf, registry, rigid_bodies
 from r5dgs_core.motion import rotations
 from r5dgs_core.scene.units import Units
@@ -70,18 +71,42 @@ def sliding_pair():
     return contact_scenes.scene(contact_scenes.sliding(1.5), contact_scenes.resting(0.8))
 
 
+def above_a_table(made):
+    """The body of a scene above a static object, which is part of the background's motion."""
+    both = contact_scenes.scene((made.groups[1].model, made.groups[1].pivot), contact_scenes.resting(0.1))
+    table = contact_scenes.with_hull(both, 2, [0.1, 0.2, 0.05], [1.6, 1.0, 0.3]).hulls[1]
+    return dataclasses.replace(both, hulls=(made.hulls[0], dataclasses.replace(table, motion_id=0)))
+
+
+def falling_box():
+    return contact_scenes.scene(contact_scenes.falling())
+
+
+def test_contacts_with_fixed_bodies_have_the_restitution_that_simulations_assume_for_them():
+    assert restitution.of_damping(mjcf._DAMPING) == pytest.approx(Material().restitution, rel=1e-9)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "until"),
-    [(lambda: contact_scenes.scene(contact_scenes.falling()), 0.45), (bouncing_ball, 1.0), (sliding_pair, 0.6)],
-    ids=["box", "ball", "pair"],  # a tumbling box amplifies rounding errors at each impact
+    [
+        (falling_box, 0.45),  # a tumbling box amplifies rounding errors at each impact
+        (bouncing_ball, 1.0),
+        (sliding_pair, 0.6),
+        (lambda: above_a_table(falling_box()), 0.35),
+        (lambda: above_a_table(bouncing_ball()), 1.0),
+    ],
+    ids=["box", "ball", "pair", "box and table", "ball and table"],
 )
 def test_mujoco_replays_the_simulated_contacts_of_the_file(make, until, tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed; it comes with the extra 'contact'")
     scene = dataclasses.replace(make(), units=Units(seconds_per_unit=0.7, meters_per_unit=1.2))  # g = 4.0
-    found = scene_future.predict(scene, scene_world.Wishes(samples=1))
-    expected, bodies = found.recording, found.world.bodies
-    assert {body.name for body in bodies} == found.taken.keys() and any(touch.change for touch in expected.touches)
+    found = scene_future.predict(scene, scene_world.Wishes(samples=1, materials={1: (None, 0.6)}))
+    expected, fixed = found.recording, [shape.fixed for shape in found.world.world.bodies]
+    bodies = [(number, body) for number, body in enumerate(found.world.bodies) if not fixed[number]]
+    assert {body.name for _, body in bodies} == found.taken.keys()
+    assert any(touch.change and {*touch.bodies} >= ({0, 1} if any(fixed) else {0}) for touch in expected.touches)
+    assert expected.touches[0].time < 0.8 * until
     scene = dataclasses.replace(scene, groups=found.groups, needs=contact.needs((), found))
     (path,) = mjcf.export(scene, tmp_path / "a.xml", registry.Options((scene.t_max,)))
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -91,7 +116,7 @@ def test_mujoco_replays_the_simulated_contacts_of_the_file(make, until, tmp_path
     steps = np.linspace(0, np.searchsorted(expected.times, until), 16).astype(int)
     for before, row in itertools.pairwise(steps):
         mujoco.mj_step(model, data, row - before)
-        for number, body in enumerate(bodies):
+        for number, body in bodies:
             place = data.qpos[model.jnt_qposadr[model.joint(body.name).id] :][:3] / 1.2
             apart = np.linalg.norm(place - expected.places[row, number])
             assert apart < 1e-3 * contact_scenes.SIZE, (body.name, expected.times[row])
