@@ -93,10 +93,11 @@ def _add_contacts(root: ElementTree.Element, world: ElementTree.Element, bodies:
     add, pairs = ElementTree.SubElement, ElementTree.SubElement(root, "contact")
     simulated = [body for body in bodies if body.contacts is not None]
     others = [body for body in bodies if body.contacts is None]
+    used = {rigid_bodies.GROUND, *(body.name for body in bodies)}
     for number, body in enumerate(simulated):
         own = body.contacts
         assert own is not None
-        ground = f"{rigid_bodies.GROUND} of {body.name}"
+        ground = rigid_bodies.unused(f"{rigid_bodies.GROUND} of {body.name}", used)
         place = {"pos": numbers(own.height * own.normal), "zaxis": numbers(own.normal), "size": "0 0 1"}
         add(world, "geom", place, name=ground, type="plane", contype="0", conaffinity="0")
         for name, other in ((ground, body), *((other.name, other) for other in (*simulated[:number], *others))):

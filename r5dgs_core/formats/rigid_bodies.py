@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -23,6 +24,7 @@ from . import ground, registry, scene_nodes
 WORLD, GROUND = "world", "ground"  # names that the files use; MuJoCo reserves the former
 DENSITY = 1000.0  # unknown; masses of bodies are proportional to their volumes
 FRICTION = 0.3  # of bodies whose motion does not tell it
+_UNIT = 1e-3  # largest difference of the length of a normal from 1
 _NEAR = 0.2  # of the size: distance up to which the centre of rotation in flight replaces the centre of the hull
 
 
@@ -188,10 +190,14 @@ def _materials(scene: Scene) -> dict[int, tuple[float, float | None]]:
     found: dict[int, tuple[float, float | None]] = {}
     for row in scene.needs:
         number = row.get("object_id")
-        if row.get("name") == "contact" and isinstance(number, int) and isinstance(row.get("friction"), float):
+        if row.get("name") == "contact" and isinstance(number, int) and _is_known(row.get("friction")):
             e = row.get("restitution")
-            found[number] = max(row["friction"], 0.0), e if isinstance(e, float) else None
+            found[number] = max(row["friction"], 0.0), e if _is_known(e) else None
     return found
+
+
+def _is_known(value: object) -> bool:
+    return isinstance(value, float) and math.isfinite(value)
 
 
 def _simulated(scene: Scene, t: float) -> dict[int, Contacts]:
@@ -206,16 +212,28 @@ def _simulated(scene: Scene, t: float) -> dict[int, Contacts]:
         if row.get("name") == "contact" and isinstance(number, int) and isinstance(own, dict):
             if t < scene.t_max and own.get("flat_foot"):
                 continue
-            with contextlib.suppress(KeyError, TypeError, ValueError):  # needs are free JSON objects
-                found[number] = Contacts(
-                    normal=turn @ np.array(own["normal"], np.float64),
+            contacts = None
+            with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):  # needs are free JSON objects
+                contacts = Contacts(
+                    normal=turn @ np.array(own["normal"], np.float64).reshape(3),
                     height=length * float(own["height"]),
                     solref=_scaled(own["solref"], time),
                     solreffriction=_scaled(own["solreffriction"], time),
                     timestep=time * float(own["timestep"]),
                     flat_foot=bool(own["flat_foot"]),
                 )
+            if contacts is not None and _is_sound(contacts):
+                found[number] = contacts
     return found
+
+
+def _is_sound(contacts: Contacts) -> bool:
+    """Return True if MuJoCo can simulate contacts with these numbers."""
+    references = contacts.solref, contacts.solreffriction
+    finite = np.isfinite([*contacts.normal, contacts.height, contacts.timestep, *np.ravel(references)]).all()
+    unit = abs(float(np.linalg.norm(contacts.normal)) - 1) < _UNIT
+    springs = all(stiffness < 0 and damping <= 0 for stiffness, damping in references)
+    return bool(finite) and unit and springs and contacts.timestep > 0
 
 
 def _scaled(reference: Sequence[float], time: float) -> tuple[float, float]:
@@ -270,13 +288,16 @@ def _center_of_mass(group: MotionGroup, body: Solid, up: np.ndarray) -> np.ndarr
 
 def _names(scene: Scene, hulls: list[Hull]) -> list[str]:
     groups, used = scene_nodes.group_names(scene), {WORLD, GROUND}
-    found = []
-    for hull in hulls:
-        first = name = groups[hull.motion_id] if hull.motion_id else scene.object(hull.object_id).name
-        count = 1
-        while name in used:
-            count += 1
-            name = f"{first} {count}"
-        used.add(name)
-        found.append(name)
+    return [
+        unused(groups[hull.motion_id] if hull.motion_id else scene.object(hull.object_id).name, used) for hull in hulls
+    ]
+
+
+def unused(name: str, used: set[str]) -> str:
+    """Return a name with a number if it is used already, and add it to the used ones."""
+    found, count = name, 1
+    while found in used:
+        count += 1
+        found = f"{name} {count}"
+    used.add(found)
     return found

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -56,6 +57,36 @@ def test_hulls_and_urdf_hold_playback_and_no_simulation(kind, tmp_path):
         paths = made.write(scene, tmp_path / name / f"boxes{made.suffix}", registry.Options((T_MAX,)))
         files.append({path.name: path.read_bytes() for path in paths})
     assert files[0] == files[1]
+
+
+UNSOUND = [
+    {"normal": [0, 0, 0]},
+    {"normal": [[0], [0], [1], [0]]},
+    {"normal": [0, 0, 10**400]},
+    {"timestep": float("nan")},
+    {"timestep": 0.0},
+    {"height": float("inf")},
+    {"solref": [0.02, 1.0]},
+    {"solreffriction": [-1e4, float("nan")]},
+]
+
+
+@pytest.mark.parametrize("changes", UNSOUND)
+def test_rows_that_mujoco_cannot_simulate_are_ignored(changes, tmp_path):
+    scene, files = simulated_boxes(**changes), []
+    for name, made in (("a", scene), ("b", without_simulation(scene))):
+        (path,) = mjcf.export(made, tmp_path / f"{name}.xml", OPTIONS)
+        files.append(path.read_text())
+    assert files[0] == files[1] and "solref" not in files[0]
+
+
+def test_the_ground_of_a_body_has_a_name_of_its_own(tmp_path):
+    scene = simulated_boxes()
+    names = {1: "ground of box 2", 2: "box 2"}
+    items = tuple(dataclasses.replace(item, name=names.get(item.id, item.name)) for item in scene.objects)
+    (path,) = mjcf.export(dataclasses.replace(scene, objects=items), tmp_path / "a.xml", OPTIONS)
+    geometries = [geom.get("name") for geom in ElementTree.parse(path).findall("worldbody//geom")]
+    assert len(geometries) == len({*geometries}) == 5 and {"ground of box 2", "ground of box 2 2"} < {*geometries}
 
 
 def bouncing_ball():
