@@ -45,11 +45,6 @@ class Comparison:
         return self.contact + BETTER < self.smooth
 
     @property
-    def worse(self) -> bool:
-        """True if contacts do not explain the poses, and predict them worse by more than the noise."""
-        return not self.good and self.smooth + BETTER < self.contact
-
-    @property
     def good(self) -> bool:
         """True if contacts explain the poses, or not worse than the smooth law by more than the noise."""
         return self.contact < max(UNEXPLAINED, self.smooth + BETTER)

@@ -200,7 +200,7 @@ def make(
                 reason = "" if enough else f"contacts are not clearly better: {compared.text()}"
             elif not reason and number in sinking and held_out.is_possible(scene, body):
                 test = held_out.compare(fitter, up)
-                reason = f"contacts are worse: {test.text()}" if test.worse else ""
+                reason = "" if test.good else f"contacts are worse: {test.text()}"
             if estimate is not None and not reason:
                 fits[len(chosen)] = fitter, estimate
                 comparisons |= {} if compared is None else {len(chosen): compared}

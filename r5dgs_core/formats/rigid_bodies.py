@@ -23,7 +23,7 @@ from . import ground, registry, scene_nodes
 
 WORLD, GROUND = "world", "ground"  # names that the files use; MuJoCo reserves the former
 DENSITY = 1000.0  # unknown; masses of bodies are proportional to their volumes
-FRICTION = 0.3  # of bodies whose motion does not tell it
+FRICTION = 0.3  # of bodies whose friction is unknown
 _UNIT = 1e-3  # largest difference of the length of a normal from 1
 _NEAR = 0.2  # of the size: distance up to which the centre of rotation in flight replaces the centre of the hull
 

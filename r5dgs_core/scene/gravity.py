@@ -13,7 +13,7 @@ from .scene import Scene
 STANDARD = 9.80665  # m / s^2
 _FLIGHTS = ("translation", "ballistic_spin", "free_top", "bounce")  # kinds whose acceleration may be gravity
 _DOWNWARD = 0.94  # least cosine between the acceleration of a falling body and the downward axis: 20 degrees
-_FALL = 0.5  # height of the fall in the observed time, in radii of the body, below which it tells nothing of gravity
+_FALL = 0.5  # height of the fall in the observed time, in radii of the body, below which gravity is not measured
 _AGREES = 0.1  # relative difference of observed motions from the gravity of the units up to which they agree with it
 
 
