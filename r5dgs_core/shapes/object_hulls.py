@@ -13,9 +13,8 @@ from ..scene.splats import to_opacities
 from . import balls, boxes, silhouette_hull, silhouettes
 
 _FILTER = 0.3  # variance that the low-pass filter of pictures adds to Gaussians, px^2
-_LEVEL = (
-    0.6  # opacity at the outlines of pictures with that filter; at 0.5, eight trained balls and boxes are 2 % larger
-)
+# Opacity at the outlines of pictures with that filter; at 0.5, eight trained balls and boxes are 2 % larger.
+_LEVEL = 0.6
 
 
 def of(scene: Scene) -> tuple[Hull, ...]:
