@@ -66,9 +66,8 @@ def keys(bpy):
     for obj in bpy.data.objects:
         for name, curve in motions.curves(obj).items():
             for field in (*POINTS, *ENUMS):
-                values = np.empty(len(curve.keyframe_points) * (2 if field in POINTS else 1), np.float32)
-                if field in ENUMS:
-                    values = values.astype(np.int32)
+                count = len(curve.keyframe_points) * (2 if field in POINTS else 1)
+                values = np.zeros(count, np.int32 if field in ENUMS else np.float32)
                 curve.keyframe_points.foreach_get(field, values)
                 found[obj.name, name, field] = values.tolist()
     return found

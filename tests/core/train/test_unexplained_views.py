@@ -125,7 +125,7 @@ def test_left_out_pixels_change_neither_the_loss_nor_its_gradient():
         loss = losses.photometric(*_without(region, image, given), 0.2)
         (gradient,) = torch.autograd.grad(loss, image)
         assert not gradient[region].any() and gradient[~region].any()
-        found.append((float(loss), gradient))
+        found.append((loss.item(), gradient))
     assert found[0][0] == found[1][0] and torch.equal(found[0][1], found[1][1])
     assert found[0][0] != found[2][0]
 
