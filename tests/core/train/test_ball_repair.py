@@ -4,21 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.data import dataset as datasets
 from r5dgs_core.motion import rotations
-from r5dgs_core.train import ball_repair, checkpoint
+from r5dgs_core.train import ball_repair
 from r5dgs_core.train.ball_outlines import Ball
-from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
 BRICK, BALL = tiny_datasets.BRICK, tiny_datasets.BALL
-
-
-@pytest.fixture
-def trainer(tiny, trained):
-    made = Trainer(datasets.read(tiny.root), trained.config)
-    made.restore(checkpoint.load(trained.folder))
-    return made
 
 
 def quats(trainer):

@@ -7,18 +7,11 @@ import torch
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
-from r5dgs_core.train import checkpoint, pose_repair, run
+from r5dgs_core.train import pose_repair, run
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
 BRICK, BALL = tiny_datasets.BRICK, tiny_datasets.BALL
-
-
-@pytest.fixture
-def trainer(tiny, trained):
-    made = Trainer(datasets.read(tiny.root), trained.config)
-    made.restore(checkpoint.load(trained.folder))
-    return made
 
 
 def quats(trainer, body):
