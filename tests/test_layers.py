@@ -73,7 +73,7 @@ ALLOWED = {
     "evaluation": {"motion", "terminal", "scene", "data", "playback", "render"},
     "film": {"motion", "scene", "data", "color", "formats", "raster", "playback", "render"},
     "language": {"scene", "data", "search", "playback", "render"},
-    "train": {"motion", "motion_fit", "scene", "data", "raster", "config", "model", "render"},
+    "train": {"motion", "motion_fit", "scene", "data", "raster", "config", "model", "render", "shapes"},
     "masks": {"data", "language"},
     "worker": {"scene", "raster", "playback", "formats", "editing", "protocol", "render", "language", "contact"},
     "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train", "shapes", "contact"},

@@ -20,6 +20,7 @@ from ..model.tracks import Tracks
 from ..motion import rotations
 from ..raster.arrays import to_host
 from ..scene import cameras, sampling, spherical_harmonics
+from ..shapes import directions as even_directions
 from . import ball_outlines, ball_texture, train_views
 from .ball_outlines import Ball
 from .ball_texture import Alignment, SurfacePixels
@@ -160,7 +161,7 @@ def _place(trainer: Trainer, tracks: Tracks, body: int, ball: Ball, found: Align
     rows = torch.nonzero(trainer.gaussians.motion_ids == body)[:, 0]
     if len(rows) == 0:
         return
-    outward = ball_texture.nodes(len(rows))
+    outward = even_directions.sphere(len(rows))
     gap = ball.radius * np.sqrt(4 * np.pi / len(rows))
     frame = rotations.multiply(rotations.conjugate(found.quats[0]), quats[0])  # from that of the ball to the texture's
     colors = found.colors(rotations.rotate(frame[None], outward))

@@ -19,6 +19,7 @@ from scipy import linalg
 
 from ..motion import rotations
 from ..scene import spherical_harmonics
+from ..shapes import directions as even_directions
 from .ball_outlines import second_differences
 
 COARSE, FINE = (40, 80), 160  # numbers of nodes, one after another
@@ -73,14 +74,6 @@ class Alignment:
         return np.clip(np.exp(_bumps(directions, len(self.texture)) @ self.texture + self.mean), 0, 1)
 
 
-def nodes(count: int) -> np.ndarray:
-    """Return evenly spread unit vectors. [N, 3]"""
-    k = np.arange(count) + 0.5
-    z, angle = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
-    wide = np.sqrt(1 - z * z)
-    return np.stack([wide * np.cos(angle), wide * np.sin(angle), z], -1)
-
-
 def align(pixels: SurfacePixels, quats: np.ndarray, times: np.ndarray) -> Alignment:
     """Find the rotations at which one texture explains the images.
 
@@ -110,7 +103,7 @@ def in_frame_of(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 def _bumps(directions: np.ndarray, count: int) -> np.ndarray:
     """Values of the nodes' functions at directions in the ball. [P, 3] -> [P, N]"""
-    return np.exp(count / WIDTH * (directions @ nodes(count).T - 1))
+    return np.exp(count / WIDTH * (directions @ even_directions.sphere(count).T - 1))
 
 
 def _shade(directions: np.ndarray) -> np.ndarray:
@@ -153,7 +146,7 @@ class _Fit:
 
     def __init__(self, pixels: SurfacePixels, count: int, quats: np.ndarray, times: np.ndarray):
         self._pixels, self._count = pixels, count
-        self._nodes, self._shade = nodes(count), _shade(pixels.directions)
+        self._nodes, self._shade = even_directions.sphere(count), _shade(pixels.directions)
         self._bend, self._steps = second_differences(times), np.diff(times) / np.diff(times).mean()
         bounds = np.searchsorted(pixels.knots, np.arange(len(times) + 1))
         self._rows: Sequence[slice] = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
