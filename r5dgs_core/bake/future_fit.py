@@ -8,16 +8,12 @@ import numpy as np
 
 from ..motion import torque_free_rotation
 from ..motion.history import PoseErrors
-from ..motion_fit import model_selection, shared_gravity
+from ..motion_fit import model_selection, pose_weights, shared_gravity
 from ..motion_fit import noise as noises
 from ..scene import visibility
 from ..scene.scene import Scene
 from ..scene.splats import to_opacities
 from ..scene.world_axes import UP_AXIS
-from . import pose_errors
-
-# Share of the usual errors of the poses below which laws do not differ (docs/results/predicted_motion.md).
-SCATTER = 0.5
 
 
 def share_gravity(
@@ -54,11 +50,9 @@ def fit(
     opacities = to_opacities(scene.gaussians.opacity_logits[members])
     body = torque_free_rotation.inertia(scene.gaussians.means[members][visibility.seen(opacities)].astype(np.float64))
     radius, turns = scene.groups[group].model.radius, bool(np.any(poses[:, 1:4] != 0))
-    weights, drift = observed.astype(np.float64), (0.0, 0.0)
-    if errors is not None:
-        weights, drift = pose_errors.weights(errors, observed, radius, turns), pose_errors.drift(errors, observed)
-        noise = max(noise[0], SCATTER * drift[0]), max(noise[1], SCATTER * drift[1])
-    track = shared_gravity.BodyTrack(scene.tracks.times, poses[:, :4], poses[:, 4:], weights)
+    known = pose_weights.from_errors(errors, observed, radius, turns)
+    noise = max(noise[0], known.noise[0]), max(noise[1], known.noise[1])
+    track = shared_gravity.BodyTrack(scene.tracks.times, poses[:, :4], poses[:, 4:], known.weights)
     found = model_selection.fit(
         track.times,
         track.quats,
@@ -67,7 +61,7 @@ def fit(
         weights=track.weights,
         inertia=body,
         least_noise=noises.of_images(radius, *noise),
-        drift=drift if turns else (drift[0], 0.0),
+        drift=known.drift,
         up=UP_AXIS.get(scene.world_convention),
     )
     return track, dataclasses.replace(found, history=dataclasses.replace(found.history, errors=errors))

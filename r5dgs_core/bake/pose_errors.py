@@ -42,7 +42,6 @@ FACTORS = (1.6, 2.0)  # ratios of measured errors to deviations, for displacemen
 UNEXPLAINED = 0.5  # misfit above which the rotations are unknown, as a share of the contrast of the texture
 LARGE = 2.0  # misfit that may count as unexplained, relative to the root mean square misfit of all pixels
 UNKNOWN = UNKNOWN_TURN  # also the standard deviation of an unknown displacement, radii
-EXACT = 1e-6  # error that cannot be distinguished from zero, rad or radii
 
 
 @dataclass(frozen=True)
@@ -268,31 +267,3 @@ def with_unseen(errors: PoseErrors, unseen: Unseen) -> PoseErrors:
     turn, count = np.array(errors.turn), len(unseen.axes)
     every = np.sqrt(((3 - count) * turn**2 + count * UNKNOWN**2) / 3) if count < 3 else UNKNOWN
     return dataclasses.replace(errors, turn=tuple(np.where(np.isinf(turn), turn, every).tolist()))
-
-
-def weights(errors: PoseErrors, observed: np.ndarray, radius: float, turns: bool) -> np.ndarray:
-    """Return weights of the poses of a track, 1 for the usual ones and less for those with larger errors. [S]
-
-    Args:
-        errors: Errors of the poses.
-        observed: Knots to use; others get the weight 0. [S] bool
-        radius: Radius of the body, world units.
-        turns: False if its rotations are not used.
-    """
-    variances = (np.array(errors.place) / radius) ** 2
-    if turns:
-        variances = variances + 2 / 3 * np.array(errors.turn) ** 2
-    variances = np.maximum(variances, EXACT**2)
-    used = observed & np.isfinite(variances)
-    if not used.any():
-        return observed.astype(np.float64)
-    share = np.where(used, variances, np.inf) / float(np.median(variances[used]))
-    return np.minimum(2 / (1 + share), 1.0)
-
-
-def drift(errors: PoseErrors, observed: np.ndarray) -> tuple[float, float]:
-    """Return the usual errors of displacements, world units, and rotations, rad; zero if no image shows the body."""
-    used = observed & np.isfinite(errors.turn)
-    if not used.any():
-        return 0.0, 0.0
-    return float(np.median(np.array(errors.place)[used])), float(np.median(np.array(errors.turn)[used]))

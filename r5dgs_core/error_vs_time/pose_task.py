@@ -13,9 +13,10 @@ from .. import timing
 from ..data.dataset import GroundTruth
 from ..evaluation import ground_truth_poses, metrics
 from ..motion import models, rigid_fit, se3, torque_free_rotation
-from ..motion_fit import candidates, model_selection, noise
+from ..motion_fit import candidates, model_selection, noise, pose_weights
 from ..playback import group_dynamics, modes, scene_player
 from ..scene.scene import MotionGroup, Scene
+from ..scene.world_axes import UP_AXIS
 from .report_rows import Row, spread
 from .task import Goal, Panel, Task, percent
 
@@ -146,24 +147,27 @@ def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -
         group: A motion group of role "body".
         names: Motion models to choose from, of `MODELS`; all if None.
     """
-    track = scene.tracks.poses[group.id]
+    track, radius = scene.tracks.poses[group.id], group.model.radius
     first, last = group.seen or (-np.inf, np.inf)
-    rows, weights = group_dynamics.opaque_members(scene, np.flatnonzero(scene.gaussians.motion_ids == group.id))
+    rows, opacities = group_dynamics.opaque_members(scene, np.flatnonzero(scene.gaussians.motion_ids == group.id))
     # Only a free top needs the inertia, so it is computed only if that model is a candidate.
     shape = None
     if names is None or names == (candidates.FREE_TOP.name,):
-        shape = torque_free_rotation.inertia(scene.gaussians.means[rows] - group.pivot, weights)
+        shape = torque_free_rotation.inertia(scene.gaussians.means[rows] - group.pivot, opacities)
         shape = shape + _MIN_MOMENT * np.eye(3)
     seen = (scene.tracks.times >= first - _SAME) & (scene.tracks.times <= last + _SAME)
+    known = pose_weights.from_errors(group.history.errors, seen, radius, bool(np.any(track[:, 1:4] != 0)))
     return model_selection.fit(
         scene.tracks.times,
         track[:, :4],
         track[:, 4:],
-        radius=group.model.radius,
-        weights=seen.astype(np.float64),
+        radius=radius,
+        weights=known.weights,
         candidates=names,
         inertia=shape,
-        least_noise=noise.of_images(group.model.radius),
+        least_noise=noise.of_images(radius, *known.noise),
+        drift=known.drift,
+        up=UP_AXIS.get(scene.world_convention),
     )
 
 

@@ -1,6 +1,5 @@
 """Errors of observed poses from images: as large as real errors, infinite without views, weights of a fit."""
 
-import dataclasses
 
 import numpy as np
 import pytest
@@ -69,26 +68,6 @@ def test_rotations_are_unknown_if_the_images_show_another_texture(monkeypatch, g
     seen = np.isfinite(found.turn)
     assert (np.array(found.turn)[seen] == pose_errors.UNKNOWN).all()
     assert (np.array(measured(monkeypatch, scene, data)[index].turn)[seen] < 0.5).all()
-
-
-def test_poses_with_large_errors_count_less_and_unseen_ones_not_at_all():
-    errors = PoseErrors((0.1, 0.1, 0.1, 0.3, np.inf, 0.1), (0.1, 0.1, 0.1, 0.3, np.inf, 0.1))
-    observed = np.array([True, True, True, True, True, False])
-    weights = pose_errors.weights(errors, observed, 1.0, True)
-    assert weights[:3].tolist() == [1, 1, 1] and weights[3] == pytest.approx(0.2) and weights[4:].tolist() == [0, 0]
-    assert pose_errors.drift(errors, observed) == (0.1, 0.1)
-    turned = dataclasses.replace(errors, turn=(9.0, 0.1, 0.1, 0.3, np.inf, 0.1))
-    assert (
-        pose_errors.weights(turned, observed, 1.0, False)[0] == 1 > pose_errors.weights(turned, observed, 1.0, True)[0]
-    )
-
-
-def test_without_any_view_all_observed_poses_count_alike():
-    errors = PoseErrors((np.inf,) * 2, (np.inf,) * 2)
-    assert pose_errors.weights(errors, np.array([True, False]), 1.0, True).tolist() == [1, 0]
-    assert pose_errors.drift(errors, np.array([True, False])) == (0, 0)
-    exact = PoseErrors((0.0,) * 2, (0.0,) * 2)
-    assert pose_errors.weights(exact, np.array([True, True]), 1.0, True).tolist() == [1, 1]
 
 
 def test_rotations_about_unseen_axes_are_stored_as_unknown():
