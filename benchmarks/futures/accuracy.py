@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -166,6 +167,25 @@ def text(row: dict[str, Any]) -> str:
     )
 
 
+def markdown(row: dict[str, Any]) -> str:
+    """Row as a line of the tables in docs/results/predicted_motion.md."""
+
+    def percent(value: float) -> str:
+        return f"{value:.1f}" if value < 99.95 else f"{value:.0f}"
+
+    cells = [
+        row["motion"],
+        str(row["draws"]),
+        f"{percent(row['error'])} ({percent(row['error_90'])})",
+        *(percent(row[key]) for key in ("line", "still")),
+        f"{row['holds']:.2f}",
+        percent(row["width"]),
+        *(f"{row[key]:.2f}" for key in ("flagged", "event")),
+        "-" if math.isnan(row["found"]) else f"{row['found']:.2f}",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
 def overall(found: list[dict[str, Any]]) -> dict[str, float]:
     """Coverage, quality of the flag, and found events, over all tracks of a noise."""
     bad = [row["flagged"] for row in found if row["error"] > scoring.BAD]
@@ -194,10 +214,11 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--tracks", type=Path, metavar="FILE", help="write the results of all tracks, as JSON")
     parser.add_argument("--merge", type=Path, nargs="+", metavar="FILE", help="tabulate files of --tracks instead")
+    parser.add_argument("--markdown", action="store_true", help="print the rows of the tables in the documentation")
     options = parser.parse_args()
     rows, totals, tracks = [], {}, []
     merged = [track for path in options.merge or () for track in json.loads(path.read_text())]
-    print(HEAD)
+    print("" if options.markdown else HEAD)
     for noise in options.noise:
         everything = []
         for name in options.motions:
@@ -210,7 +231,7 @@ def main() -> None:
                 continue
             rows.append({"draws": len(found), **summary(name, noise, found)})
             everything += found
-            print(text(rows[-1]), flush=True)
+            print(markdown(rows[-1]) if options.markdown else text(rows[-1]), flush=True)
             tracks += [{**row, "noise": noise, "motion": name} for row in found]
         totals[noise] = overall(everything)
         print(noise, {key: round(value, 3) for key, value in totals[noise].items()}, flush=True)

@@ -7,7 +7,7 @@ the body.
 The pose of least misfit has the covariance (J^T J)^-1 (sum g g^T) (J^T J)^-1. The sum is over views instead of pixels,
 because the misfits of trained Gaussians are correlated over a view. The ratio to the covariance for independent pixels
 is pooled over the knots of a body, because single knots have few views. A track also drifts together with the texture
-that is trained with it; `FACTORS` are measured ratios of true errors to these deviations. If the misfit is as large as
+that is trained with it; `FACTOR` is the measured ratio of true errors to these deviations. If the misfit is as large as
 the contrast of the texture, wrong rotations have blurred it, and the rotations are unknown.
 """
 
@@ -38,7 +38,7 @@ VIEWS = 4  # maximum number of views of a knot, spread evenly
 STEP = 0.03  # change of the pose for finite differences, rad or radii
 MARGIN = 2  # dilation of the pixels that show a body, px
 MIN_PIXELS = 8  # minimum number of pixels of a body in a view
-FACTORS = (1.6, 2.0)  # ratios of measured errors to deviations, for displacements and rotations
+FACTOR = 1.2  # ratio of measured errors to deviations, of displacements and of rotations
 UNEXPLAINED = 0.5  # misfit above which the rotations are unknown, as a share of the contrast of the texture
 LARGE = 2.0  # misfit that may count as unexplained, relative to the root mean square misfit of all pixels
 UNKNOWN = UNKNOWN_TURN  # also the standard deviation of an unknown displacement, radii
@@ -255,8 +255,8 @@ def _errors(
     blurred = inner > max(UNEXPLAINED * texture, LARGE**2 * usual * sum(look.values for look in every))
     pooled = np.mean(ratios, axis=0) if ratios else np.ones(6)
     found = []
-    for factor, part, lost in zip(FACTORS, (slice(3, 6), slice(0, 3)), (False, blurred), strict=True):
-        deviation = factor * np.sqrt(variances[:, part].mean(1) * pooled[part].mean())
+    for part, lost in ((slice(3, 6), False), (slice(0, 3), blurred)):
+        deviation = FACTOR * np.sqrt(variances[:, part].mean(1) * pooled[part].mean())
         deviation = np.where(np.isinf(deviation), deviation, UNKNOWN if lost else np.minimum(deviation, UNKNOWN))
         found.append(deviation)
     return PoseErrors(tuple((radius * found[0]).tolist()), tuple(found[1].tolist()))

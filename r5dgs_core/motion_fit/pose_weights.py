@@ -12,7 +12,7 @@ import numpy as np
 from ..motion.history import PoseErrors
 
 # Share of the usual errors of the poses below which laws do not differ (docs/results/predicted_motion.md).
-SCATTER = 0.5
+SCATTER = 0.75
 EXACT = 1e-6  # error that cannot be distinguished from zero, rad or radii
 
 

@@ -1,6 +1,5 @@
 """Errors of observed poses from images: as large as real errors, infinite without views, weights of a fit."""
 
-
 import numpy as np
 import pytest
 

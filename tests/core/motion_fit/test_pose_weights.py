@@ -15,7 +15,7 @@ def test_poses_with_large_errors_count_less_and_unseen_ones_not_at_all():
     found = pose_weights.from_errors(errors, observed, 1.0, True)
     assert found.weights[:3].tolist() == [1, 1, 1] and found.weights[3] == pytest.approx(0.2)
     assert found.weights[4:].tolist() == [0, 0]
-    assert found.drift == (0.1, 0.1) and found.noise == (0.05, 0.05)
+    assert found.drift == (0.1, 0.1) and found.noise == pytest.approx((0.075, 0.075))
 
 
 def test_errors_of_rotations_count_only_if_rotations_are_used():
