@@ -13,7 +13,7 @@ per axis. ``impact`` stops before the first contact, ``share`` after 60 % of the
 
 Errors are those of the end of the toss: place in widths, rotation in degrees. ``covered`` is the share of
 tosses whose end lies in the 90 % band, ``radius`` the median radius of the band, ``face_auroc`` how well the share of
-samples on other faces finds the predictions on a wrong face. Odd tosses tuned nothing.
+samples on other faces than the predicted one finds predictions on a wrong face. Odd tosses tuned nothing.
 """
 
 from __future__ import annotations
@@ -98,7 +98,8 @@ def study(toss: np.ndarray, until: str, samples: int, seed: int) -> dict[str, An
     center = np.median(sampled.places, axis=1)
     apart = float(np.linalg.norm(center - truth[1]))
     radius = float(sampled.radii(center, 0.9)[0])
-    row |= {"covered": apart <= radius, "radius": radius / WIDTH, "other_faces": sampled.other_faces()}
+    row |= {"covered": apart <= radius, "radius": radius / WIDTH}
+    row["other_faces"] = sampled.other_faces(found["contact"][0])
     row |= {"friction": estimate.material.friction, "restitution": estimate.material.restitution}
     return row
 

@@ -15,7 +15,7 @@ from .world import Material, State
 WIDENED = 2.0  # factor on standard deviations of a fit to poses, calibrated on tosses of a cube
 CONTRADICTS = 29.1  # squared change of the poses, in units of the widened noise; 99 % of chi2 of 14 parameters
 _ATTEMPTS = 10
-_FACE = np.pi / 4  # angle to the most central future beyond which a body lies on another face
+_FACE = np.pi / 4  # angle beyond which two rotations put a body on different faces
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,14 @@ class Futures:
         """Angles to rotations [T, 4] within which the share ``level`` of the samples lies, rad. [T]"""
         return np.quantile(rotations.angle_between(self.quats, quats[:, None]), level, axis=1)
 
-    def other_faces(self) -> float:
-        """Share of the samples whose last rotation is far from that of the most central one."""
-        last = self.quats[-1]
-        apart = rotations.angle_between(last[:, None], last[None])
-        return float((apart[np.argmin(np.median(apart, axis=1))] > _FACE).mean())
+    def other_faces(self, quat: np.ndarray) -> float:
+        """Share of the samples that end on another face than a predicted rotation. [4]"""
+        return float(on_other_face(self.quats[-1], quat).mean())
+
+
+def on_other_face(quats: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """True for rotations [..., 4] that put a body on another face than one does. [4]"""
+    return rotations.angle_between(quats, np.broadcast_to(quat, quats.shape)) > _FACE
 
 
 def draws(fitter: Fitter, estimate: Estimate, rng: np.random.Generator) -> Iterator[tuple[State, Material]]:

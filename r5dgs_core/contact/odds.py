@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
+import numpy as np
+
 from ..scene import predictability
 from ..scene.scene import Scene
-from . import recording, scene_bodies, scene_future, world
+from . import futures, recording, scene_bodies, scene_future, world
 from .recording import Recording
 from .scene_world import SceneWorld, Wishes
 
@@ -23,12 +25,14 @@ class Odds:
         rests: It comes to rest.
         leaves: It is off the plane that supports it at the end.
         hits: It touches an object before any other, by name; objects that it never touches are left out.
+        turns_over: It ends on another face than in the shown prediction; None for balls, which have no faces.
     """
 
     name: str
     rests: float
     leaves: float
     hits: dict[str, float]
+    turns_over: float | None
 
 
 def of(scene: Scene, count: int, seed: int = 0) -> list[Odds]:
@@ -48,26 +52,35 @@ def of(scene: Scene, count: int, seed: int = 0) -> list[Odds]:
     made, duration = found.world, predictability.horizon(scene) - scene.t_max
     if made is None or duration <= 0:
         return []
-    runs, futures = made.draft(scene.t_max, duration), []
+    runs, sampled = made.draft(scene.t_max, duration), []
     for state, materials in made.draws(scene.t_max, list(found.materials), wishes):
         runs.set_materials(materials)
         future = recording.record(runs, state, duration)
         if not runs.failed:
-            futures.append(future)
-    if not futures:
+            sampled.append(future)
+    if not sampled:
         return []
-    return [_odds(made, number, futures) for number, body in enumerate(made.bodies) if body.name in found.taken]
+    assert found.recording is not None
+    times, quats = found.recording.times, found.recording.quats
+    shown = quats[min(int(np.searchsorted(times, duration)), len(times) - 1)]
+    numbers = [number for number, body in enumerate(made.bodies) if body.name in found.taken]
+    return [_odds(made, number, sampled, shown[number]) for number in numbers]
 
 
-def _odds(made: SceneWorld, number: int, futures: list[Recording]) -> Odds:
-    firsts = [_first(number, future) for future in futures]
+def _odds(made: SceneWorld, number: int, sampled: list[Recording], shown: np.ndarray) -> Odds:
+    """Odds of a body; ``shown`` is its rotation at the end of the shown prediction. [4]"""
+    firsts = [_first(number, future) for future in sampled]
     hits = {
-        made.bodies[other].name: firsts.count(other) / len(futures)
+        made.bodies[other].name: firsts.count(other) / len(sampled)
         for other in sorted({first for first in firsts if first is not None})
     }
-    rests = sum(bool(future.slow[number]) for future in futures) / len(futures)
-    leaves = sum(_is_off(made, number, future) for future in futures) / len(futures)
-    return Odds(made.bodies[number].name, rests, leaves, hits)
+    rests = sum(bool(future.slow[number]) for future in sampled) / len(sampled)
+    leaves = sum(_is_off(made, number, future) for future in sampled) / len(sampled)
+    turns_over = None
+    if made.world.bodies[number].ball_radius is None:
+        ends = np.array([future.quats[-1, number] for future in sampled])
+        turns_over = float(futures.on_other_face(ends, shown).mean())
+    return Odds(made.bodies[number].name, rests, leaves, hits, turns_over)
 
 
 def _first(number: int, future: Recording) -> int | None:

@@ -14,6 +14,7 @@ def test_a_body_that_slides_into_another_touches_it_first_in_every_future():
     assert (first.name, first.hits) == ("box 1", {"box 2": 1.0})
     assert (second.name, second.hits) == ("box 2", {"box 1": 1.0})
     assert first.rests == first.leaves == 0.0  # it slid without friction
+    assert first.turns_over == second.turns_over == 0.0
 
 
 @pytest.mark.slow

@@ -1,0 +1,16 @@
+"""Samples of the motion of a body."""
+
+import numpy as np
+import pytest
+
+from r5dgs_core.contact import futures
+from r5dgs_core.motion import rotations
+
+
+@pytest.mark.parametrize(("predicted", "share"), [(0.0, 0.25), (0.5, 0.25), (np.pi / 2, 0.75)])
+def test_other_faces_are_those_that_a_prediction_does_not_show(predicted, share):
+    about_x = rotations.rotvecs_to_quats(np.array([[angle, 0.0, 0.0] for angle in (0.0, 0.1, -0.1, np.pi / 2)]))
+    found = futures.Futures(np.zeros(1), about_x[None], np.zeros((1, 4, 3)))
+    shown = rotations.rotvecs_to_quats(np.array([predicted, 0.0, 0.0]))
+    assert found.other_faces(shown) == share
+    assert found.other_faces(-shown) == share
