@@ -7,9 +7,10 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
-from ..contact import held_out, restitution, scene_future
+from ..contact import held_out, scene_future
 from ..contact.scene_future import Prediction
 from ..errors import BackendError, Interrupted, R5dgsError
+from ..motion import restitution
 from ..scene import slipped_rotations
 from .draft import Context, Draft, Need
 

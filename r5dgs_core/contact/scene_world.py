@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..motion import models
+from ..motion import models, restitution
 from ..scene import world_axes
 from ..scene.scene import Scene
 from ..shapes import boxes, solid
-from . import edges, floors, futures, held_out, restitution, scene_bodies, stepping, support, world
+from . import edges, floors, futures, held_out, scene_bodies, stepping, support, world
 from .held_out import Comparison
 from .identify import Estimate, Fitter
 from .scene_bodies import SceneBody
@@ -235,14 +235,14 @@ def _misfit(estimate: Estimate | None) -> str:
 def _body(scene: Scene, body: SceneBody, below: Plane | None, pushed: bool, gravity: np.ndarray) -> Body:
     """Shape and floor of a body."""
     if below is None:
-        return Body(body.solid, fixed=not (body.moves or pushed))
+        return Body(body.solid) if body.moves or pushed else Body(body.solid, world.NEUTRAL, fixed=True)
     own = Body(body.solid)
     if body.moves:
         return dataclasses.replace(own, floor=floors.of(own, below, scene_bodies.track(scene, body), gravity))
     gap = float((body.solid.vertices @ below.normal).min()) - below.height
     stands = abs(gap) <= _STANDS * body.solid.size and body.group.id
     if not stands and not pushed:
-        return dataclasses.replace(own, fixed=True)
+        return dataclasses.replace(own, material=world.NEUTRAL, fixed=True)
     if not stands and gap > 0:  # it stands on something else
         return own
     points, floor = solid.with_flat_foot(body.solid.vertices, below.normal)

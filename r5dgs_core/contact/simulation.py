@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from .. import errors, extras
-from ..motion import rotations
-from . import restitution
+from ..motion import restitution, rotations
+from . import world as worlds
 from .flights import ROUND, Flights
 from .stepping import Stepping
 from .world import Body, Material, State, World
@@ -76,10 +76,9 @@ class Simulation:
         """Set the materials of the B bodies."""
         model, frequency, least = self.model, self.stepping.frequency, self.stepping.least_restitution
         for pair, bodies in enumerate(self._pairs):
-            own = [materials[i] for i in bodies]
-            friction = max(material.friction for material in own)
-            reference = restitution.reference(max(min(material.restitution for material in own), least), frequency)
-            model.pair_friction[pair, :2] = min(max(friction, _LEAST_FRICTION), _MOST_FRICTION)
+            shared = worlds.combined([materials[i] for i in bodies])
+            reference = restitution.reference(max(shared.restitution, least), frequency)
+            model.pair_friction[pair, :2] = min(max(shared.friction, _LEAST_FRICTION), _MOST_FRICTION)
             model.pair_solref[pair] = reference
             model.pair_solreffriction[pair] = restitution.grip(reference)
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..motion import restitution as bounces
 from ..motion import rotations
 from ..shapes.solid import Solid
 
 
 @dataclass(frozen=True)
 class Material:
-    """Contact parameters of a body. A contact has the larger friction and the smaller restitution of its two bodies.
+    """Contact parameters of a body, as they are on the ground and on fixed bodies.
 
     Attributes:
         friction: Coulomb coefficient, >= 0.
@@ -20,7 +23,19 @@ class Material:
     """
 
     friction: float = 0.3
-    restitution: float = 0.3
+    restitution: float = bounces.ASSUMED
+
+
+NEUTRAL = Material(0.0, 1.0)  # of fixed bodies: a contact with them has the material of the other body
+
+
+def combined(materials: Sequence[Material]) -> Material:
+    """Material of a contact of one body with the ground, or of two: the larger friction, the product of restitutions.
+
+    Source: Blender's Bullet multiplies restitutions. MuJoCo has the larger friction; a product would let bodies slip
+        off each other that hold on the ground.
+    """
+    return Material(max(one.friction for one in materials), math.prod(one.restitution for one in materials))
 
 
 @dataclass(frozen=True)

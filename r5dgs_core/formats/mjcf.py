@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from .. import atomic_files
-from ..motion import rotations
+from ..motion import restitution, rotations
 from ..scene.scene import Scene
 from . import registry, rigid_bodies
 from .rigid_bodies import RigidBody
@@ -18,7 +18,6 @@ from .rigid_bodies import RigidBody
 KEY = "start"  # name of the keyframe
 _TORSION = (0.005, 0.0001)  # MuJoCo's torsional and rolling friction
 _TOGETHER, _ON_GROUND = 1, 2  # bits of the contacts between bodies, and of those with the common ground
-_DAMPING = 0.49723939470  # damping ratio of contacts with the restitution assumed for fixed bodies, 0.3
 _IMPEDANCE = (0.99, 0.99, 0.001, 0.5, 2.0)  # constant, so that solref alone determines the restitution
 
 
@@ -101,25 +100,24 @@ def _add_contacts(root: ElementTree.Element, world: ElementTree.Element, bodies:
         place = {"pos": numbers(own.height * own.normal), "zaxis": numbers(own.normal), "size": "0 0 1"}
         add(world, "geom", place, name=ground, type="plane", contype="0", conaffinity="0")
         for name, other in ((ground, body), *((other.name, other) for other in (*simulated[:number], *others))):
-            mu = numbers([max(body.friction, other.friction)] * 2 + [_TORSION[0]] + [_TORSION[1]] * 2)
-            pair = {key: numbers(values) for key, values in _softer(body, other).items()}
+            friction = max(body.friction, other.friction if other.moves else 0.0)
+            mu = numbers([friction] * 2 + [_TORSION[0]] + [_TORSION[1]] * 2)
+            pair = {key: numbers(values) for key, values in _contact(body, other).items()}
             add(pairs, "pair", pair, geom1=name, geom2=body.name, condim="3", friction=mu)
 
 
-def _softer(body: RigidBody, other: RigidBody) -> dict[str, Iterable[float]]:
-    """Numbers of the contact of a simulated body with another body: those of the smaller restitution.
+def _contact(body: RigidBody, other: RigidBody) -> dict[str, Iterable[float]]:
+    """Numbers of the contact of a simulated body with its ground, if ``other`` is the body itself, or another body.
 
-    Simulations assume one for fixed bodies.
+    As in simulations, restitutions are multiplied, and those of the ground and of fixed bodies are one.
     """
     own = body.contacts
     assert own is not None
-    if other.contacts is None:
-        damping = min(own.solref[1], -2 * _DAMPING * math.sqrt(-own.solref[0]))
-        solref, grip = (own.solref[0], damping), (own.solreffriction[0], min(own.solreffriction[1], damping))
-    else:
-        softer = min((body, other), key=lambda one: 1.0 if one.restitution is None else one.restitution).contacts
-        assert softer is not None
-        solref, grip = softer.solref, softer.solreffriction
+    solref, grip = own.solref, own.solreffriction
+    if other is not body and other.moves and body.restitution is not None:
+        others = restitution.ASSUMED if other.restitution is None else other.restitution
+        solref = restitution.reference(body.restitution * others, math.sqrt(-own.solref[0]))
+        grip = restitution.grip(solref)
     return {"solref": solref, "solreffriction": grip, "solimp": _IMPEDANCE}
 
 

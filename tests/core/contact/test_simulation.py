@@ -89,14 +89,22 @@ def test_a_collision_of_two_balls_with_enough_friction_ends_their_slip(e):
     assert abs(slip) < 0.1 * 0.2
 
 
-def test_of_two_bodies_the_rougher_and_the_less_elastic_one_count():
+def test_two_bodies_have_the_friction_of_the_rougher_one_and_the_product_of_their_restitutions():
     balls = contacts.ball([0, 0, 0], 0.2, 0.9), contacts.ball([1.5 * SIZE, 0, 0], 0.7, 0.5)
     runs, state = contacts.simulate(world.World(balls, None, np.zeros(3)))
     assert runs.model.pair_friction[0, 0] == 0.7
     state.velocities[0, 0] = 1.0
     runs.load(state)
     runs.advance(0.5)
-    assert runs.state().velocities[:, 0] @ [-1, 1] == pytest.approx(0.5, abs=0.02)
+    assert runs.state().velocities[:, 0] @ [-1, 1] == pytest.approx(0.45, abs=0.02)
+
+
+def test_the_ground_and_fixed_bodies_leave_the_material_to_the_other_body():
+    table = contacts.box([0, 0, 0], fixed=True, friction=world.NEUTRAL.friction, restitution=world.NEUTRAL.restitution)
+    runs = contacts.simulate(contacts.on_plane(table, contacts.ball([1, 1, 1], 0.1, 0.8)))[0]
+    table_pair, ground_pair = runs.model.pair_solref
+    np.testing.assert_allclose(table_pair, ground_pair)
+    np.testing.assert_allclose(runs.model.pair_friction[:, :2], 0.1)
 
 
 def test_bodies_of_equal_density_have_masses_by_volume():

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.bake import contact
-from r5dgs_core.contact import restitution, scene_future, scene_world
-from r5dgs_core.contact.world import Material
+from r5dgs_core.contact import scene_future, scene_world
 from r5dgs_core.formats import mjcf, registry, rigid_bodies
 from r5dgs_core.motion import rotations
 from r5dgs_core.scene.units import Units
@@ -111,10 +110,6 @@ def above_a_table(made):
 
 def falling_box():
     return contact_scenes.scene(contact_scenes.falling())
-
-
-def test_contacts_with_fixed_bodies_have_the_restitution_that_simulations_assume_for_them():
-    assert restitution.of_damping(mjcf._DAMPING) == pytest.approx(Material().restitution, rel=1e-9)
 
 
 @pytest.mark.slow

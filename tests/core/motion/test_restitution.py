@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from r5dgs_core.contact import restitution
+from r5dgs_core.motion import restitution
 
 
 @pytest.mark.parametrize("e", [0.05, 0.1, 0.3, math.exp(-2), 0.5, 0.7, 0.9, 0.98])

@@ -10,6 +10,7 @@ import functools
 import math
 
 _GRIP = math.log(20) / (2 * math.pi)  # damping ratio of friction, at least: a bounce of time pi / w leaves 1 / 20
+ASSUMED = 0.3  # of bodies about whose restitution nothing is known
 LEAST, MOST = 0.05, 0.98  # range of e in which simulated impacts keep it to 0.01
 _HEAVY = 50.0  # damping ratio above which nothing bounces
 
