@@ -25,6 +25,7 @@ WORLD, GROUND = "world", "ground"  # names that the files use; MuJoCo reserves t
 DENSITY = 1000.0  # unknown; masses of bodies are proportional to their volumes
 FRICTION = 0.3  # of bodies whose friction is unknown
 _UNIT = 1e-3  # largest difference of the length of a normal from 1
+_STANDS = 0.15  # of the size: distance from the ground up to which a body stands on it
 _NEAR = 0.2  # of the size: distance up to which the centre of rotation in flight replaces the centre of the hull
 
 
@@ -60,7 +61,7 @@ class RigidBody:
         quat: Rotation from the body's frame to the world, unit wxyz. [4]
         velocity: Of the centre of mass. [3]
         spin: Angular velocity, world axes. [3]
-        moves: False for an object without motion of its own.
+        moves: False for an object without motion of its own, and for one that never moves nor stands on the ground.
         friction: Coulomb coefficient of its contacts, `FRICTION` if it is unknown.
         restitution: Speed after an impact over the speed before it, or None if it is unknown.
         contacts: Ground and contacts of the simulation of its motion, or None if it was not simulated.
@@ -113,6 +114,7 @@ def of(scene: Scene, t: float, options: registry.Options, as_simulated: bool = F
     turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
     axes, length, time = rotations.rotmats_to_quats(turn), scene.units.meters_per_unit or 1.0, _time_unit(scene)
     found, materials, simulated = [], _materials(scene), _simulated(scene, t) if as_simulated else {}
+    floor = _ground_height(scene)
     for (hull, body), name in zip(chosen, names, strict=True):
         group, contacts = scene.groups[hull.motion_id], simulated.get(hull.object_id)
         if contacts is not None and contacts.flat_foot:
@@ -136,7 +138,7 @@ def of(scene: Scene, t: float, options: registry.Options, as_simulated: bool = F
                 rotations.multiply(rotations.multiply(axes, quat), rotations.conjugate(axes)),
                 length / time * turn @ velocity,
                 turn @ spin / time,
-                hull.motion_id > 0,
+                contacts is not None or not _is_fixed(group, scene.tracks.poses[group.id], body, turn[2], floor),
                 *materials.get(hull.object_id, (FRICTION, None)),
                 contacts,
             )
@@ -155,8 +157,30 @@ def gravity(scene: Scene) -> np.ndarray:
 
 def ground_height(scene: Scene) -> float | None:
     """Height of the plane under the bodies in the units of a file, z up, or None; see `ground.height`."""
-    found = ground.height(scene, [hull for hull, _ in _solids(_hulls(scene))])
+    found = _ground_height(scene)
     return None if found is None else found * (scene.units.meters_per_unit or 1.0)
+
+
+def _ground_height(scene: Scene) -> float | None:
+    return ground.height(scene, [hull for hull, _ in _solids(_hulls(scene))])
+
+
+def _is_fixed(group: MotionGroup, poses: np.ndarray, body: Solid, up: np.ndarray, floor: float | None) -> bool:
+    """Return True for a body of the background, and for one that never moves and does not stand on the ground.
+
+    Simulations of contacts fix these bodies, too.
+
+    Args:
+        group: Motion group of the body.
+        poses: Its observed poses. [S, 7]
+        body: Its shape.
+        up: Upward unit vector. [3]
+        floor: Height of the ground along it, or None.
+    """
+    carried = group.parent is not None or group.follows is not None or group.joint is not None
+    if not group.id or carried or group.model.kind != "static" or poses[:, 1:].any():
+        return not group.id
+    return floor is None or abs(float((body.vertices @ up).min()) - floor) > _STANDS * body.size
 
 
 def time_step(scene: Scene) -> float:

@@ -244,3 +244,9 @@ def test_the_ground_is_below_all_observed_places_and_missing_if_nothing_rests(th
     lowest = min(float(corners[:, 2].min()) for corners in posed(scene, scene.t_max))
     assert ground.height(scene, scene.hulls) == pytest.approx(lowest) and lowest < -0.05
     assert ground.height(thrown, thrown.hulls) is None and ground.MISSING in mjcf.FORMAT.losses(thrown, OPTIONS)
+
+
+def test_objects_that_never_move_are_fixed_unless_they_stand_on_the_ground():
+    boxes = [contact_scenes.falling(), contact_scenes.resting(1.0), contact_scenes.resting(2.0)]
+    lamp = contact_scenes.with_hull(contact_scenes.scene(*boxes), 3, [2.0, 0.2, 1.5], [0.4, 0.4, 0.4])
+    assert [body.moves for body in rigid_bodies.of(lamp, lamp.t_max, OPTIONS)] == [True, True, False]
