@@ -6,6 +6,7 @@ ray passes through it.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,7 @@ _DEEP = 0.3  # points farther below a plane, in sizes, show that it is empty abo
 _LAYER = 0.1  # points nearer to a plane, in sizes, are part of it
 _CELL = 0.15  # edge length of a cell, in sizes
 _REACH = 12.0  # distance up to which a support is searched, in sizes
+_STRIP = 0.75  # half width of the part of a surface, in sizes, that shows its border at a path
 _HOLES = 0.15  # share of empty cells above which a support is not convex
 _SEEN = 0.3  # opacity of a Gaussian that may carry a body
 
@@ -135,9 +137,39 @@ def _find(scene: Scene, plane: Plane, path: np.ndarray, size: float) -> Edge | N
     holes, solid = (np.count_nonzero(np.linalg.norm(x - place, axis=1) < _UNDER * size) for x in (empty, carried))
     if holes < max(2 * solid, 4):
         return None
-    outline = corners[hull.vertices] @ flat.T + plane.height * normal
+    side = hull.equations[np.argmax(place @ hull.equations[:, :2].T + hull.equations[:, 2]), :2]
+    shape = _trimmed(corners[hull.vertices], side, track[[0, beyond[0]]], carried, empty, size)
+    outline = shape @ flat.T + plane.height * normal
     low = surface[near & (heights < -_DEEP * size)]
     return Edge(outline, support.level(low, normal, size))
+
+
+def _trimmed(
+    corners: np.ndarray, out: np.ndarray, path: np.ndarray, carried: np.ndarray, empty: np.ndarray, size: float
+) -> np.ndarray:
+    """Cut a convex outline back where a path leaves it, as noise widens it. [V, 2] -> [V', 2]
+
+    Args:
+        corners: Corners of the outline, in order.
+        out: Outward unit normal of its side there. [2]
+        path: Start of the path, and its first place that is clearly beyond that side. [2, 2]
+        carried, empty: Points of the surface, and points where nothing is. [P, 2] each
+        size: Size of the body.
+    """
+    start, place = path
+    points = np.concatenate([carried, empty]) - place
+    close = (np.abs(points @ [-out[1], out[0]]) < _STRIP * size) & (np.abs(points @ out) < size)
+    across = points[close] @ out
+    order = np.argsort(across)
+    signs = np.repeat([1, -1], [len(carried), len(empty)])[close][order]
+    border = max(across[order][np.argmax(np.cumsum(signs))], (start - place) @ out)  # beyond it, most are empty
+    reach = (corners - place) @ out - border
+    cut = [corners[reach <= 0]]
+    for a, b in itertools.pairwise([*range(len(corners)), 0]):
+        if reach[a] * reach[b] < 0:
+            cut.append(corners[a : a + 1] + reach[a] / (reach[a] - reach[b]) * (corners[b] - corners[a]))
+    left = np.concatenate(cut)
+    return left[spatial.ConvexHull(left).vertices]
 
 
 def _part(carried: np.ndarray, empty: np.ndarray, start: np.ndarray, size: float) -> np.ndarray | None:

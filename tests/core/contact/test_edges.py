@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import spatial
 
 from r5dgs_core.bake import contact
 from r5dgs_core.contact import edges, scene_bodies, scene_future, scene_world, simulation, stepping, support, world
@@ -47,6 +48,16 @@ def test_a_body_whose_law_is_no_free_motion_falls_off_the_edge_if_contacts_expla
     assert scene_bodies.of(scene)[0][0].reason
     found = scene_future.predict(scene, Wishes(samples=1))
     assert found.leaving == "box 1" and bool(found.taken) == leaves
+
+
+def test_noise_does_not_widen_a_support_where_a_body_leaves_it():
+    pixels = np.stack(np.meshgrid(*[np.linspace(-2, 2, 81)] * 2), -1).reshape(-1, 2)
+    solid = pixels[:, 0] + np.random.default_rng(0).normal(0, 0.1, len(pixels)) < 0.5
+    corners = pixels[solid][spatial.ConvexHull(pixels[solid]).vertices]
+    path = np.array([[-1.0, 0.0], [0.9, 0.0]])
+    found = edges._trimmed(corners, np.array([1.0, 0.0]), path, pixels[solid], pixels[~solid], 1.0)
+    assert corners[:, 0].max() > 0.65 and found[:, 0].max() == pytest.approx(0.5, abs=0.05)
+    np.testing.assert_array_equal(found.min(axis=0), corners.min(axis=0))
 
 
 @pytest.mark.parametrize(("speed", "border"), [(1.0, 2.0), (0.2, 0.5), (-2.0, 0.5)], ids=["far", "slow", "away"])
