@@ -13,7 +13,8 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core import errors
-from ...r5dgs_core.motion import confidence, models, rotations, torque_free_rotation
+from ...r5dgs_core.formats import rigid_bodies
+from ...r5dgs_core.motion import confidence, models, restitution, rotations, torque_free_rotation
 from ...r5dgs_core.motion.history import EMPTY as NO_HISTORY
 from ...r5dgs_core.motion.history import Band, History
 from ...r5dgs_core.motion.models import MotionModel
@@ -45,7 +46,7 @@ def remember(
         tolerance: Maximum error of the keys, as a fraction of the scene's extent.
         reaches: Reach of the motion groups, from `keyframes.reaches`. [G]
     """
-    extent = scene.extent
+    extent, materials = scene.extent, rigid_bodies.materials(scene)
     for (_, motion_id), anchor in anchors.items():
         group = scene.groups[motion_id]
         leader = anchors.get((0, group.follows)) if group.follows else None
@@ -61,6 +62,10 @@ def remember(
                 "allowed": tolerance * extent,
             }
         )
+        if group.object_id in materials and motion_id:
+            friction, bounciness = materials[group.object_id]
+            anchor.r5dgs_contact.friction = friction
+            anchor.r5dgs_contact.bounciness = restitution.ASSUMED if bounciness is None else bounciness
         state.frames_per_unit = scene.frames_per_unit
         state.leader = state.learned_leader = leader
         set_fields(state, group.own_model)

@@ -113,7 +113,7 @@ def of(scene: Scene, t: float, options: registry.Options, as_simulated: bool = F
     start = {(one.object_id, one.group): one for one in object_poses.at(scene, (t,))}
     turn = cameras.WORLD_TO_BLENDER[scene.world_convention]
     axes, length, time = rotations.rotmats_to_quats(turn), scene.units.meters_per_unit or 1.0, _time_unit(scene)
-    found, materials, simulated = [], _materials(scene), _simulated(scene, t) if as_simulated else {}
+    found, own, simulated = [], materials(scene), _simulated(scene, t) if as_simulated else {}
     floor = _ground_height(scene)
     for (hull, body), name in zip(chosen, names, strict=True):
         group, contacts = scene.groups[hull.motion_id], simulated.get(hull.object_id)
@@ -139,7 +139,7 @@ def of(scene: Scene, t: float, options: registry.Options, as_simulated: bool = F
                 length / time * turn @ velocity,
                 turn @ spin / time,
                 contacts is not None or not _is_fixed(group, scene.tracks.poses[group.id], body, turn[2], floor),
-                *materials.get(hull.object_id, (FRICTION, None)),
+                *own.get(hull.object_id, (FRICTION, None)),
                 contacts,
             )
         )
@@ -209,7 +209,7 @@ def simulator_losses(scene: Scene, options: registry.Options) -> list[str]:
     return [*losses(scene, options), *unknown, ground.MISSING if ground_height(scene) is None else ground.LOSS]
 
 
-def _materials(scene: Scene) -> dict[int, tuple[float, float | None]]:
+def materials(scene: Scene) -> dict[int, tuple[float, float | None]]:
     """Friction and restitution that contacts were simulated with, by id of the object."""
     found: dict[int, tuple[float, float | None]] = {}
     for row in scene.needs:
