@@ -14,6 +14,7 @@ from . import directions
 _SOFT = 0.01  # deviation, as a share of the radius, from which on planes count less
 _ROUNDS = (8.0, 4.0, 2.0, 1.0)  # factors of it, one fit after another, so that the first guess does not matter
 _ALIKE = 0.03  # median deviation, as a share of the radius, up to which an object is a ball; that of a cube is 0.05
+_WHOLE = 0.04  # the same including the side of what sticks out; `_ALIKE` holds for the other side
 _FLAT = 0.2  # share of the planes that may be closer to the centre by more: a hemisphere is no ball
 
 
@@ -38,9 +39,21 @@ def of(normals: np.ndarray, reach: np.ndarray) -> np.ndarray | None:
     shifted, x = (reach - normals @ middle) / scale, np.array([0.0, 0.0, 0.0, 1.0])
     for factor in _ROUNDS:
         x = least_squares(lambda y: columns @ y - shifted, x, loss="cauchy", f_scale=factor * _SOFT).x
-    deviations = columns @ x - shifted
-    if np.median(np.abs(deviations)) > _ALIKE or np.mean(deviations > _ALIKE) > _FLAT:
+    if not _is_ball(normals, columns @ x - shifted):
         return None
     corners = directions.sphere(MAX_VERTICES)
     radius = float(x[3]) * np.cbrt(4 / 3 * np.pi / ConvexHull(corners).volume)
     return middle + scale * (x[:3] + radius * corners)
+
+
+def _is_ball(normals: np.ndarray, deviations: np.ndarray) -> bool:
+    """Return True if planes touch a ball, except on one side. [P, 3], [P]
+
+    Gaussians in the space that no camera sees stick out on one side, the longer end of an egg on two.
+    """
+    beyond = normals.T @ np.maximum(-deviations, 0.0)
+    apart = np.abs(deviations)
+    alike = np.median(apart) <= _ALIKE or (
+        np.median(apart) <= _WHOLE and np.median(apart[normals @ beyond <= 0]) <= _ALIKE
+    )
+    return bool(alike and np.mean(deviations > _ALIKE) <= _FLAT)

@@ -44,6 +44,15 @@ def test_what_fills_the_space_between_a_ball_and_its_support_does_not_count(wide
     assert_ball(balls.of(*planes(supported(wide))))
 
 
+def test_rough_outlines_and_a_filled_space_below_a_ball_together_leave_it_a_ball():
+    normals, reach = planes(supported(0.6))
+    rough = reach + RADIUS * np.random.default_rng(0).normal(0, 0.028, len(reach))
+    assert np.median(np.abs((rough - normals @ CENTER) / RADIUS - 1)) > balls._ALIKE
+    found = balls.of(normals, rough)
+    np.testing.assert_allclose(found.mean(axis=0), CENTER, atol=0.03 * RADIUS)
+    assert solid.of(found).volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.05)
+
+
 def cylinder(height):
     turns = np.linspace(0, 2 * np.pi, 60)
     ring = np.stack([np.cos(turns), np.sin(turns), np.zeros(60)], axis=1)
