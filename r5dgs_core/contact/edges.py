@@ -52,18 +52,29 @@ def first(scene: Scene, bodies: list[SceneBody], numbers: list[int], end: float,
     ground = _Ground.of(scene, up)
     for number in numbers:
         body = bodies[number]
-        path = scene_bodies.predicted(body, np.linspace(0, max(end - scene.t_max, 0.0), _TIMES))[1]
         size = body.solid.size
-        carried = [ground.carries(place, size) for place in path]
-        if not carried[0] or all(carried):  # decided without drawing pictures
+        paths = [path for path in _paths(scene, body, end) if ground.is_left(path, size)]
+        if not paths:  # decided without drawing pictures
             continue
         plane = _plane(scene, body, up)
         if plane is None or not held_out.in_contact(scene, body, plane):
             continue
-        edge = _find(scene, plane, path, size)
-        if edge is not None:
-            return Leave(number, plane, edge)
+        for path in paths:
+            edge = _find(scene, plane, path, size)
+            if edge is not None:
+                return Leave(number, plane, edge)
     return None
+
+
+def _paths(scene: Scene, body: SceneBody, end: float) -> list[np.ndarray]:
+    """Paths on which a body may move off its support, at equal steps of time. [T, 3] each
+
+    They are that of its law and, if the law is that of a driven body, the straight one with its velocity: drift of a
+    rolling ball's poses looks like a force.
+    """
+    path = scene_bodies.predicted(body, np.linspace(0, max(end - scene.t_max, 0.0), _TIMES))[1]
+    straight = path[0] + np.arange(_TIMES)[:, None] * (path[1] - path[0])
+    return [path, straight] if body.reason else [path]
 
 
 def _plane(scene: Scene, body: SceneBody, up: np.ndarray) -> Plane | None:
@@ -104,6 +115,11 @@ class _Ground:
         )
         lengths = np.linalg.norm(axes, axis=2)
         return cls(up, found.means[rows], lengths @ np.abs(up), lengths.max(axis=1))
+
+    def is_left(self, path: np.ndarray, size: float) -> bool:
+        """Return True if a body is carried at the start of a path and not everywhere on it. [T, 3]"""
+        carried = [self.carries(place, size) for place in path]
+        return carried[0] and not all(carried)
 
     def carries(self, place: np.ndarray, size: float) -> bool:
         """Return True if a Gaussian is under a body of the given size with its centre at a place [3]."""

@@ -65,7 +65,11 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     Raises:
         BackendError: Contacts are needed and MuJoCo is not installed.
     """
-    wishes = wishes or Wishes()
+    return _predict(scene, wishes or Wishes(), with_edges=True)
+
+
+def _predict(scene: Scene, wishes: Wishes, *, with_edges: bool) -> Prediction:
+    """Predict motions with contacts, with or without edges of supports."""
     bodies, lines = scene_bodies.of(scene)
     bodies = [body for body in bodies if body.group.id not in wishes.ignored]
     bodies += scene_bodies.obstacles(scene, wishes.obstacles)
@@ -81,8 +85,8 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     driven = [n for n in passing if bodies[n].reason and n not in pushed | doubtful]
     lines += [f"{bodies[n].name}: keeps its smooth motion: {bodies[n].reason}" for n in driven]
     tried = (set(passing) - set(driven)) | pushed | doubtful
-    free = [n for n, body in enumerate(bodies) if n not in tried and _is_free(scene, body)]
-    leave = None if up is None else edges.first(scene, bodies, free, end, up)
+    free = [n for n, body in enumerate(bodies) if (n not in tried or n in doubtful) and _is_free(scene, body)]
+    leave = edges.first(scene, bodies, free, end, up) if with_edges and up is not None else None
     leaving = set() if leave is None else {leave.number}
     tried |= leaving
     doubtful |= {n for n in leaving if bodies[n].reason}
@@ -95,7 +99,19 @@ def predict(scene: Scene, wishes: Wishes | None = None) -> Prediction:
     sinking -= leaving | pushed
     made = scene_world.make(scene, bodies, tried, pushed, judged, pull, end, leave, sinking).weighted(wishes.masses)
     found = _simulated(scene, made, wishes, end, depths, [*lines, *made.lines])
-    return found if leave is None else dataclasses.replace(found, leaving=bodies[leave.number].name)
+    if leave is None:
+        return found
+    name = bodies[leave.number].name
+    if name in found.taken and not _falls(found, name):  # friction stops it before the edge
+        return _predict(scene, wishes, with_edges=False)
+    return dataclasses.replace(found, leaving=name)
+
+
+def _falls(found: Prediction, name: str) -> bool:
+    """Return True if the centre of a body sinks below its support in the simulation."""
+    assert found.world is not None and found.recording is not None and found.world.world.plane is not None
+    number, support = [body.name for body in found.world.bodies].index(name), found.world.world.plane
+    return bool((found.recording.places[:, number] @ support.normal).min() < support.height)
 
 
 def _simulated(

@@ -50,6 +50,17 @@ def test_a_body_whose_law_is_no_free_motion_falls_off_the_edge_if_contacts_expla
     assert found.leaving == "box 1" and bool(found.taken) == leaves
 
 
+@pytest.mark.parametrize("brakes", [False, True], ids=["drift", "friction"])
+def test_a_body_whose_law_brakes_falls_off_the_edge_only_if_its_poses_do_not_brake(brakes):
+    scene = table(1.2, 0.6, acceleration=-1.5 if brakes else -0.2)
+    model = dataclasses.replace(scene.groups[1].model, acceleration=np.array([-1.5, 0, 0]))
+    scene = dataclasses.replace(scene, groups=(scene.groups[0], dataclasses.replace(scene.groups[1], model=model)))
+    assert models.evaluate(model, np.linspace(0, 0.8))[1][:, 0].max() < 0.5
+    found = scene_future.predict(scene, Wishes(samples=1, until=1.4))
+    assert bool(found.leaving) == (not brakes)
+    assert brakes or list(found.taken) == ["box 1"]
+
+
 def test_noise_does_not_widen_a_support_where_a_body_leaves_it():
     pixels = np.stack(np.meshgrid(*[np.linspace(-2, 2, 81)] * 2), -1).reshape(-1, 2)
     solid = pixels[:, 0] + np.random.default_rng(0).normal(0, 0.1, len(pixels)) < 0.5
