@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
 from ..motion import rotations
 from .identify import PARAMETERS, Estimate, Fitter
@@ -50,8 +50,19 @@ def on_other_face(quats: np.ndarray, quat: np.ndarray) -> np.ndarray:
     return rotations.angle_between(quats, np.broadcast_to(quat, quats.shape)) > _FACE
 
 
-def draws(fitter: Fitter, estimate: Estimate, rng: np.random.Generator) -> Iterator[tuple[State, Material]]:
-    """Yield states and materials that are drawn from an estimate, without end.
+def normals(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw standard normal parameters: of ``count`` equally likely intervals, each holds one value. [count, 14]
+
+    Shares and quantiles of so many draws are as exact as those of twice as many independent ones.
+
+    Source: Latin hypercube sampling (McKay, Beckman and Conover, 1979).
+    """
+    intervals = rng.permuted(np.tile(np.arange(count), (PARAMETERS, 1)), axis=1).T
+    return special.ndtri((intervals + rng.uniform(1e-9, 1 - 1e-9, intervals.shape)) / count)
+
+
+def draws(fitter: Fitter, estimate: Estimate, count: int, rng: np.random.Generator) -> Iterator[tuple[State, Material]]:
+    """Yield ``count`` states and materials that are drawn from an estimate.
 
     Standard deviations that come from poses are multiplied by `WIDENED`, those of a prior are not.
     Draws that contradict the poses are repeated, the last ones closer to the estimate. In contact, the poses are no
@@ -61,11 +72,12 @@ def draws(fitter: Fitter, estimate: Estimate, rng: np.random.Generator) -> Itera
     told = np.linalg.inv(estimate.covariance) - assumed
     root = np.linalg.cholesky(np.linalg.inv(told / WIDENED**2 + assumed))
     fitted = fitter.residuals(estimate.state, estimate.material, estimate.time)
-    while True:
+    for first in normals(count, rng):
         found = estimate.state, estimate.material
         for attempt in range(2 * _ATTEMPTS):
             closer = 0.5 ** max(attempt - _ATTEMPTS, 0)
-            drawn = fitter.moved(estimate.state, estimate.material, closer * root @ rng.normal(size=PARAMETERS))
+            numbers = rng.normal(size=PARAMETERS) if attempt else first
+            drawn = fitter.moved(estimate.state, estimate.material, closer * root @ numbers)
             change = fitter.residuals(*drawn, estimate.time) - fitted
             if (change**2).sum() <= WIDENED**2 * CONTRADICTS:
                 found = drawn
@@ -90,7 +102,7 @@ def sample(
         rng: Source of the samples.
     """
     quats, places = np.empty((len(times), count, 4)), np.empty((len(times), count, 3))
-    for n, (state, material) in enumerate(itertools.islice(draws(fitter, estimate, rng), count)):
+    for n, (state, material) in enumerate(draws(fitter, estimate, count, rng)):
         quats[:, n], places[:, n] = fitter.poses(state, material, times - estimate.time)
     good = np.isfinite(places).all(axis=(0, 2))
     return Futures(times, quats[:, good], places[:, good])

@@ -127,7 +127,7 @@ class SceneWorld:
         rng, start = np.random.default_rng(wishes.seed), self.start(t_max)
         for number, body in enumerate(self.bodies):
             start.velocities[number] += wishes.pushes.get(body.group.id, np.zeros(3))
-        drawn_of = {number: futures.draws(*fit, rng) for number, fit in self.fits.items()}
+        drawn_of = {number: futures.draws(*fit, wishes.samples, rng) for number, fit in self.fits.items()}
         for _ in range(wishes.samples):
             state, used = _copy(start), list(materials)
             for number, (fitter, estimate) in self.fits.items():

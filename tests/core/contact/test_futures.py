@@ -1,9 +1,11 @@
 """Samples of the motion of a body."""
 
+import statistics
+
 import numpy as np
 import pytest
 
-from r5dgs_core.contact import futures
+from r5dgs_core.contact import futures, identify
 from r5dgs_core.motion import rotations
 
 
@@ -14,3 +16,11 @@ def test_other_faces_are_those_that_a_prediction_does_not_show(predicted, share)
     shown = rotations.rotvecs_to_quats(np.array([predicted, 0.0, 0.0]))
     assert found.other_faces(shown) == share
     assert found.other_faces(-shown) == share
+
+
+def test_each_parameter_is_drawn_once_from_each_of_equally_likely_intervals():
+    drawn = futures.normals(50, np.random.default_rng(0))
+    limits = [statistics.NormalDist().inv_cdf(k / 50) for k in range(1, 50)]
+    for column in drawn.T:
+        np.testing.assert_array_equal(np.bincount(np.searchsorted(limits, column)), np.ones(50))
+    assert np.abs(np.corrcoef(drawn.T) - np.eye(identify.PARAMETERS)).max() < 0.6

@@ -1,7 +1,6 @@
 """Material and state of simulated tosses are found from noisy poses."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -73,8 +72,7 @@ def test_a_flight_tells_nothing_about_the_material():
     assert len(fitter.track) >= 3
     np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance))[12:], [0.45, 1.0], rtol=0.2)
     rng = np.random.default_rng(2)
-    found = itertools.islice(futures.draws(fitter, estimate, rng), 400)
-    drawn = [np.log(material.friction) for _, material in found]
+    drawn = [np.log(material.friction) for _, material in futures.draws(fitter, estimate, 400, rng)]
     assert np.std(drawn) == pytest.approx(0.45, rel=0.15)  # a prior is not widened
     first, again = (
         futures.sample(fitter, estimate, times[[3, -1]], 24, np.random.default_rng(1)).radii(places[[3, -1]], 0.9)
