@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..motion import history, rotations, se3
+from ..motion_fit import band as bands
 from ..scene import gravity, predictability, world_axes
 from ..scene.scene import MotionGroup, Scene
 from ..shapes import directions
@@ -22,7 +23,6 @@ from .simulation import Simulation
 PENETRATION = 0.02  # of the size, by which a smooth motion passes through something before contacts are tried
 BAND_LEVEL = 0.95
 KNOTS = 16  # of a band
-UNPREDICTABLE = 0.35  # half width of a band, in sizes, beyond which a motion is not predictable
 _BEYOND = 4.0  # time that is simulated if the bodies do not come to rest, over the time to the horizon
 _TIMES = 64  # at which smooth motions are tested
 _DIRECTIONS = directions.sphere(128)  # in which an overlap is measured, besides those of the faces
@@ -192,9 +192,8 @@ def _band(
     if own is not None:
         widths, angles = np.hypot(widths, own.widths(times)), np.hypot(angles, own.angles(times))
     angles = np.minimum(angles, np.pi)
-    late = np.flatnonzero(widths > UNPREDICTABLE * size)
-    until = float(times[late[0]]) if len(late) else None
-    return history.Band(tuple(times.tolist()), tuple(widths.tolist()), tuple(angles.tolist()), BAND_LEVEL, until)
+    band = history.Band(tuple(times.tolist()), tuple(widths.tolist()), tuple(angles.tolist()), BAND_LEVEL)
+    return bands.trusted(band, 0.5 * size)
 
 
 def _passing(
