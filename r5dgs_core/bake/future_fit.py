@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..motion import torque_free_rotation
 from ..motion.history import PoseErrors
+from ..motion_fit import band as bands
 from ..motion_fit import model_selection, pose_weights, shared_gravity
 from ..motion_fit import noise as noises
 from ..scene import visibility
-from ..scene.scene import Scene
+from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
 from ..scene.world_axes import UP_AXIS
 
@@ -65,6 +67,22 @@ def fit(
         up=UP_AXIS.get(scene.world_convention),
     )
     return track, dataclasses.replace(found, history=dataclasses.replace(found.history, errors=errors))
+
+
+def with_unknown_motion(groups: Sequence[MotionGroup], observed: np.ndarray, times: np.ndarray) -> list[MotionGroup]:
+    """Return the groups, with the band of an unknown motion for bodies that were seen at one time at most.
+
+    Args:
+        groups: The motion groups.
+        observed: Knots at which each group was placed. [G, S] bool
+        times: Times of the knots. [S]
+    """
+    found, span = list(groups), float(times[-1] - times[0])
+    for group in groups:
+        if group.role == "body" and observed[group.id].sum() < 2 and span > 0:
+            unknown = bands.unknown(float(times[-1]), span, group.model.radius)
+            found[group.id] = dataclasses.replace(group, history=dataclasses.replace(group.history, band=unknown))
+    return found
 
 
 def describe(chosen: model_selection.Fit | None) -> str:

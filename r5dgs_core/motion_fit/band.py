@@ -42,15 +42,16 @@ def drift_noise(least: Noise, deviations: Noise) -> Noise:
     )
 
 
-def confidence_band(selected: Selected, variance: float, drift: Noise) -> Widths:
-    """Band of the chosen solution, up to one observed span past t_max.
+def confidence_band(selected: Selected, variance: float, drift: Noise, until: float = 1.0) -> Widths:
+    """Band of the chosen solution.
 
     Args:
         selected: Result of the selection.
         variance: Factor of the parameters' covariance, from `model_scores.covariance_factor`.
         drift: Drift of the track over its span.
+        until: End of the band, spans past t_max.
     """
-    tau = np.linspace(0.0, 1.0, MAX_KNOTS)
+    tau = np.linspace(0.0, until, MAX_KNOTS)
     chosen, noise_level, noise = selected.chosen, selected.noise_level, selected.noise
     place, turn = _variance(chosen, variance, tau)
     place2, turn2 = _spread(chosen, selected.solutions, noise_level, tau)
@@ -104,6 +105,12 @@ def trusted(band: Band, radius: float) -> Band:
     wide = np.flatnonzero(widths > WIDE)
     until = _crossing(np.array(band.times), widths, int(wide[0])) if len(wide) else None
     return replace(band, predictable_until=until)
+
+
+def unknown(t_max: float, span: float, radius: float) -> Band:
+    """Return the band of a body that was seen at one time at most, so that its motion is unknown."""
+    width = _FARTHEST * radius
+    return Band((t_max, t_max + span), (width, width), (math.pi, math.pi), LEVEL, t_max)
 
 
 def _crossing(tau: np.ndarray, values: np.ndarray, row: int) -> float:

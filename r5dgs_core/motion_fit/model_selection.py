@@ -125,16 +125,24 @@ def fit(
     else:
         selected = search.select(track, family, least, candidates is None, up)
     noise_of_drift = bands.drift_noise(least, Noise(drift[0] / radius, drift[1]))
-    return _result(selected, family, float(times[-1]), radius, span, noise_of_drift)
+    # A body that enters late has a short span; its band reaches as far as those of the other bodies.
+    until = float(times[-1] - times[0]) / span
+    return _result(selected, family, float(times[-1]), radius, span, noise_of_drift, until)
 
 
 def _result(
-    selected: Selected, family: tuple[Candidate, ...], t_max: float, radius: float, span: float, drift: Noise
+    selected: Selected,
+    family: tuple[Candidate, ...],
+    t_max: float,
+    radius: float,
+    span: float,
+    drift: Noise,
+    until: float,
 ) -> Fit:
-    """Fit in world units; ``drift`` is that of `band.confidence_band`."""
+    """Fit in world units; ``drift`` and ``until`` are those of `band.confidence_band`."""
     chosen, noise_level, level = selected.chosen, selected.noise_level, selected.noise
     variance = model_scores.covariance_factor(chosen, selected.track, level, noise_level)
-    widths = bands.confidence_band(selected, variance, drift)
+    widths = bands.confidence_band(selected, variance, drift, until)
     rule = simple_rules.better(selected.track, level, chosen) if widths.unknown else None
     predicted = rule or chosen
     model = fitted_motion.to_model(predicted, variance, radius, span)

@@ -12,6 +12,7 @@ from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import predictability
 from r5dgs_core.train import checkpoint, checkpoint_content
 from tests.support import tiny_datasets
 
@@ -119,6 +120,18 @@ def test_a_turn_that_carries_a_shadow_is_kept_while_it_is_seen_and_not_foretold(
     assert scene.groups[BRICK].model.kind == "static"
     np.testing.assert_array_equal(later[0][BRICK], [1, 0, 0, 0])
     np.testing.assert_array_equal(later[1][BRICK], 0)
+
+
+@pytest.mark.default_cases("rest")
+def test_the_motion_of_a_body_that_was_seen_once_is_not_predictable(given):
+    _, truth, _ = given
+    observed = np.ones(truth.tracks.poses.shape[:2], bool)
+    observed[BRICK, 1:] = False
+    found = simplify_motion.simplify(truth, observed, None).scene
+    histories = {group.object_id: group.history for group in found.groups if group.role == "body"}
+    assert histories[BRICK].warning() == f"not predictable past {truth.t_max:.2f}"
+    assert histories[BRICK].band.half_width[0] > 1.0
+    assert not histories[BALL].warning(predictability.horizon(truth))
 
 
 def test_without_images_only_what_is_too_small_to_be_seen_is_dropped(given):

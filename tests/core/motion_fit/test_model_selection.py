@@ -286,6 +286,16 @@ def test_the_band_holds_the_true_error():
     assert fit.history.band.half_width[-1] > fit.history.band.half_width[4] > 0
 
 
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_body_that_enters_late_has_a_band_as_long_as_those_of_the_others(count):
+    late = (np.arange(15) >= 15 - count).astype(float)
+    quats, d, _, _ = problems.observe(MOTIONS["rolling"][0], TIMES, np.random.default_rng(5), 0.01 * SIZE, 0.02)
+    fit = model_selection.fit(TIMES, quats, d, radius=RADIUS, weights=late)
+    assert fit.history.band.times[-1] == pytest.approx(2 * T_MAX)
+    assert fit.history.band.widths(T_MAX + HORIZON[:1])[0] > 0.2 * SIZE
+    assert fit.history.warning(T_MAX + HORIZON[0]).startswith("not predictable past")
+
+
 def test_a_drift_of_the_track_widens_the_band_and_not_the_fit():
     (plain, _), (wide, _) = (
         fitted("ballistic, spinning", np.random.default_rng(1), 2e-3, 2e-3, drift=drift)
