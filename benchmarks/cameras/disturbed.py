@@ -90,7 +90,8 @@ def distance(found: Mapping[str, Camera], true: Mapping[str, Camera]) -> tuple[f
         return np.concatenate(rows).ravel()
 
     best = optimize.least_squares(differences, np.zeros(7)).x
-    return tuple(float(np.sqrt(2 * np.mean(differences(world) ** 2))) for world in (np.zeros(7), best))
+    given, aligned = (float(np.sqrt(2 * np.mean(differences(world) ** 2))) for world in (np.zeros(7), best))
+    return given, aligned
 
 
 def _in_world(camera: Camera, world: np.ndarray, origin: np.ndarray, depth: float) -> Camera:
