@@ -132,8 +132,11 @@ def usual(frames: Iterable[tuple[np.ndarray, np.ndarray | None]]) -> UsualColors
 def enlarged(blocks: np.ndarray, height: int, width: int) -> np.ndarray:
     """Return a mask of blocks as a mask of pixels. [h, w] -> [H, W] bool"""
     size = _side(height)
-    at = (np.minimum(np.arange(n) // size, k - 1) for n, k in zip((height, width), blocks.shape, strict=True))
-    return blocks[np.ix_(*at)]
+    for axis, length in ((1, width), (0, height)):  # several times faster than indexing
+        counts = np.full(blocks.shape[axis], size)
+        counts[-1] = length - size * (len(counts) - 1)
+        blocks = np.repeat(blocks, counts, axis)
+    return blocks
 
 
 def _side(height: int) -> int:

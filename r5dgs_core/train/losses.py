@@ -25,29 +25,32 @@ _OFFSETS = np.arange(11) - 5
 _WINDOW = np.exp(-(_OFFSETS**2) / (2 * 1.5**2))
 WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
+_NOTHING = np.zeros((0, 0), bool)  # no pixel is left out
 
 
-def photometric(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+def photometric(image: Tensor, target: Tensor, ssim_weight: float, left_out: np.ndarray | None = None) -> Tensor:
     """Return the loss (1 - w) L1 + w (1 - SSIM) between two images.
 
     Args:
         image: Rendered image. [H, W, 3] float32
         target: Ground truth. [H, W, 3] float32
         ssim_weight: The weight w.
+        left_out: Pixels in which the target counts as equal to the image, which has no gradient there; None for no
+            pixel. [H, W] bool
 
     Returns:
         The loss, a scalar; differentiable in ``image``.
 
     Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5.
     """
-    return _Photometric.apply(image, target, ssim_weight)
+    return _Photometric.apply(image, target, ssim_weight, left_out)
 
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, image, target, ssim_weight):
+    def forward(ctx, image, target, ssim_weight, left_out):
         if not arrays.takes_kernels(image):
-            value, ctx.gradient = _in_torch(image.detach(), target, ssim_weight)
+            value, ctx.gradient = _in_torch(image.detach(), target, ssim_weight, left_out)
             return value
         x = image.detach().contiguous().numpy()
         y = target.contiguous().numpy()
@@ -56,18 +59,22 @@ class _Photometric(torch.autograd.Function):
         x, y = x.reshape(shape), y.reshape(shape)
         sums = np.empty((height, 2), np.float64)
         gradient = np.empty(shape, np.float32)
-        thread_pool.run(_compare, height // _WORTH_A_THREAD, x, y, WINDOW, np.float32(ssim_weight), sums, gradient)
+        given = (x, y, _NOTHING if left_out is None else left_out, WINDOW, np.float32(ssim_weight), sums, gradient)
+        thread_pool.run(_compare, height // _WORTH_A_THREAD, *given)
         similarity, difference = sums.sum(0) / x.size
         ctx.gradient = torch.from_numpy(gradient.reshape(height, width, 3))
         return image.new_tensor((1 - ssim_weight) * difference + ssim_weight * (1 - similarity))
 
     @staticmethod
     def backward(ctx, upstream):
-        return ctx.gradient * upstream, None, None
+        return ctx.gradient * upstream, None, None, None
 
 
-def _in_torch(x: Tensor, y: Tensor, ssim_weight: float) -> tuple[Tensor, Tensor]:
-    """Return the loss and its gradient by the first image, by the formulas of the kernels. Inputs [H, W, 3]"""
+def _in_torch(x: Tensor, y: Tensor, ssim_weight: float, left_out: np.ndarray | None) -> tuple[Tensor, Tensor]:
+    """Return the loss and its gradient by the first image, by the formulas of the kernels. Inputs [H, W, 3], [H, W]"""
+    inside = None if left_out is None else torch.from_numpy(left_out).to(x.device)[..., None]
+    if inside is not None:
+        y = torch.where(inside, x, y)
     images = torch.stack([x, y, x * x, y * y, x * y]).permute(0, 3, 1, 2)  # [5, 3, H, W]
     mu1, mu2, square1, square2, product = _blurred(images)
     mu11, mu22, mu12 = mu1 * mu1, mu2 * mu2, mu1 * mu2
@@ -80,6 +87,8 @@ def _in_torch(x: Tensor, y: Tensor, ssim_weight: float) -> tuple[Tensor, Tensor]
     difference = x - y
     chain = by_mean + 2 * x * by_square + y * by_product
     gradient = ((1 - ssim_weight) * difference.sign() - ssim_weight * chain) / x.numel()
+    if inside is not None:
+        gradient.masked_fill_(inside, 0.0)
     return (1 - ssim_weight) * difference.abs().mean() + ssim_weight * (1 - s.mean()), gradient
 
 
@@ -101,7 +110,7 @@ def _window(device: torch.device) -> Tensor:
 
 
 @kernels.kernel
-def _compare(worker, workers, x, y, window, weight, sums, gradient):
+def _compare(worker, workers, x, y, left_out, window, weight, sums, gradient):
     """Compute L1 and SSIM of this worker's rows, and the gradient of the loss with respect to x.
 
     The image passes in one sweep: row r is blurred along itself, row r - 5 is compared once the rows around it are
@@ -110,6 +119,7 @@ def _compare(worker, workers, x, y, window, weight, sums, gradient):
 
     Args:
         x, y: The images. [H, 3 W]
+        left_out: Pixels in which y counts as equal to x, or none. [H, W] or [0, 0]
         window: Weights of the blur. [11]
         weight: Of SSIM in the loss.
         sums: Result, sums of SSIM and of the differences of each row. [H, 2]
@@ -118,18 +128,46 @@ def _compare(worker, workers, x, y, window, weight, sums, gradient):
     height, length = x.shape
     raw, full = np.empty((5, length), np.float32), np.empty((5, length), np.float32)
     moments, slopes = np.empty((_KEPT, 5, length), np.float32), np.empty((_KEPT, 3, length), np.float32)
+    others = np.empty((_KEPT if len(left_out) else 0, length), np.float32)  # rows of y, with x where it is left out
     first, end = worker * height // workers, (worker + 1) * height // workers
     for row in range(first - 2 * _REACH, end + 2 * _REACH):
         if 0 <= row < height:
-            _blur_products(x[row], y[row], window, raw, moments[row % _KEPT])
+            if len(left_out):
+                _mix(x[row], y[row], left_out[row], others[row % _KEPT])
+            other = others[row % _KEPT] if len(left_out) else y[row]
+            _blur_products(x[row], other, window, raw, moments[row % _KEPT])
         at = row - _REACH
         if max(first - _REACH, 0) <= at < min(end + _REACH, height):
-            found = _compare_row(x, y, at, window, moments, raw, full, slopes[at % _KEPT])
+            other = others[at % _KEPT] if len(left_out) else y[at]
+            found = _compare_row(x[at], other, at, height, window, moments, raw, full, slopes[at % _KEPT])
             if first <= at < end:
                 sums[at, 0], sums[at, 1] = found
         at = row - 2 * _REACH
         if first <= at < end:
-            _write_gradient(x, y, at, window, weight, slopes, full, gradient)
+            other = others[at % _KEPT] if len(left_out) else y[at]
+            _write_gradient(x[at], other, at, height, window, weight, slopes, full, gradient[at])
+            if len(left_out):
+                _clear(gradient[at], left_out[at])
+
+
+@kernels.helper
+def _mix(x, y, left_out, out):
+    """Copy a row of y, with x in the pixels that are left out."""
+    for j in range(np.uint64(len(x))):
+        out[j] = y[j]
+    for pixel in range(len(left_out)):
+        if left_out[pixel]:
+            for j in range(3 * pixel, 3 * pixel + 3):
+                out[j] = x[j]
+
+
+@kernels.helper
+def _clear(gradient, left_out):
+    """Set the gradient of a row to zero in the pixels that are left out."""
+    for pixel in range(len(left_out)):
+        if left_out[pixel]:
+            for j in range(3 * pixel, 3 * pixel + 3):
+                gradient[j] = np.float32(0.0)
 
 
 @kernels.helper
@@ -146,12 +184,12 @@ def _blur_products(x, y, window, raw, moments):
 
 
 @kernels.helper
-def _compare_row(x, y, r, window, moments, raw, full, slopes):
-    """Compute SSIM of a row from the blurred moments, and its derivatives by these, blurred along the row.
+def _compare_row(x, y, r, height, window, moments, raw, full, slopes):
+    """Compute SSIM of row r of images from the blurred moments, and its derivatives by these, blurred along the row.
 
     Returns the sums of SSIM and of the differences of the images.
     """
-    height, length = x.shape
+    length = len(x)
     one, two = np.float32(1.0), np.float32(2.0)
     for m in range(5):
         _blur_column(moments, m, r, height, window, full[m])
@@ -166,7 +204,7 @@ def _compare_row(x, y, r, window, moments, raw, full, slopes):
         inverse = one / (c * d)
         s = a * b * inverse
         similarity += s
-        difference += abs(x[r, j] - y[r, j])
+        difference += abs(x[j] - y[j])
         raw[0, j] = two * mu2 * (b - a) * inverse - two * mu1 * s * (one / c - one / d)
         raw[1, j] = -s / d
         raw[2, j] = two * a * inverse
@@ -176,19 +214,19 @@ def _compare_row(x, y, r, window, moments, raw, full, slopes):
 
 
 @kernels.helper
-def _write_gradient(x, y, r, window, weight, slopes, full, gradient):
-    """Compute the gradient of the loss by a row of x from the derivatives, blurred along the columns."""
-    height, length = x.shape
+def _write_gradient(x, y, r, height, window, weight, slopes, full, gradient):
+    """Compute the gradient of the loss by row r of x from the derivatives, blurred along the columns."""
+    length = len(x)
     n = np.float32(height * length)
     l1 = (np.float32(1.0) - weight) / n
     share = -weight / n
     for m in range(3):
         _blur_column(slopes, m, r, height, window, full[m])
     for j in range(np.uint64(length)):
-        difference = x[r, j] - y[r, j]
+        difference = x[j] - y[j]
         sign = np.float32(difference > 0) - np.float32(difference < 0)
-        chain = full[0, j] + np.float32(2.0) * x[r, j] * full[1, j] + y[r, j] * full[2, j]
-        gradient[r, j] = l1 * sign + share * chain
+        chain = full[0, j] + np.float32(2.0) * x[j] * full[1, j] + y[j] * full[2, j]
+        gradient[j] = l1 * sign + share * chain
 
 
 @kernels.helper

@@ -214,8 +214,8 @@ class Trainer:
             ) from error
         self.refinement.watch(splats)
         image = self.refinement.shade(image, inputs.target, inputs.index)
-        compared = _without(self.given_views[inputs.index].unexplained, image, inputs.target)
-        loss, identity = losses.photometric(*compared, self.config.losses.ssim), None
+        left_out = self.given_views[inputs.index].unexplained
+        loss, identity = losses.photometric(image, inputs.target, self.config.losses.ssim, left_out), None
         if self.identity is not None:
             identity = self.identity.loss(self.gaussians, splats, inputs.view, self.iteration, features)
         return loss, identity, splats
@@ -315,14 +315,6 @@ class Trainer:
         """Restore a `state` of a trainer with the same data set and configuration."""
         trainer_state.restore(self, state)
         self._loss = RunningLoss(state.running_loss)
-
-
-def _without(region: np.ndarray | None, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a picture and its target [H, W, 3] so that they are equal and constant in a region [H, W], if any."""
-    if region is None:
-        return image, target
-    inside, constant = torch.from_numpy(region).to(image.device)[..., None], image.detach()
-    return torch.where(inside, constant, image), torch.where(inside, constant, target)
 
 
 def _rasterized(

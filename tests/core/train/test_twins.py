@@ -15,12 +15,14 @@ def draws(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
+@pytest.mark.parametrize("partly", [False, True])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_the_photometric_loss(weight):
+def test_the_photometric_loss(weight, partly):
     x, y = draws(21, 17, 3).abs().requires_grad_(), draws(21, 17, 3, seed=1).abs()
-    expected = losses.photometric(x, y, weight)
+    left_out = (draws(21, 17, seed=2) > 0.5).numpy() if partly else None
+    expected = losses.photometric(x, y, weight, left_out)
     (expected_gradient,) = torch.autograd.grad(expected, x)
-    found, gradient = losses._in_torch(x.detach(), y, weight)
+    found, gradient = losses._in_torch(x.detach(), y, weight, left_out)
     torch.testing.assert_close(found, expected.detach(), atol=1e-6, rtol=1e-5)
     torch.testing.assert_close(gradient, expected_gradient, atol=1e-7, rtol=1e-3)
 

@@ -20,7 +20,7 @@ from r5dgs_core.train import checkpoint, checkpoint_content, losses, run, train_
 from r5dgs_core.train.initialization import background_images
 from r5dgs_core.train.normalization import Normalization
 from r5dgs_core.train.step_graphs import StepInputs
-from r5dgs_core.train.trainer import Trainer, _without
+from r5dgs_core.train.trainer import Trainer
 from tests.support import passers_by, tiny_datasets
 
 
@@ -122,7 +122,7 @@ def test_left_out_pixels_change_neither_the_loss_nor_its_gradient():
     found = []
     for given in (target, torch.where(inside, 1 - target, target), torch.where(inside, target, 1 - target)):
         image = picture.clone().requires_grad_()
-        loss = losses.photometric(*_without(region, image, given), 0.2)
+        loss = losses.photometric(image, given, 0.2, region)
         (gradient,) = torch.autograd.grad(loss, image)
         assert not gradient[region].any() and gradient[~region].any()
         found.append((loss.item(), gradient))
