@@ -5,6 +5,7 @@ A `Stage` is a module with a function ``apply``, which leaves the arrays of its 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -14,12 +15,15 @@ from torch import Tensor
 
 from ..config.config import Config
 from ..config.sections.needs import NeedsSection
-from ..data.dataset import Dataset
+from ..data import dataset as datasets
+from ..data.dataset import Dataset, View
+from ..data.explained_pixels import ExplainedPixels
 from ..scene.scene import MotionGroup, Scene
-from ..train import checkpoint, checkpoint_content, run_folder
+from ..train import checkpoint, checkpoint_content, run_folder, train_views
 from ..train.normalization import Normalization
 from ..train.observed_motion import ObservedMotion
 from ..train.refinement import refined_dataset
+from ..train.unexplained_views import Decision
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,27 @@ class Context:
     @property
     def tensors(self) -> dict[str, Tensor]:
         return self.state.tensors
+
+    def explained(self, view: View) -> np.ndarray | None:
+        """Return the pixels of a training view that training has not left out; None for all. [H, W] bool
+
+        Raises:
+            DatasetError: An image is missing or cannot be read.
+        """
+        if self._explained is None:
+            return None
+        pixels, given = self._explained[0], self._explained[1][view.name]
+        behind = train_views.behind(self.given, self.config)
+        return pixels.of(given, datasets.load_image(given, behind), datasets.load_mask(given))
+
+    @functools.cached_property
+    def _explained(self) -> tuple[ExplainedPixels, dict[str, View]] | None:
+        """Explained pixels and the given training views by name; None if training has left out nothing."""
+        stored = self.tensors.get(checkpoint_content.UNEXPLAINED)
+        if stored is None or not Decision.of(stored).on:
+            return None
+        pixels = ExplainedPixels(self.given, train_views.behind(self.given, self.config))
+        return pixels, {view.name: view for view in self.given.train}
 
     def cameras(self, points: np.ndarray) -> dict[str, Any]:
         """Return the record of the refinement of the cameras; empty if none was tried.

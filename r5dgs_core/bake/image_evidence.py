@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..config.config import Config
 from ..data import dataset as datasets
 from ..errors import DatasetError
 from ..motion import rotations
@@ -29,6 +28,7 @@ from ..scene import cameras
 from ..scene.sampling import spread
 from ..scene.scene import Scene
 from ..train import train_views
+from .draft import Context
 
 log = logging.getLogger(__name__)
 
@@ -68,16 +68,24 @@ class ImageEvidence:
         scene: The scene with the trained motion; groups stay within the observed time.
         views: Views, as from `sample`.
         behind: Colour behind transparent pixels; None if the images are opaque. [3]
+        explained: Returns the pixels of a view to compare; None for all. [H, W] bool
 
     Raises:
         DatasetError: An image is missing or cannot be read.
     """
 
-    def __init__(self, scene: Scene, views: Sequence[datasets.View], behind: np.ndarray | None):
+    def __init__(
+        self,
+        scene: Scene,
+        views: Sequence[datasets.View],
+        behind: np.ndarray | None,
+        explained: Callable[[datasets.View], np.ndarray | None] = lambda view: None,
+    ):
         # With an infinite t_max, the player uses the track at the last knot, too, and never the motion model.
         self._scene = dataclasses.replace(scene, t_max=math.inf)
         self._views = views
         self._truths = [datasets.load_image(view, behind) for view in views]
+        self._explained = [explained(view) for view in views]
         self._clusters = _clusters(views)
         self.remember()
 
@@ -99,7 +107,7 @@ class ImageEvidence:
                 errors.append(self._error(frames[1], row))
             else:
                 old, new = (self._error(frame, row, window) for frame in frames)
-                errors.append(error + (new - old) * self._truths[row][window].size / self._truths[row].size)
+                errors.append(error + (new - old) * self._count(row, window) / self._count(row, self._whole(row)))
         return self.psnr - _mean_psnr(errors)
 
     def support(
@@ -133,12 +141,17 @@ class ImageEvidence:
             picture, patches = self._draw(dataclasses.replace(lit[0], object_ids=octants), row, window)
             slope = (self._draw(lit[1], row, window)[0] - self._draw(lit[2], row, window)[0]).astype(np.float64)
             slope /= 2 * step
+            explained = self._explained[row]
+            if explained is not None:
+                slope[~explained[window]] = 0
+                patches = np.where(explained[window], patches, PATCHES)
             pixels += int((patches < PATCHES).sum())
             cluster, error = self._clusters[row], (picture - self._truths[row][window]) * slope
             scores[cluster] -= np.bincount(patches.ravel(), error.sum(-1).ravel(), PATCHES + 1)
             information[cluster] += np.bincount(patches.ravel(), (slope**2).sum(-1).ravel(), PATCHES + 1)
             if colored:
-                changed += float(((self._draw(own[3], row, window)[0] - self._draw(own[0], row, window)[0]) ** 2).sum())
+                turned = (self._draw(own[3], row, window)[0] - self._draw(own[0], row, window)[0]) ** 2
+                changed += float((turned if explained is None else turned[explained[window]]).sum())
         return _support(scores, information, pixels, changed)
 
     def _with(self, poses: np.ndarray) -> Scene:
@@ -214,9 +227,17 @@ class ImageEvidence:
         return np.clip(output.color, 0, 1), np.where(output.ids < 0, PATCHES, output.ids)
 
     def _error(self, frame: scene_player.Frame, row: int, window: tuple[slice, slice] | None = None) -> float:
-        """Return the mean squared error of a picture, or of a part of it."""
-        truth = self._truths[row] if window is None else self._truths[row][window]
-        return float(np.mean((self._draw(frame, row, window)[0] - truth) ** 2))
+        """Return the mean squared error of a picture, or of a part of it, over the explained pixels."""
+        window, explained = window or self._whole(row), self._explained[row]
+        squared = (self._draw(frame, row, window)[0] - self._truths[row][window]) ** 2
+        if explained is not None:
+            squared = squared[explained[window]]
+        return float(np.mean(squared)) if squared.size else 0.0
+
+    def _count(self, row: int, window: tuple[slice, slice]) -> int:
+        """Return the number of values of the explained pixels of a view in a window."""
+        truth, explained = self._truths[row][window], self._explained[row]
+        return truth.size if explained is None else truth.shape[2] * int(explained[window].sum())
 
 
 def _mean_psnr(errors: Sequence[float]) -> float:
@@ -245,15 +266,16 @@ def _support(scores: np.ndarray, information: np.ndarray, pixels: int, changed: 
     )
 
 
-def gather(scene: Scene, dataset: datasets.Dataset, config: Config) -> ImageEvidence | None:
-    """Return the evidence of the training images on a scene's motion.
+def gather(scene: Scene, context: Context) -> ImageEvidence | None:
+    """Return the evidence of a run's training images on a scene's motion.
 
     The result is None if nothing moves, or if an image is missing, which is logged as a warning.
     """
     if not np.any(scene.tracks.poses[..., 1:] != 0):
         return None
     try:
-        return ImageEvidence(scene, sample(dataset.train), train_views.behind(dataset, config))
+        behind = train_views.behind(context.dataset, context.config)
+        return ImageEvidence(scene, sample(context.dataset.train), behind, context.explained)
     except DatasetError as error:
         log.warning(
             "the motion is simplified without the training images, so only motion below fixed thresholds is dropped: "

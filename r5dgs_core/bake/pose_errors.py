@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,7 +89,14 @@ class Measured:
 NOTHING = Measured({}, {})
 
 
-def measure(scene: Scene, dataset: datasets.Dataset, config: Config, groups: Collection[int], masked: bool) -> Measured:
+def measure(
+    scene: Scene,
+    dataset: datasets.Dataset,
+    config: Config,
+    groups: Collection[int],
+    masked: bool,
+    explained: Callable[[datasets.View], np.ndarray | None] = lambda view: None,
+) -> Measured:
     """Return the errors of the observed poses of some groups, and the rotations that are not seen.
 
     Args:
@@ -98,9 +105,7 @@ def measure(scene: Scene, dataset: datasets.Dataset, config: Config, groups: Col
         config: Configuration of the run.
         groups: The bodies.
         masked: True if the masks of the data set have the ids of the scene's objects.
-
-    Returns:
-        The errors.
+        explained: Returns the pixels of a view that training has not left out; None for all. [H, W] bool
 
     Raises:
         DatasetError: An image is missing or cannot be read.
@@ -122,7 +127,8 @@ def measure(scene: Scene, dataset: datasets.Dataset, config: Config, groups: Col
             truth, ids = datasets.load_image(view, behind), datasets.load_mask(view) if masked else None
             if ids is None or number == 0:
                 picture = scene_renderer.render_frame(scene, posed[0], view.camera)
-                misfits.append(float(((np.clip(picture.color, 0, 1) - truth) ** 2).mean()))
+                squared, pixels = (np.clip(picture.color, 0, 1) - truth) ** 2, explained(view)
+                misfits.append(float((squared if pixels is None else squared[pixels]).mean()))
                 ids = picture.ids if ids is None else ids
             for group in groups:
                 mine = ids == scene.groups[group].object_id

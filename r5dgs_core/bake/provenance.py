@@ -54,12 +54,12 @@ def _on_training_views(draft: Draft, context: Context) -> dict[str, Any]:
     dataset, tensors = context.dataset, context.tensors
     behind = train_views.behind(dataset, context.config)
     try:
-        baked = view_psnr.training_psnr(dataset, behind, image_evidence.make_renderer(draft.scene))
+        baked = view_psnr.training_psnr(dataset, behind, image_evidence.make_renderer(draft.scene), context.explained)
         if checkpoint_content.TRAIN_PSNR in tensors:
             before = float(tensors[checkpoint_content.TRAIN_PSNR])
         else:
             before = view_psnr.training_psnr(
-                dataset, behind, image_evidence.make_renderer(draft.trained or draft.scene)
+                dataset, behind, image_evidence.make_renderer(draft.trained or draft.scene), context.explained
             )
     except DatasetError:  # `simplify_motion` has logged it
         return {}

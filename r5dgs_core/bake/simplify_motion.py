@@ -127,11 +127,11 @@ class Simplified:
 def apply(draft: Draft, context: Context) -> Draft:
     """Simplify the motion of the scene by the evidence of the training images."""
     observed = np.stack([group.observed for group in draft.observed.motion.groups])
-    evidence = image_evidence.gather(draft.scene, context.dataset, context.config)
+    evidence = image_evidence.gather(draft.scene, context)
     measured = pose_errors.NOTHING
     if evidence is not None:
-        ids = [group.id for group in _moving(draft.scene)]
-        measured = pose_errors.measure(draft.scene, context.dataset, context.config, ids, not context.discovered)
+        masked, ids = not context.discovered, [group.id for group in _moving(draft.scene)]
+        measured = pose_errors.measure(draft.scene, context.dataset, context.config, ids, masked, context.explained)
     found = simplify(draft.scene, observed, evidence, context.wanted, measured)
     return dataclasses.replace(draft, scene=found.scene, trained=draft.scene, parts=found.rows, slipped=found.slipped)
 

@@ -7,12 +7,12 @@ its own images while the scene is fixed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..data import dataset as datasets
-from ..data.unexplained import UsualColors
+from ..data.explained_pixels import ExplainedPixels
 from ..playback import scene_player
 from ..render import camera_fit, scene_renderer
 from ..scene import camera_correction, cameras
@@ -20,7 +20,6 @@ from ..scene.camera_correction import Correction
 from ..scene.cameras import Camera
 from ..scene.sampling import spacing, spread
 from ..scene.scene import Scene
-from . import explained
 
 IMAGES = 6  # maximum number of images of a camera for the fit
 TIME = 0.1  # change of time in the fit, as a share of the spacing of the observed times
@@ -31,7 +30,7 @@ def corrections(
     views: Sequence[datasets.View],
     background: np.ndarray | None,
     backend: str = "auto",
-    usual: Mapping[str, UsualColors] | None = None,
+    explained: ExplainedPixels | None = None,
 ) -> dict[str, Correction]:
     """Return a correction for each camera of some views by its name.
 
@@ -43,7 +42,7 @@ def corrections(
         views: Held-out views.
         background: Colour behind transparent pixels. [3]
         backend: Rasterizer.
-        usual: Usual colours of cameras, whose unexplained regions are left out.
+        explained: Pixels to which cameras are fitted; None for all.
     """
     stored = scene.provenance.get("cameras", {}).get("corrections", {})
     found = {name: camera_correction.from_dict(values) for name, values in stored.items()}
@@ -57,7 +56,7 @@ def corrections(
         if name not in found:
             mine = [view for view in views if view.camera.name == name]
             early = [view for view in mine if view.t <= scene.t_max] or mine
-            found[name] = _fitted(scene, spread(early, IMAGES), background, draw, usual or {})
+            found[name] = _fitted(scene, spread(early, IMAGES), background, draw, explained)
     return found
 
 
@@ -66,18 +65,14 @@ def _fitted(
     views: Sequence[datasets.View],
     background: np.ndarray | None,
     draw: camera_fit.Draw,
-    usual: Mapping[str, UsualColors],
+    explained: ExplainedPixels | None,
 ) -> Correction:
     """Return the correction that explains the images of a camera best."""
-    shots = [
-        camera_fit.Shot(
-            view.camera,
-            view.t,
-            datasets.load_image(view, background),
-            explained.explained(usual, view, background),
-        )
-        for view in views
-    ]
+    shots = []
+    for view in views:
+        image = datasets.load_image(view, background)
+        valid = None if explained is None else explained.of(view, image, datasets.load_mask(view))
+        shots.append(camera_fit.Shot(view.camera, view.t, image, valid))
     times = scene.tracks.times
     units = camera_fit.Units(_depth(scene, views[0].camera), TIME * spacing(times))
     which = camera_fit.columns(pose=True, focal=True, time=len(times) > 1, color=True)

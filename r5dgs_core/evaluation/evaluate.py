@@ -19,7 +19,7 @@ import numpy as np
 from .. import atomic_files, timing
 from ..data import dataset as datasets
 from ..data import images
-from ..data.unexplained import UsualColors
+from ..data.explained_pixels import ExplainedPixels
 from ..errors import ConfigError
 from ..playback import scene_player
 from ..render import scene_renderer
@@ -101,10 +101,10 @@ def evaluate(
     count = counter(progress, sum(len(dataset.views(split)) for split in splits) * len(modes))
     result: dict[str, Any] = {"scene": scene.name, "splits": {}, "objects": object_errors(scene, dataset.ground_truth)}
     result["horizon"] = predictability.horizon(scene)
-    corrections, usual = None, explained.usual_colors(scene, dataset, background)
+    corrections, explained_pixels = None, explained.pixels(scene, dataset, background)
     if align or (align is None and scene.provenance.get("cameras", {}).get("refined")):
         held_out = [view for split in splits for view in dataset.views(split)]
-        corrections = alignment.corrections(scene, held_out, background, backend, usual)
+        corrections = alignment.corrections(scene, held_out, background, backend, explained_pixels)
     for split in splits:
         result["splits"][split] = {}
         views = dataset.views(split)
@@ -116,7 +116,7 @@ def evaluate(
                 background=background,
                 backend=backend,
                 corrections=corrections,
-                usual=usual,
+                explained_pixels=explained_pixels,
                 perceptual=perceptual,
                 measured=count,
             )
@@ -150,7 +150,7 @@ def measure_views(
     background: np.ndarray | None = None,
     backend: str = "auto",
     corrections: Mapping[str, Correction] | None = None,
-    usual: Mapping[str, UsualColors] | None = None,
+    explained_pixels: ExplainedPixels | None = None,
     perceptual: lpips.Lpips | None = None,
     measured: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
@@ -163,7 +163,7 @@ def measure_views(
         background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
         backend: Rasterizer.
         corrections: Correction of each camera by its name, for ``psnr_aligned``; None leaves that out.
-        usual: Usual colours of each training camera by its name, for ``psnr_explained``.
+        explained_pixels: Pixels for ``psnr_explained``; None leaves that out.
         perceptual: Network for ``lpips``, or None.
         measured: Called after each image.
 
@@ -176,13 +176,13 @@ def measure_views(
         render_timed(scene, view.camera, view.t, move, backend=backend)
     for view in views:
         rendering = render_timed(scene, view.camera, view.t, move, backend=backend)
-        truth = datasets.load_image(view, background)
-        tally.add(rendering, truth, datasets.load_mask(view), is_later(scene, view.t))
+        truth, mask = datasets.load_image(view, background), datasets.load_mask(view)
+        tally.add(rendering, truth, mask, is_later(scene, view.t))
         picture = rendering.color
         if corrections is not None:
             picture = _aligned(scene, view, corrections[view.camera.name], move, backend)
             tally.values["psnr_aligned"].append(metrics.psnr(picture, truth))
-        where = explained.explained(usual or {}, view, background)
+        where = None if explained_pixels is None else explained_pixels.of(view, truth, mask)
         if where is not None:
             tally.values["psnr_explained"].append(metrics.psnr(picture, truth, where))
         if measured is not None:

@@ -7,10 +7,11 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 
 from ..config import training_needs
-from ..data.dataset import Dataset
+from ..data.dataset import Dataset, View
 from ..scene.splats import to_opacities
 from . import checkpoint_content, view_psnr
 from .identity import identity_training, label_cleanup, label_votes
@@ -87,6 +88,7 @@ def final_tensors(trainer: Trainer, progress: Progress) -> dict[str, torch.Tenso
             _refined(trainer),
             trainer.behind,
             lambda view: trainer.render(trainer.normalization.camera(view.camera), view.t).cpu().numpy(),
+            _explained(trainer),
         )
     extra[checkpoint_content.TRAIN_PSNR] = torch.tensor(shown, dtype=torch.float64)
     return {name: tensor.cpu() for name, tensor in extra.items()}
@@ -97,6 +99,17 @@ def _refined(trainer: Trainer) -> Dataset:
     tensors = trainer.refinement.tensors()
     found = refined_dataset.corrections(trainer.dataset, tensors, trainer.normalization)
     return refined_dataset.apply(trainer.dataset, found)
+
+
+def _explained(trainer: Trainer) -> Callable[[View], np.ndarray | None]:
+    """Return a function that returns the pixels of a view that the run has not left out; None for all. [H, W] bool"""
+    given = {view.name: view for view in trainer.given_views}
+
+    def pixels(view: View) -> np.ndarray | None:
+        left_out = given[view.name].unexplained
+        return None if left_out is None else ~left_out
+
+    return pixels
 
 
 def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -63,7 +63,10 @@ def configured(trainer: Trainer) -> HeldOutPsnr | None:
 
 
 def training_psnr(
-    dataset: datasets.Dataset, behind: np.ndarray | None, draw: Callable[[datasets.View], np.ndarray]
+    dataset: datasets.Dataset,
+    behind: np.ndarray | None,
+    draw: Callable[[datasets.View], np.ndarray],
+    explained: Callable[[datasets.View], np.ndarray | None],
 ) -> float:
     """Return the mean PSNR on the training views, or on `TRAINING_VIEWS` of them spread evenly, dB.
 
@@ -71,12 +74,13 @@ def training_psnr(
         dataset: The data set.
         behind: Background of transparent pixels, as for `train_views.load`. [3] or None
         draw: Renders a view. [H, W, 3]
+        explained: Returns the pixels of a view to compare; None for all. [H, W] bool
 
     Raises:
         DatasetError: An image is missing or cannot be read.
     """
     chosen = spread(dataset.train, TRAINING_VIEWS)
-    return float(np.mean([psnr_8_bit(draw(view), _load(view, behind)) for view in chosen]))
+    return float(np.mean([psnr_8_bit(draw(view), _load(view, behind), explained(view)) for view in chosen]))
 
 
 def _load(view: datasets.View, behind: np.ndarray | None) -> np.ndarray:
@@ -84,8 +88,14 @@ def _load(view: datasets.View, behind: np.ndarray | None) -> np.ndarray:
     return np.round(np.clip(datasets.load_image(view, behind), 0, 1) * 255).astype(np.uint8)
 
 
-def psnr_8_bit(image: np.ndarray, target: np.ndarray) -> float:
-    """Return the PSNR of colours in [0, 1] against 8-bit colours, dB; 99 for equal images. [H, W, 3]"""
-    rounded = np.round(np.clip(image, 0, 1) * 255)
-    error = float(np.mean(((rounded - target) / 255) ** 2))
+def psnr_8_bit(image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None) -> float:
+    """Return the PSNR of colours in [0, 1] against 8-bit colours, dB; 99 for equal images.
+
+    Args:
+        image: Picture. [H, W, 3]
+        target: Image. [H, W, 3] uint8
+        where: Mask of the pixels to compare, which is not empty; None for all. [H, W] bool
+    """
+    squared = ((np.round(np.clip(image, 0, 1) * 255) - target) / 255) ** 2
+    error = float(np.mean(squared if where is None else squared[where]))
     return min(99.0, -10 * math.log10(max(error, 1e-12)))

@@ -182,6 +182,29 @@ def test_without_training_images_a_warning_is_logged_and_poses_decide(trained, t
 
 
 @pytest.mark.parametrize("given", ["slide"], indirect=True)
+@pytest.mark.parametrize("whole", [image_evidence.WHOLE, 0])
+def test_pixels_that_training_has_left_out_are_no_evidence(given, whole, monkeypatch):
+    monkeypatch.setattr(image_evidence, "WHOLE", whole)
+    _, truth, data = given
+    noisy = with_noise(truth, 0.02, 0.02).tracks.poses
+    region = np.zeros((72, 96), bool)
+    region[20:45, 30:60] = True
+    views = image_evidence.sample(data.train)
+    found = []
+    for changed in (np.zeros_like(region), region, ~region):
+        evidence = image_evidence.ImageEvidence(truth, views, None, lambda view: ~region)
+        for image in evidence._truths:
+            image[changed] = 1 - image[changed]
+        evidence.remember()
+        support = evidence.support(BRICK, truth.tracks.poses, noisy, 0.1)
+        found.append((evidence.psnr, evidence.loss(noisy), *dataclasses.astuple(support)))
+    assert found[0] == found[1]
+    assert found[2][0] < found[0][0] - 1
+    everything = image_evidence.ImageEvidence(truth, views, None)
+    assert everything.support(BRICK, truth.tracks.poses, noisy, 0.1) != support
+
+
+@pytest.mark.parametrize("given", ["slide"], indirect=True)
 def test_in_large_images_only_the_part_that_the_body_reaches_is_drawn(given, monkeypatch):
     _, truth, data = given
     evidence, noisy = evidence_of(truth, data), with_noise(truth, 0.02, 0.02).tracks.poses

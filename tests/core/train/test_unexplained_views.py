@@ -11,11 +11,13 @@ from scipy import ndimage
 
 from r5dgs_core import errors
 from r5dgs_core.bake import needs
+from r5dgs_core.bake.draft import Context
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import masks, unexplained
 from r5dgs_core.evaluation import evaluate, explained
 from r5dgs_core.raster import RasterStats
+from r5dgs_core.scene.camera_correction import Correction
 from r5dgs_core.train import checkpoint, checkpoint_content, losses, run, train_views, unexplained_views
 from r5dgs_core.train.initialization import background_images
 from r5dgs_core.train.normalization import Normalization
@@ -179,8 +181,23 @@ def test_the_evaluation_measures_the_explained_regions_on_their_own(crossed):
 def test_training_and_evaluation_find_the_same_regions(crossed):
     need = {"name": unexplained.NEED, "decision": "on"}
     scene = dataclasses.replace(tiny_datasets.make_truth(), needs=(need,))
-    usual = explained.usual_colors(scene, crossed, np.ones(3))
+    pixels = explained.pixels(scene, crossed, np.ones(3))
     _, views, _ = decided(crossed)
     for view, given in zip(views, crossed.train, strict=True):
-        found = explained.explained(usual, given, np.ones(3))
+        found = pixels.of(given, datasets.load_image(given), datasets.load_mask(given))
         assert np.array_equal(view.unexplained, ~found)
+
+
+def test_baking_finds_the_regions_of_the_run(crossed):
+    """Also if its data set has corrected cameras."""
+    _, views, decision = decided(crossed)
+    bright = dataclasses.replace(Correction(), gain=1.2 * np.eye(3))
+    corrected = dataclasses.replace(
+        crossed, train=tuple(dataclasses.replace(view, correction=bright) for view in crossed.train)
+    )
+    run_of = types.SimpleNamespace(config=tiny_datasets.settings())
+    context = Context(run_of, of_run(decision), corrected, Normalization(np.zeros(3), 1.0), crossed)
+    for view, one in zip(views, corrected.train, strict=True):
+        assert np.array_equal(view.unexplained, ~context.explained(one))
+    dropped = dataclasses.replace(context, state=of_run(unexplained_views.Decision(0.2, False)))
+    assert dropped.explained(corrected.train[0]) is None

@@ -68,3 +68,10 @@ def test_the_psnr_of_a_constant_error_is_exact(levels):
     image = np.full((4, 5, 3), levels / 255, np.float32)
     assert view_psnr.psnr_8_bit(image, target) == pytest.approx(20 * np.log10(255 / levels))
     assert view_psnr.psnr_8_bit(target.astype(np.float32), target) == 99
+
+
+def test_the_psnr_counts_only_the_pixels_of_a_mask():
+    target, where = np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), bool)
+    where[1:3, 2:4] = True
+    image = np.where(where[..., None], np.float32(10 / 255), np.float32(1))
+    assert view_psnr.psnr_8_bit(image, target, where) == pytest.approx(20 * np.log10(255 / 10))
