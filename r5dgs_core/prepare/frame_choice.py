@@ -42,7 +42,7 @@ class Choice:
         moments: Number of the moment of each frame. C arrays [F]
         interval: Median time between two moments, seconds.
         source_interval: Median time between two frames of the slowest camera, seconds.
-        unused: Time that each camera records before and after the others, seconds. (C,)
+        spans: First and last time of each camera's recording, seconds. [C, 2]
     """
 
     indices: tuple[np.ndarray, ...]
@@ -50,7 +50,7 @@ class Choice:
     moments: tuple[np.ndarray, ...]
     interval: float
     source_interval: float
-    unused: tuple[float, ...]
+    spans: np.ndarray
 
 
 def choose(names: Sequence[str], clocks: Sequence[np.ndarray], window: Window) -> Choice:
@@ -75,7 +75,6 @@ def choose(names: Sequence[str], clocks: Sequence[np.ndarray], window: Window) -
             f"the recordings have no overlap: {names[early]} ends {first - last:.2f} s before {names[late]} begins. "
             "Remedy: remove one of them, or correct their clocks with --offset NAME=MS or timestamps.csv"
         )
-    unused = tuple(float(max(first - t[0], 0.0) + max(t[-1] - last, 0.0)) for t in clocks)
     low = max(first - slack, first + window.start - SAME_S)
     high = last + slack if window.end is None else min(last + slack, first + window.end + SAME_S)
     grid = clocks[slowest]
@@ -96,7 +95,7 @@ def choose(names: Sequence[str], clocks: Sequence[np.ndarray], window: Window) -
         moments=tuple(np.flatnonzero(keep) for keep in kept),
         interval=interval,
         source_interval=max(steps),
-        unused=unused,
+        spans=np.array([(times[0], times[-1]) for times in clocks]),
     )
 
 

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from .. import errors, folder_lock
 from ..capture.calibration.calibration import Calibration
 from ..capture.reconstruction import gauge
@@ -132,13 +134,15 @@ def _plan(
 
 
 def _length_notes(names: list[str], choice: Choice) -> list[str]:
-    """Remarks about time that only some cameras recorded."""
-    limit = max(2 * choice.source_interval, 0.1)
-    return [
-        f"{name}: {unused:.2f} s at its ends are not used, because another camera does not record then"
-        for name, unused in zip(names, choice.unused, strict=True)
-        if unused > limit
-    ]
+    """Remarks about time that only some cameras recorded, one about its begin and one about its end."""
+    begins, ends = choice.spans.T
+    notes = []
+    for unused, word in ((begins.max() - begins, "begins later"), (ends - ends.min(), "ends earlier")):
+        cut = np.flatnonzero(unused > max(2 * choice.source_interval, 0.1))
+        if len(cut):
+            cameras = ", ".join(names[k] for k in cut)
+            notes.append(f"{cameras}: up to {unused.max():.2f} s are not used, because {names[unused.argmin()]} {word}")
+    return notes
 
 
 def _write_images(plan: Plan, out: Path, progress: Progress) -> dict[str, list[int]]:

@@ -274,7 +274,7 @@ def test_recordings_of_different_lengths_are_cut_and_named(capture, tmp_path):
     recordings.write_video(tmp_path / "videos" / "cam0.mp4", frames, np.arange(3) / 10)
     plan = command.run_prepare(tmp_path / "videos", tmp_path / "data", sync="none")
     assert [len(indices) for indices in plan.choice.indices] == [3, 3, 3]
-    assert "cam1: 0.30 s at its ends are not used" in plan.notes[0]
+    assert plan.notes[0] == "cam1, cam2: up to 0.30 s are not used, because cam0 ends earlier"
 
 
 def test_frames_that_cannot_be_decoded_are_left_out_and_listed(capture, tmp_path, monkeypatch):
