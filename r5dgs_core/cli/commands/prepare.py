@@ -263,7 +263,7 @@ def summary(plan: Plan) -> list[str]:
     seconds = timeline.t_max * timeline.seconds_per_unit
     lines.append(f"{seconds:.2f} s are observed; t_max is {timeline.t_max:.3g}")
     data = shlex.quote(str(plan.request.out))
-    lines.append(f"written: {plan.request.out}. Next: r5dgs train {data} --out RUN")
+    lines.append(f"written: {plan.request.out}. Next: r5dgs train {data} --out RUN --scene SCENE.r5dgs")
     return lines
 
 

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ... import errors, terminal
+from ... import errors, input_paths, terminal
 from .. import exit_status, inputs, options
 from ..exit_status import ExitStatus
+from . import bake
 
 if TYPE_CHECKING:
     from ...train.workers import Workers
@@ -26,6 +27,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     p.add_argument("data", type=Path, help="data set folder: transforms_train.json, or images and sparse/")
     p.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder to write")
+    p.add_argument("--scene", type=Path, metavar="FILE.r5dgs", help="also bake the run to this scene file")
     shown = "masks of the training views (default: DATA/object_mask); 'none' trains without masks"
     p.add_argument("--masks", metavar="FOLDER", help=shown)
     options.add_training(p)
@@ -33,7 +35,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> ExitStatus | None:
     """Run the command, in this process or together with others that ``torch.distributed.run`` has started."""
-    given = options.training(args)
+    given = {**options.training(args), "scene": args.scene}
     if args.masks is not None:
         masks = args.masks if args.masks == "none" else Path(args.masks).resolve()
         given["overrides"].append(f"data.masks={masks}")
@@ -88,9 +90,15 @@ def run_train(
     device: str | None = None,
     threads: int | None = None,
     progress_kind: str,
+    scene: Path | None = None,
     workers: Workers | None = None,
 ) -> None:
-    """Train a run folder from a data set (see `train.run.train`), and name objects whose motion is not predictable."""
+    """Train a run folder from a data set (see `train.run.train`), and name objects whose motion is not predictable.
+
+    ``scene`` is the scene file to which the run is then baked (see `bake.run_bake`), if any.
+    """
+    if scene is not None:
+        input_paths.check_scene_output(scene)
     count = 1 if workers is None else workers.count
     settings = options.training_settings(out, config_path, overrides, preset=preset, resume=resume, processes=count)
     inputs.check_dataset(data)
@@ -114,12 +122,14 @@ def run_train(
         )
         with interrupt.at_once(f"{out} is trained; stopped while its motion was fitted"):
             progress({"event": "prepare", "text": "motion past the last observed time"})
-            scene = quick_fit.scene_of(trained)
-        lines = predictability.warnings(scene)
-        refined = [f"cameras: {text}" for text in camera_correction.sizes(scene.provenance["cameras"]).values()]
+            fitted = quick_fit.scene_of(trained)
+        lines = predictability.warnings(fitted)
+        refined = [f"cameras: {text}" for text in camera_correction.sizes(fitted.provenance["cameras"]).values()]
         if progress_kind == "json":
             for event, texts in (("cameras", refined), ("warning", lines)):
                 for line in texts:
                     progress({"event": event, "text": line})
     if progress_kind == "auto":
         terminal.print_lines([*refined, *lines])
+    if scene is not None:
+        bake.run_bake(out, scene, None, threads=threads, progress_kind=progress_kind)

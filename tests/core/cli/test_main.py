@@ -183,6 +183,15 @@ def test_a_resumed_run_keeps_its_own_configuration(made, tiny, capsys):
     assert main.main(["train", str(tiny.root), "--out", str(made[0]), "--resume", "--progress", "none"]) == 0
 
 
+def test_train_can_write_the_scene_file_too(made, tiny, tmp_path, capsys):
+    scene, given = tmp_path / "tiny.r5dgs", ("train", tiny.root, "--out", made[0], "--resume")
+    assert main.main([*map(str, given), "--scene", str(scene), "--progress", "none"]) == 0
+    assert f"written: {scene}" in capsys.readouterr().out
+    assert scene.read_bytes() == made[1].read_bytes()
+    line = complaint(capsys, *given, "--scene", tmp_path / "tiny.zip", status=ExitStatus.USAGE)
+    assert "expected a name that ends in .r5dgs" in line
+
+
 def test_a_cap_and_a_preset_reach_the_run(tiny, tmp_path, capsys):
     run, given = tmp_path / "run", ["train", str(tiny.root), "--progress", "none", *OPTIONS]
     assert main.main([*given, "--out", str(run), "--max-gaussians", "120", "--preset", "fast"]) == 0
