@@ -153,13 +153,13 @@ def _check_images(found: Dataset, collect: Collector, album: Album) -> None:
         reduced = []
         for view in views:
             with collect(), coded("D12"):
-                pixels = images.read(view.image_path)
+                color = dataset.load_image_8bit(view)
                 digest = hashlib.sha256(view.image_path.read_bytes()).digest()
                 other = same.setdefault(digest, view)
                 if other.camera.name != view.camera.name:
                     collect.add("D51", f"{view.image_path}: the same file as {other.image_path}, from another camera")
                 if len(reduced) < motion_tracks.MOST_FRAMES:
-                    reduced.append((view, recording.reduce(pixels)))
+                    reduced.append((view, recording.reduce(color)))
         if len(reduced) >= recording.LEAST:
             one = recording.measure([view for view, _ in reduced], [picture for _, picture in reduced])
             over_time.check(one, str(found.root), found.units.seconds_per_unit, collect, album)

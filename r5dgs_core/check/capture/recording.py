@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...data import images
 from ...data.views import View
 from ...prepare import motion_tracks
 
@@ -60,10 +59,9 @@ def measure(views: Sequence[View], pictures: Sequence[np.ndarray]) -> Recording:
     return Recording(tuple(views), np.stack(stack), np.stack(edges), motion_tracks.step_of(views[0].camera.width))
 
 
-def reduce(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the reduced image [h, w, 3] uint8 and its edges [h, w] float16 of an image [H, W, C]."""
-    step = motion_tracks.step_of(pixels.shape[1])
-    color = images.to_uint8(images.composite(images.to_rgba(pixels)))
+def reduce(color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the reduced image [h, w, 3] uint8 and its edges [h, w] float16 of an image [H, W, 3] uint8."""
+    step = motion_tracks.step_of(color.shape[1])
     gray = color.mean(2, dtype=np.float32)
     slope = np.zeros_like(gray)
     slope[:, 1:] = np.abs(np.diff(gray, axis=1))
