@@ -150,7 +150,7 @@ def _check_images(found: Dataset, collect: Collector, album: Album) -> None:
     same: dict[bytes, View] = {}
     clocks = timing.Clocks(str(found.root), found.units.seconds_per_unit, collect, album)
     for views in recording.by_camera(_views(found)):
-        reduced = []
+        gathered = recording.Gathered(min(len(views), motion_tracks.MOST_FRAMES))
         for view in views:
             with collect(), coded("D12"):
                 color = dataset.load_image_8bit(view)
@@ -158,10 +158,10 @@ def _check_images(found: Dataset, collect: Collector, album: Album) -> None:
                 other = same.setdefault(digest, view)
                 if other.camera.name != view.camera.name:
                     collect.add("D51", f"{view.image_path}: the same file as {other.image_path}, from another camera")
-                if len(reduced) < motion_tracks.MOST_FRAMES:
-                    reduced.append((view, recording.reduce(color)))
-        if len(reduced) >= recording.LEAST:
-            one = recording.measure([view for view, _ in reduced], [picture for _, picture in reduced])
+                if not gathered.full:
+                    gathered.add(view, color)
+        if len(gathered.views) >= recording.LEAST:
+            one = gathered.recording()
             over_time.check(one, str(found.root), found.units.seconds_per_unit, collect, album)
             clocks.add(one)
     clocks.check()

@@ -51,15 +51,15 @@ def track(source: CameraSource, lens: Lens, report: Callable[[int], None]) -> Mo
     first = max(0, (len(source.times) - MOST_FRAMES) // 2)
     wanted = range(first, min(first + MOST_FRAMES, len(source.times)))
     step = step_of(source.width)
-    found, small = [], []
+    found: list[int] = []
+    stack = np.empty((len(wanted), source.height // step, source.width // step, 3), np.uint8)
     for count, (index, pixels) in enumerate(source.read(list(wanted)), 1):
         found.append(index)
-        small.append(reduce(pixels, step))
+        stack[count - 1] = reduce(pixels, step)
         report(count)
-    if len(small) < 4:
+    if len(found) < 4:
         return MotionTrack(np.zeros(0), np.zeros((0, 2)), 1.0 / lens.fx, np.zeros(0))
-    stack = np.stack(small)
-    places = centers(stack)
+    places = centers(stack[: len(found)])
     seen = np.isfinite(places[:, 0])
     pixels = (places[seen] + 0.5) * step
     rays = lens.unproject(pixels) if len(pixels) else np.zeros((0, 3))

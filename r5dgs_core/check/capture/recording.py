@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,18 +48,42 @@ def by_camera(views: Iterable[View]) -> list[tuple[View, ...]]:
     return [tuple(sorted(group.values(), key=lambda view: view.t)) for group in groups.values()]
 
 
-def measure(views: Sequence[View], pictures: Sequence[np.ndarray]) -> Recording:
-    """Return the recording of a camera.
+class Gathered:
+    """Images of a camera that are reduced one by one.
 
     Args:
-        views: Its views, by time.
-        pictures: Their reduced images and edges, as from `reduce`.
+        most: Maximum number of images.
+
+    Attributes:
+        views: Their views.
     """
-    stack, edges = zip(*pictures, strict=True)
-    return Recording(tuple(views), np.stack(stack), np.stack(edges), motion_tracks.step_of(views[0].camera.width))
+
+    def __init__(self, most: int):
+        self._most = most
+        self.views: list[View] = []
+        self._stack, self._edges = np.empty((0, 0, 0, 3), np.uint8), np.empty((0, 0, 0), np.float16)
+
+    @property
+    def full(self) -> bool:
+        """True if no more images can be added."""
+        return len(self.views) == self._most
+
+    def add(self, view: View, color: np.ndarray) -> None:
+        """Add an image. [H, W, 3] uint8"""
+        picture, edges = _reduced(color)
+        if not self.views:  # one array from the first image on, as stacking a list needs twice the memory
+            self._stack = np.empty((self._most, *picture.shape), np.uint8)
+            self._edges = np.empty((self._most, *edges.shape), np.float16)
+        self._stack[len(self.views)], self._edges[len(self.views)] = picture, edges
+        self.views.append(view)
+
+    def recording(self) -> Recording:
+        """Return the images; there is at least one."""
+        count, step = len(self.views), motion_tracks.step_of(self.views[0].camera.width)
+        return Recording(tuple(self.views), self._stack[:count], self._edges[:count], step)
 
 
-def reduce(color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _reduced(color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the reduced image [h, w, 3] uint8 and its edges [h, w] float16 of an image [H, W, 3] uint8."""
     step = motion_tracks.step_of(color.shape[1])
     gray = color.mean(2, dtype=np.float32)
