@@ -40,7 +40,8 @@ def check(one: Recording, place: str, seconds: float | None, collect: Collector,
     if len(one.views) < LEAST:
         return
     behind = motion_tracks.background(one.stack)
-    apart = np.abs(one.stack.astype(np.int16) - behind).max(-1)
+    # image by image, as the differences of all channels would need several times the memory of the images
+    apart = np.stack([np.abs(picture.astype(np.int16) - behind).max(-1) for picture in one.stack])
     _check_doubled(one, place, collect, album)
     _check_exposure(one, behind, apart, place, collect, album)
     _check_blur(one, apart, place, collect, album)
