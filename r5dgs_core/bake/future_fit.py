@@ -52,7 +52,7 @@ def fit(
     opacities = to_opacities(scene.gaussians.opacity_logits[members])
     body = torque_free_rotation.inertia(scene.gaussians.means[members][visibility.seen(opacities)].astype(np.float64))
     radius, turns = scene.groups[group].model.radius, bool(np.any(poses[:, 1:4] != 0))
-    known = pose_weights.from_errors(errors, observed, radius, turns)
+    known = pose_weights.from_errors(errors, observed, radius, turns, scene.groups[group].rigid_rms)
     noise = max(noise[0], known.noise[0]), max(noise[1], known.noise[1])
     track = shared_gravity.BodyTrack(scene.tracks.times, poses[:, :4], poses[:, 4:], known.weights)
     found = model_selection.fit(
@@ -69,7 +69,9 @@ def fit(
     return track, dataclasses.replace(found, history=dataclasses.replace(found.history, errors=errors))
 
 
-def with_unknown_motion(groups: Sequence[MotionGroup], observed: np.ndarray, times: np.ndarray) -> list[MotionGroup]:
+def with_unknown_motion(
+    groups: Sequence[MotionGroup], observed: np.ndarray, times: np.ndarray
+) -> tuple[MotionGroup, ...]:
     """Return the groups, with the band of an unknown motion for bodies that were seen at one time at most.
 
     Args:
@@ -82,7 +84,7 @@ def with_unknown_motion(groups: Sequence[MotionGroup], observed: np.ndarray, tim
         if group.role == "body" and observed[group.id].sum() < 2 and span > 0:
             unknown = bands.unknown(float(times[-1]), span, group.model.radius)
             found[group.id] = dataclasses.replace(group, history=dataclasses.replace(group.history, band=unknown))
-    return found
+    return tuple(found)
 
 
 def describe(chosen: model_selection.Fit | None) -> str:

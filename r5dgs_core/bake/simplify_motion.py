@@ -69,9 +69,8 @@ class _Kind:
 
 _TURN, _PATH = slice(0, 4), slice(4, 7)  # columns of poses
 _ROTATION = _Kind("rotation", _TURN, "offset_rotvec", "spread of its rotations, rad")  # simplified to no rotation
-# simplified to one fixed place
+# simplified to one fixed place, and to a straight line
 _PLACE = _Kind("motion", _PATH, "offset_displacement", "spread of its places, diameters")
-# simplified to a straight line
 _BEND = _Kind("curved_path", _PATH, "offset_displacement", "distance from a straight path, diameters")
 
 
@@ -191,7 +190,7 @@ def simplify(
         groups[index] = dataclasses.replace(groups[index], model=model, history=history)
     slipped = {index: fit.slipped for index, fit in shared.items() if fit.slipped}
     groups = future_fit.with_unknown_motion(groups, observed, scene.tracks.times)
-    return Simplified(dataclasses.replace(bound, groups=tuple(groups)), tuple(rows), slipped)
+    return Simplified(dataclasses.replace(bound, groups=groups), tuple(rows), slipped)
 
 
 def _moving(scene: Scene) -> list[MotionGroup]:

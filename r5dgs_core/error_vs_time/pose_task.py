@@ -156,7 +156,8 @@ def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -
         shape = torque_free_rotation.inertia(scene.gaussians.means[rows] - group.pivot, opacities)
         shape = shape + _MIN_MOMENT * np.eye(3)
     seen = (scene.tracks.times >= first - _SAME) & (scene.tracks.times <= last + _SAME)
-    known = pose_weights.from_errors(group.history.errors, seen, radius, bool(np.any(track[:, 1:4] != 0)))
+    turns = bool(np.any(track[:, 1:4] != 0))
+    known = pose_weights.from_errors(group.history.errors, seen, radius, turns, group.rigid_rms)
     return model_selection.fit(
         scene.tracks.times,
         track[:, :4],

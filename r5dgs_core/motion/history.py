@@ -110,6 +110,18 @@ class PoseErrors:
     turn: tuple[float, ...]
 
 
+def with_bend(errors: np.ndarray, radius: float, bend: float) -> np.ndarray:
+    """Return errors of displacements and of rotations of a body that also bends, so that it has no exact pose.
+
+    Args:
+        errors: Standard deviations per component, world units and rad. [2, ...]
+        radius: Radius of the body, world units.
+        bend: Root mean square distance of its points from a rigid motion, world units.
+    """
+    each = bend / math.sqrt(3)
+    return np.stack([np.hypot(errors[0], each), np.hypot(errors[1], each / radius if radius > 0 else 0.0)])
+
+
 @dataclass(frozen=True)
 class History:
     """Events, segments, confidence band and pose errors of a motion, from its observed poses.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..motion.history import PoseErrors
+from ..motion.history import PoseErrors, with_bend
 
 # Share of the usual errors of the poses below which laws do not differ (docs/results/predicted_motion.md).
 SCATTER = 0.75
@@ -32,7 +32,9 @@ class PoseWeights:
     drift: tuple[float, float] = (0.0, 0.0)
 
 
-def from_errors(errors: PoseErrors | None, observed: np.ndarray, radius: float, turns: bool) -> PoseWeights:
+def from_errors(
+    errors: PoseErrors | None, observed: np.ndarray, radius: float, turns: bool, bend: float = 0.0
+) -> PoseWeights:
     """Return the weights of the poses of a track, 1 for the usual ones and less for those with larger errors.
 
     Args:
@@ -40,12 +42,15 @@ def from_errors(errors: PoseErrors | None, observed: np.ndarray, radius: float, 
         observed: Poses to use; others get the weight 0. [S] bool
         radius: Radius of the body, world units.
         turns: False if its rotations are not used.
+        bend: Root mean square distance of the body's Gaussians from its rigid motion, world units. A body that bends
+            has no exact pose, so this counts as drift.
     """
-    if errors is None:
-        return PoseWeights(observed.astype(np.float64))
-    drift = _usual(errors, observed)
-    noise = SCATTER * drift[0], SCATTER * drift[1]
-    return PoseWeights(_weights(errors, observed, radius, turns), noise, drift if turns else (drift[0], 0.0))
+    weights, usual = observed.astype(np.float64), (0.0, 0.0)
+    if errors is not None:
+        weights, usual = _weights(errors, observed, radius, turns), _usual(errors, observed)
+    place, turn = with_bend(np.array(usual), radius, bend)
+    noise = SCATTER * usual[0], SCATTER * usual[1]
+    return PoseWeights(weights, noise, (float(place), float(turn) if turns else 0.0))
 
 
 def _weights(errors: PoseErrors, observed: np.ndarray, radius: float, turns: bool) -> np.ndarray:

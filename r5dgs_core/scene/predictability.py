@@ -100,10 +100,9 @@ def _outlook(groups: Sequence[MotionGroup], end: float) -> Outlook:
         result = Outlook(first[0].history.warning(end), widths[worst], 100 * shares[worst])
     errors = [(group, own) for group in groups if (own := group.history.errors) is not None]
     if errors:
-        turns = [error for _, own in errors if (error := _error(np.degrees(own.turn))) is not None]
-        places = [
-            error for group, own in errors if (error := _error(100 * np.array(own.place) / _size(group))) is not None
-        ]
+        known = [(group, _with_bend(own, group)) for group, own in errors]
+        turns = [error for _, (_, turn) in known if (error := _error(np.degrees(turn))) is not None]
+        places = [error for group, (place, _) in known if (error := _error(100 * place / _size(group))) is not None]
         result = dataclasses.replace(
             result,
             rotation_error_deg=max(turns, key=lambda error: error.worst, default=None),
@@ -111,6 +110,11 @@ def _outlook(groups: Sequence[MotionGroup], end: float) -> Outlook:
             unseen_times=max(int(np.isinf(own.place).sum()) for _, own in errors),
         )
     return result
+
+
+def _with_bend(errors: history.PoseErrors, group: MotionGroup) -> np.ndarray:
+    """Errors of places and of rotations, with the deviations of the body from a rigid motion. [2, S]"""
+    return history.with_bend(np.array([errors.place, errors.turn]), group.model.radius, group.rigid_rms)
 
 
 def _size(group: MotionGroup) -> float:

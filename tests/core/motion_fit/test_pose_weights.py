@@ -31,3 +31,11 @@ def test_without_any_view_all_observed_poses_count_alike():
         assert found.weights.tolist() == [1, 0] and found.noise == found.drift == (0, 0)
     exact = dataclasses.replace(errors, place=(0.0,) * 2, turn=(0.0,) * 2)
     assert pose_weights.from_errors(exact, np.array([True, True]), 1.0, True).weights.tolist() == [1, 1]
+
+
+def test_a_body_that_bends_drifts_by_its_bends_and_its_noise_stays():
+    errors, observed = PoseErrors((0.1,) * 4, (0.2,) * 4), np.ones(4, bool)
+    rigid, bent = (pose_weights.from_errors(errors, observed, 2.0, True, bend) for bend in (0.0, 3.0))
+    assert bent.drift == pytest.approx((np.hypot(0.1, 3**0.5), np.hypot(0.2, 3**0.5 / 2)))
+    assert bent.noise == rigid.noise and bent.weights.tolist() == rigid.weights.tolist()
+    assert pose_weights.from_errors(None, observed, 2.0, True, 3.0).drift == pytest.approx((3**0.5, 3**0.5 / 2))

@@ -48,6 +48,12 @@ def test_the_half_width_is_that_of_the_horizon():
     assert found.rotation_error_deg is None
 
 
+def rigid(scene, bend=0.0):
+    """The scene with bodies that deviate from rigid motion by a distance, world units."""
+    groups = tuple(dataclasses.replace(group, rigid_rms=bend) for group in scene.groups)
+    return dataclasses.replace(scene, groups=groups)
+
+
 def test_a_trusted_object_has_an_empty_warning_and_an_unknown_one_none():
     scene = with_histories(History(band=dataclasses.replace(BAND, predictable_until=None)))
     found = predictability.outlooks(scene)
@@ -59,7 +65,7 @@ def test_a_trusted_object_has_an_empty_warning_and_an_unknown_one_none():
 
 def test_errors_of_poses_are_those_of_the_times_that_show_the_object():
     errors = PoseErrors((0.01, 0.02, np.inf, 0.06), (0.01, 0.02, np.inf, 0.06))
-    scene = with_histories(History(errors=errors))
+    scene = rigid(with_histories(History(errors=errors)))
     found = predictability.outlooks(scene)[scene.groups[1].object_id]
     size = 2 * scene.groups[1].model.radius
     assert found.position_error_percent == predictability.PoseError(pytest.approx(2 / size), pytest.approx(6 / size))
@@ -71,6 +77,14 @@ def test_errors_of_poses_are_those_of_the_times_that_show_the_object():
     hidden = with_histories(History(errors=PoseErrors((np.inf,), (np.inf,))))
     never = predictability.outlooks(hidden)[scene.groups[1].object_id]
     assert never.rotation_error_deg is None and never.unseen_times == 1
+
+
+def test_a_body_that_bends_has_no_exact_poses():
+    errors = PoseErrors((0.0,) * 4, (0.0,) * 4)
+    scene = rigid(with_histories(History(errors=errors)), bend=3**0.5)
+    found, radius = predictability.outlooks(scene)[scene.groups[1].object_id], scene.groups[1].model.radius
+    assert found.position_error_percent.median == pytest.approx(50 / radius)
+    assert found.rotation_error_deg.median == pytest.approx(np.degrees(1 / radius))
 
 
 def test_of_parts_of_an_object_the_worst_counts():
