@@ -2,10 +2,11 @@
 
 A knot is suspicious if the image error of the body is unusually large there, or if its rotation differs much from the
 rotation that constant spin between its neighbours predicts. Such a knot is registered again (`registration`) from its
-own pose and from the predicted one, and if the error remains large, from rotations of the prediction. The pose of
-least image error is taken; among similar errors, the one nearest to the prediction. If the error is unusually large in
-all of them, no pose explains the body, and it keeps its own: a body that bends would otherwise be registered to one of
-its parts at some knots and to another part at others. After a repair, the neighbours become suspicious, so that a
+own pose and from the predicted one, and if the error remains large, from rotations of the prediction, and in blurred
+pictures from where constant velocity predicts the body. The pose of least image error is taken; among similar errors,
+the one nearest to the prediction. If the error is unusually large in all of them, no pose explains the body, and it
+keeps its own unless the error becomes much smaller: a body that bends would otherwise be registered to one of its parts
+at some knots and to another part at others. After a repair, the neighbours become suspicious, so that a
 series of slipped knots is repaired from its ends. Other knots keep their poses bit for bit.
 
 A knot is checked when it enters training, because a fast body is easily lost then, and in some rounds over all knots.
@@ -33,13 +34,15 @@ BALLS = 0.8  # share of the run after which balls are aligned again
 JUMP = np.radians(8.0)  # angle from the prediction above which a knot is suspicious
 UNUSUAL = 1.5  # image error above which a knot is suspicious, relative to the median over the knots of the body
 CLEARLY = 0.93  # largest image error of a new pose that is accepted, relative to that of the present one
+MUCH = 0.7  # the same, of a new pose that does not explain the body either
 SIMILAR = 1.03  # image error below which the pose nearest to the prediction is taken, relative to the smallest error
-APART = np.radians(3.0)  # smallest angle between different poses
+FAIR = 0.8  # image error above which starts from afar are tried, relative to that of an unexplained body
+APART = np.radians(3.0)  # smallest angle between different poses, and smallest distance in radii of the body
 TURNS = np.radians((25.0, 50.0))  # rotations of the prediction about each axis that are tried as starts
-MIN_VIEWS = 2  # minimum number of views of a knot; a single view does not determine a position
 VIEWS = 3  # maximum number of views of a knot
 REFINED = 2  # number of starts that are refined
 STEPS = 4  # steps of a refinement
+FAR_STEPS = 8  # steps of a refinement from a predicted displacement, of blurred and of sharp pictures
 MAX_REGISTRATIONS_PER_KNOT = 2  # maximum registrations of a body in a round, relative to the number of its knots
 
 
@@ -67,7 +70,7 @@ def after_step(trainer: Trainer, entered: tuple[int, int]) -> None:
             for row in np.flatnonzero(registration.errors(trainer, s, VIEWS) > UNUSUAL * usual):
                 knots = np.flatnonzero(trainer.places.measured[row])
                 knots = knots[(knots >= first) & (knots <= last)]
-                _repair_knot(trainer, int(row) + 1, s, knots, UNUSUAL * float(usual[row]))
+                _repair_knot(trainer, int(row) + 1, s, knots, UNUSUAL * float(usual[row]), settled=False)
     total = trainer.config.train.iterations
     if first > 0 or last < len(trainer.times) - 1:
         return
@@ -98,7 +101,7 @@ def repair(trainer: Trainer) -> int:
             if not queue:
                 break
             s = queue.pop(0)
-            if _repair_knot(trainer, body, s, seen, limit):
+            if _repair_knot(trainer, body, s, seen, limit, settled=True):
                 found.add(s)
                 queue += [int(n) for n in seen if abs(n - s) == 1 and n not in queue]
         if found:
@@ -129,7 +132,7 @@ def suspicious(errors: np.ndarray, quats: np.ndarray, times: np.ndarray) -> np.n
     return found[np.argsort(-score[found], kind="stable")]
 
 
-def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit: float) -> bool:
+def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit: float, *, settled: bool) -> bool:
     """Register a knot; return True if it has a new pose.
 
     Args:
@@ -138,36 +141,49 @@ def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit
         knot: The knot.
         seen: Knots that may predict it.
         limit: Picture error above which the body is not explained. Turns of the prediction are then tried; if they do
-            not explain it either, it may bend, and keeps its pose.
+            not explain it either, it may bend, and keeps its pose unless the error becomes much smaller.
+        settled: True if all times have entered. Before, the body is not yet sharp, so that it is not sought from afar,
+            and neither moved without a turn, nor in a single view.
     """
     look = BodyRegistration(trainer, _tracks(trainer), body, knot, VIEWS)
-    predicted = _predictions(trainer, body, knot, seen)
-    if len(look) < MIN_VIEWS or not predicted:
+    predicted, carried = _predictions(trainer, body, knot, seen)
+    if len(look) < (1 if settled else 2) or not predicted:
         return False
     own = look.pose
     found = [look.refined(pose, STEPS) for pose in [own, *predicted[:1]][: 1 + _apart(own, predicted[0])]]
     if min(error for _, error in found) > limit:
         turned = sorted(_turned(predicted[0]) + predicted[1:], key=look.error)
         found += [look.refined(pose, STEPS) for pose in turned[:REFINED]]
+    while settled and carried and min(error for _, error in found) > FAIR * limit:
+        found.append(look.refined_from_afar(carried.pop(0), FAR_STEPS))
     least = min(error for _, error in found)
     near = [pose for pose, error in found if error <= SIMILAR * least]
     best = min(near, key=lambda pose: float(rotations.angle_between(pose[0], predicted[0][0])))
-    better = _apart(best, own) and least < min(CLEARLY * look.error(own), limit)
+    moved = np.linalg.norm(best[1] - own[1]) > APART * look.radius
+    before = look.error(own)
+    most = max(limit, MUCH * before) if settled else limit
+    better = (_apart(best, own) or (settled and moved)) and least < min(CLEARLY * before, most)
     if better:
         look.write_pose(best)
     return better
 
 
-def _predictions(trainer: Trainer, body: int, knot: int, seen: np.ndarray) -> list[Pose]:
-    """Poses that other knots predict by constant spin: between neighbours, from before, from after; or the nearest."""
+def _predictions(trainer: Trainer, body: int, knot: int, seen: np.ndarray) -> tuple[list[Pose], list[Pose]]:
+    """Poses that other knots predict by constant spin: between neighbours, from before, from after; or the nearest.
+
+    Returns:
+        The predicted rotations with the present displacement, and with the displacement of constant velocity.
+    """
     before, after = seen[seen < knot][::-1], seen[seen > knot]
     pairs = [(side[0], side[1]) for side in (before, after) if len(side) > 1]
     if len(before) and len(after):
         pairs.insert(0, (before[0], after[0]))
     tracks, quats = _tracks(trainer).tracks, _quats(trainer, body)
-    own = to_host(tracks.params["translations"])[body, knot].astype(np.float64)
+    shifts = to_host(tracks.params["translations"])[body].astype(np.float64)
+    turns = [_between(tracks.times, quats, a, b, knot) for a, b in pairs]
+    moves = [shifts[a] + _share(tracks.times, a, b, knot) * (shifts[b] - shifts[a]) for a, b in pairs]
     nearest = [quats[side[0]] for side in (before, after) if len(side)][:1]
-    return [(q, own) for q in [_between(tracks.times, quats, a, b, knot) for a, b in pairs] or nearest]
+    return [(q, shifts[knot]) for q in turns or nearest], list(zip(turns, moves, strict=True))
 
 
 def _tracks(trainer: Trainer) -> TracksRepresentation:
@@ -181,8 +197,12 @@ def _quats(trainer: Trainer, body: int) -> np.ndarray:
 
 def _between(times: np.ndarray, quats: np.ndarray, a: int, b: int, s: int) -> np.ndarray:
     """Rotation at knot s by constant spin from knot a to knot b; s may lie outside. [4]"""
-    share = (times[s] - times[a]) / (times[b] - times[a])
-    return rotations.interpolate(quats[a], quats[b], share)
+    return rotations.interpolate(quats[a], quats[b], _share(times, a, b, s))
+
+
+def _share(times: np.ndarray, a: int, b: int, s: int) -> float:
+    """Time of knot s as a share of the time from knot a to knot b."""
+    return (times[s] - times[a]) / (times[b] - times[a])
 
 
 def _turned(pose: Pose) -> list[Pose]:

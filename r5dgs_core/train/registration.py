@@ -28,6 +28,7 @@ from .trainer import Trainer
 
 MARGIN = 2  # dilation of masks, px
 MIN_PIXELS = 8  # minimum number of pixels of a mask
+BLUR = 0.05  # standard deviation that blurs pictures for a start from afar, relative to the root of the body's pixels
 STEP = 0.02  # change of the pose for finite differences, rad or radii
 _LARGEST = 0.35  # step of the refinement, rad or radii
 _ENOUGH = 1e-2  # relative gain of a step below which the refinement ends
@@ -53,12 +54,15 @@ class BodyRegistration:
         body: Row of the body.
         knot: The knot.
         most: Largest number of views, spread evenly over those that show the body.
+
+    Attributes:
+        radius: Radius of the body, normalised units.
     """
 
     def __init__(self, trainer: Trainer, motion: TracksRepresentation, body: int, knot: int, most: int):
         self._trainer, self._motion, self._body, self._knot = trainer, motion, body, knot
         owner = int(motion.tracks.owners[body])
-        self._radius = float(trainer.places.radii[owner - 1])
+        self.radius = float(trainer.places.radii[owner - 1])
         object_id, params = int(trainer.object_ids[owner]), trainer.gaussians.params
         rows = torch.nonzero(trainer.gaussians.motion_ids == body)[:, 0]
         names = ("means", "quats", "log_scales", "opacity_logits", "shading")
@@ -66,6 +70,10 @@ class BodyRegistration:
         self._shape["colors"] = spherical_harmonics.dc_to_rgb(params["sh"].detach()[rows, 0])
         shown = sampling.spread([v for v in views_at(trainer, knot) if (v.mask == object_id).sum() >= MIN_PIXELS], most)
         self._looks = [self._look(view, view.mask == object_id) for view in shown]
+        self._free = np.eye(3)  # directions in which the views determine the position
+        if len(self._looks) == 1:
+            away = self.pose[1] + to_host(motion.tracks.centers[body]) - self._looks[0].camera.center
+            self._free -= np.outer(away, away) / (away @ away)
 
     def __len__(self) -> int:
         """Number of views."""
@@ -96,12 +104,22 @@ class BodyRegistration:
         """Mean squared error of the body's pixels."""
         return float((self._residuals(pose) ** 2).mean())
 
-    def refined(self, pose: Pose, steps: int) -> tuple[Pose, float]:
-        """Return the pose of least picture error near a pose, and this error, by damped Gauss-Newton steps."""
-        residuals, damping = self._residuals(pose), 1e-2
+    def refined_from_afar(self, pose: Pose, steps: int) -> tuple[Pose, float]:
+        """Return `refined` after a refinement of blurred pictures, which have wider minima."""
+        return self.refined(self.refined(pose, steps, BLUR)[0], steps)
+
+    def refined(self, pose: Pose, steps: int, blur: float = 0.0) -> tuple[Pose, float]:
+        """Return the pose of least picture error near a pose, and this error, by damped Gauss-Newton steps.
+
+        Args:
+            pose: The start.
+            steps: Largest number of steps.
+            blur: Standard deviation by which the pictures are blurred, relative to the size of the body in them.
+        """
+        residuals, damping = self._residuals(pose, blur), 1e-2
         error = float((residuals**2).mean())
         for _ in range(steps):
-            moved = [self._residuals(self._moved(pose, change)) for change in STEP * np.eye(6)]
+            moved = [self._residuals(self._moved(pose, change), blur) for change in STEP * np.eye(6)]
             slopes = (np.stack(moved, -1) - residuals[:, None]) / STEP  # [P, 6]
             normal = slopes.T @ slopes
             diagonal = np.diag(np.diag(normal) + 1e-6 * max(float(np.trace(normal)), 1e-12))
@@ -109,7 +127,7 @@ class BodyRegistration:
                 change = -np.linalg.solve(normal + damping * diagonal, slopes.T @ residuals)
                 change *= min(1.0, _LARGEST / max(np.linalg.norm(change[:3]), np.linalg.norm(change[3:]), 1e-9))
                 there = self._moved(pose, change)
-                new = self._residuals(there)
+                new = self._residuals(there, blur)
                 gain = 1 - float((new**2).mean()) / error
                 if gain > 0:
                     break
@@ -123,10 +141,10 @@ class BodyRegistration:
 
     def _moved(self, pose: Pose, change: np.ndarray) -> Pose:
         turned = rotations.multiply(rotations.rotvecs_to_quats(change[:3]), pose[0])
-        return rotations.normalize(turned), pose[1] + self._radius * change[3:]
+        return rotations.normalize(turned), pose[1] + self.radius * self._free @ change[3:]
 
     @torch.no_grad()
-    def _residuals(self, pose: Pose) -> np.ndarray:
+    def _residuals(self, pose: Pose, blur: float = 0.0) -> np.ndarray:
         """Picture minus truth in the region of the body. [P] float64"""
         quat, shift = (self._tensor(x)[None] for x in pose)
         placed = GroupPoses(quat, rotations.quats_to_rotmats(quat), shift)
@@ -140,7 +158,10 @@ class BodyRegistration:
             )
             behind = self._trainer.background.image(look.camera)
             drawn = rasterize_splats(means, quats, scales, opacities, colors, look.camera, behind).image
-            found.append((to_host(drawn) - look.truth)[look.region].ravel())
+            image = to_host(drawn)
+            if blur > 0:
+                image = lit_alike(image, look.truth, look.region)
+            found.append(blurred(image - look.truth, look.region, blur)[look.region].ravel())
         return np.concatenate(found).astype(np.float64)
 
     @torch.no_grad()
@@ -165,6 +186,36 @@ class BodyRegistration:
 def views_at(trainer: Trainer, knot: int) -> list[train_views.TrainView]:
     """Return the views with masks at a knot."""
     return [v for v in trainer.views if v.has_mask and train_views.nearest_knot(trainer.times, v.t) == knot]
+
+
+def lit_alike(image: np.ndarray, truth: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """Return an image with the gain and offset of each channel that bring it nearest to another one in a region.
+
+    Light changes as a body moves, and it would shift the minima of blurred pictures.
+
+    Args:
+        image: The image. [H, W, D]
+        truth: The other one. [H, W, D]
+        region: The region. [H, W] bool
+    """
+    a, b = image[region].astype(np.float64), truth[region].astype(np.float64)
+    spread = np.maximum(a.var(0), 1e-6)
+    gain = np.maximum(((a - a.mean(0)) * (b - b.mean(0))).mean(0) / spread, 0.0)
+    return gain * (image - a.mean(0)) + b.mean(0)
+
+
+def blurred(image: np.ndarray, region: np.ndarray, blur: float) -> np.ndarray:
+    """Return an image, 0 outside a region, blurred by a Gaussian.
+
+    Args:
+        image: The image. [H, W, D]
+        region: The region. [H, W] bool
+        blur: Standard deviation relative to the root of the pixels of the region; 0 returns the image itself.
+    """
+    if blur <= 0:
+        return image
+    sigma = blur * float(np.sqrt(region.sum()))
+    return ndimage.gaussian_filter(np.where(region[..., None], image, 0), (sigma, sigma, 0))
 
 
 def grown(mask: np.ndarray) -> np.ndarray:

@@ -54,13 +54,18 @@ def test_a_repair_leaves_other_bodies_alone(trainer):
 
 
 @pytest.mark.slow
-def test_a_body_that_no_pose_explains_keeps_its_bits(trainer, monkeypatch):
+def test_a_body_that_no_pose_explains_keeps_its_bits_unless_it_is_much_better(trainer, monkeypatch):
+    turns = quats(trainer, BRICK)
     slip(trainer, BRICK, (3,), (0, 0, 1), 40)
     before = trainer.state().tensors
     monkeypatch.setattr(pose_repair, "UNUSUAL", 0.01)  # even the true poses have larger errors
+    monkeypatch.setattr(pose_repair, "MUCH", 0.0)  # and no error is much smaller
     assert pose_repair.repair(trainer) == 0
     after = trainer.state().tensors
     assert all(torch.equal(after[name], before[name]) for name in before)
+    monkeypatch.setattr(pose_repair, "MUCH", 0.7)
+    assert pose_repair.repair(trainer) > 0
+    assert off(trainer, BRICK, turns).max() < 8
 
 
 def test_a_sound_track_keeps_its_bits(trainer, monkeypatch):
