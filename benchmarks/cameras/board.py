@@ -7,8 +7,10 @@ FOLDER is a session of caliscope with videos, ``camera_array.toml`` and the boar
 (``mprib/caliscope``, ``tests/sessions/post_optimization``). The videos are prepared with every eighth moment held out.
 With ``--masks corners``, the masks are the board's rectangle, from its corners in the world; views in which fewer than
 four corners were found are unknown there. The true poses of the board are those of its corners. One constant rigid
-offset between the trained group and the board is fitted over the clip, and nothing else. Results:
-docs/results/captures.md.
+offset between the trained group and the board is fitted over the clip, and nothing else. With ``--masks none``, the
+groups that are found are compared with the masks from the corners. The corners in the world were triangulated from
+those in the images; where they do not agree, the cameras did not record at the same moment, and the true poses are
+wrong. Results: docs/results/captures.md.
 """
 
 from __future__ import annotations
@@ -58,10 +60,12 @@ class Board:
 
     def __init__(self, folder: Path):
         own, world = {}, defaultdict(dict)
-        self._found: dict[tuple[int, int], int] = defaultdict(int)
+        self._found: dict[tuple[int, int], dict[int, list[float]]] = defaultdict(dict)
         for row in _rows(folder / CORNERS / "xy_CHARUCO.csv"):
-            own[int(row["keypoint_id"])] = [float(row[f"obj_loc_{axis}"]) for axis in "xyz"]
-            self._found[int(row["sync_index"]), int(row["cam_id"])] += 1
+            key = int(row["keypoint_id"])
+            own[key] = [float(row[f"obj_loc_{axis}"]) for axis in "xyz"]
+            pixel = [float(row[f"img_loc_{axis}"]) for axis in "xy"]
+            self._found[int(row["sync_index"]), int(row["cam_id"])][key] = pixel
         for row in _rows(folder / CORNERS / "xyz_CHARUCO.csv"):
             place = [float(row[f"{axis}_coord"]) for axis in "xyz"]
             world[int(row["sync_index"])][int(row["keypoint_id"])] = place
@@ -74,6 +78,7 @@ class Board:
             ids = sorted(world[moment])
             if len(ids) >= LEAST:
                 self.poses[row], self.posed[row] = _rigid([own[k] for k in ids], [world[moment][k] for k in ids]), True
+        self._world = world
         every = np.array(list(own.values()))
         side = every[:, 0].min()
         width, height = every[:, :2].max(0) + side
@@ -97,14 +102,31 @@ class Board:
             return ids
         share = np.arange(EDGE)[:, None] / EDGE
         ring = [a + share * (b - a) for a, b in zip(self.outline, np.roll(self.outline, -1, 0), strict=True)]
-        points = np.concatenate(ring) @ self.poses[row, :3, :3].T + self.poses[row, :3, 3]
-        inside = np.linalg.inv(one.pose(0))
-        pixels = one.lens(0).project(points @ inside[:3, :3].T + inside[:3, 3])
+        pixels = _pixels(plan, number, np.concatenate(ring) @ self.poses[row, :3, :3].T + self.poses[row, :3, 3])
         if np.isfinite(pixels).all():
-            known = self._found[int(self.moments[row]), camera] >= LEAST
+            known = len(self._found[int(self.moments[row]), camera]) >= LEAST
             corners = np.round((pixels - 0.5) * 16).astype(np.int32)
             cv2.fillPoly(ids, [corners], 1 if known else masks.UNKNOWN, shift=4)
         return ids
+
+    def disagreement(self, row: int, plan: Plan) -> float:
+        """Return how far the corners found in a moment are from those in the world: rms of the worst camera, px."""
+        moment, worst = int(self.moments[row]), 0.0
+        for number, camera in enumerate(plan.cameras):
+            found = self._found[moment, int(camera.name.rpartition("_")[2])]
+            keys = [key for key in found if key in self._world[moment]]
+            if len(keys) >= LEAST:
+                pixels = _pixels(plan, number, np.array([self._world[moment][key] for key in keys])) - 0.5
+                apart = pixels - [found[key] for key in keys]
+                worst = max(worst, float(np.sqrt((apart**2).sum(1).mean())))
+        return worst
+
+
+def _pixels(plan: Plan, number: int, points: np.ndarray) -> np.ndarray:
+    """Return the pixels of world points [N, 3] in the recording of a camera. [N, 2]"""
+    one = plan.cameras[number]
+    inside = np.linalg.inv(one.pose(0))
+    return one.lens(0).project(points @ inside[:3, :3].T + inside[:3, 3])
 
 
 def _rigid(before: list[list[float]], after: list[list[float]]) -> np.ndarray:
@@ -144,23 +166,31 @@ def prepared(folder: Path, out: Path, with_masks: bool, without: str | None, lin
     return plan
 
 
-def pose_errors(scene: Scene, dataset: datasets.Dataset) -> dict[str, float]:
-    """Return errors of the board's poses at the observed times, mm and degrees; empty if no group is the board."""
+def pose_errors(scene: Scene, dataset: datasets.Dataset) -> dict[str, Any]:
+    """Return errors of the board's poses, mm and degrees, at the times of the training images, and at those held out.
+
+    Empty if no group is the board.
+    """
     assert dataset.ground_truth is not None
     found = ground_truth_poses.bodies(scene, dataset.ground_truth)
     if not found:
         return {}
     body = found[0]
     predicted = ground_truth_poses.motion(scene, [body.group], body.times)[0]
+    places, turns = metrics.pose_errors(predicted, body.motion, body.group.pivot)
+    times = np.unique([view.t for view in dataset.train])
+    trained = np.abs(body.times[:, None] - times).min(1) < 0.25 * np.median(np.diff(times))
     seen = body.times <= scene.t_max + 1e-9
-    places, turns = metrics.pose_errors(predicted[seen], body.motion[seen], body.group.pivot)
+    result: dict[str, Any] = {}
+    for name, here in (("", seen & trained), ("held_out_", seen & ~trained)):
+        result[f"{name}mm"] = float(1e3 * np.median(places[here]))
+        result[f"{name}mm_worst"] = float(1e3 * places[here].max())
+        result[f"{name}degrees"] = float(np.median(turns[here]))
+        result[f"{name}degrees_worst"] = float(turns[here].max())
+    each = {"times_each": body.times, "mm_each": 1e3 * places, "degrees_each": turns}
     return {
-        "mm": float(1e3 * np.median(places)),
-        "mm_worst": float(1e3 * places.max()),
-        "degrees": float(np.median(turns)),
-        "degrees_worst": float(turns.max()),
-        "mm_each": (1e3 * places).round(2).tolist(),
-        "degrees_each": turns.round(2).tolist(),
+        **result,
+        **{name: values[seen].round(2 + (name == "times_each")).tolist() for name, values in each.items()},
     }
 
 
@@ -178,25 +208,32 @@ def main() -> None:
     warm_up.warm_up()
     with tempfile.TemporaryDirectory() as folder:
         room = args.keep or Path(folder)
-        prepared(args.folder, room / "data", args.masks == "corners", args.without_camera, args.lines)
+        with_masks, truth = args.masks == "corners", room / "data"
+        plan = prepared(args.folder, room / "data", with_masks, args.without_camera, args.lines)
+        if not with_masks:
+            truth = room / "masked"
+            prepared(args.folder, truth, True, args.without_camera, args.lines)
         began = time.process_time()
         trained = run.train(room / "data", room / "run", config.load(None, args.set), overwrite=True)
         seconds = time.process_time() - began
         scene = bake.bake(trained)
-        dataset = datasets.read(room / "data")
+        dataset = datasets.read(truth)
         result = evaluate.evaluate(scene, dataset, splits=("val",), align=True)
+    board = Board(args.folder)
     val, record = result["splits"]["val"]["rigid"], scene.provenance.get("cameras", {})
     row = {
         "val": val["psnr"],
         "val_aligned": val["psnr_aligned"],
         "val_explained": val["psnr_explained"],
         "val_objects": val["psnr_objects"],
+        "iou": (val["iou_objects_matched"] or {}).get("1"),
         "cpu_seconds": seconds,
         "gaussians": len(scene.gaussians.means),
         "refined": record.get("refined"),
         "sizes": record.get("sizes"),
         "unexplained": next(row["value"] for row in scene.needs if row["name"] == unexplained.NEED),
         **pose_errors(scene, dataset),
+        "corners_px_each": [round(board.disagreement(int(k), plan), 1) for k in np.flatnonzero(board.posed)],
     }
     print("\n".join(f"{name:>14} {value}" for name, value in row.items()))
     if args.json:
