@@ -66,8 +66,10 @@ def _weights(errors: PoseErrors, observed: np.ndarray, radius: float, turns: boo
 
 
 def _usual(errors: PoseErrors, observed: np.ndarray) -> tuple[float, float]:
-    """Median errors of displacements and of rotations; zero if no image shows the body."""
-    used = observed & np.isfinite(errors.turn)
-    if not used.any():
-        return 0.0, 0.0
-    return float(np.median(np.array(errors.place)[used])), float(np.median(np.array(errors.turn)[used]))
+    """Median errors of displacements and of rotations, each of its finite ones; zero if there are none."""
+    place, turn = (np.array(values)[observed & np.isfinite(values)] for values in (errors.place, errors.turn))
+    return _median(place), _median(turn)
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else 0.0

@@ -39,3 +39,10 @@ def test_a_body_that_bends_drifts_by_its_bends_and_its_noise_stays():
     assert bent.drift == pytest.approx((np.hypot(0.1, 3**0.5), np.hypot(0.2, 3**0.5 / 2)))
     assert bent.noise == rigid.noise and bent.weights.tolist() == rigid.weights.tolist()
     assert pose_weights.from_errors(None, observed, 2.0, True, 3.0).drift == pytest.approx((3**0.5, 3**0.5 / 2))
+
+
+def test_unknown_errors_of_places_do_not_make_the_noise_of_rotations_infinite_or_the_reverse():
+    some, all_true = (0.1, np.inf, np.inf), np.ones(3, bool)
+    for place, turn in ((some, (0.2,) * 3), ((0.2,) * 3, some)):
+        found = pose_weights.from_errors(PoseErrors(place, turn), all_true, 1.0, True)
+        assert found.drift == (np.median(place[:1]), np.median(turn[:1])) and np.isfinite(found.noise).all()
