@@ -14,6 +14,7 @@ from ...time_left import Phase
 from .. import options
 
 if TYPE_CHECKING:
+    from ...config.config import Config
     from ...data.dataset import Dataset
     from ...scene.scene import Scene
     from ...train.run_folder import Run
@@ -118,7 +119,7 @@ def run_demo(
     if progress_kind != "json":
         print(f"scene:         {scene_path}\ncontact sheet: {sheet}\ntable:         {json_path}")
         print(f"{time.monotonic() - began:.0f} s in all; open the scene in Blender: File > Import > R5DGS scene")
-        print(expectation())
+        terminal.print_lines([expectation()] if has_expectation(trained.config) else [])
     return result
 
 
@@ -141,6 +142,13 @@ def _bake_and_evaluate(trained: Run, data: Path, path: Path, progress: Any) -> t
         progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
     )
     return scene, dataset, result
+
+
+def has_expectation(settings: Config) -> bool:
+    """Return True if a run has the settings of `EXPECTED`, whose seed and device are arbitrary."""
+    from ...config.config import Config
+
+    return {*settings.differences(Config())} <= {"train.seed", "train.device"}
 
 
 def expectation() -> str:

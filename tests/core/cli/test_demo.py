@@ -3,7 +3,10 @@
 import importlib.util
 from pathlib import Path
 
+import pytest
+
 from r5dgs_core.cli.commands import demo
+from r5dgs_core.config import config
 
 ROOT = Path(__file__).parents[3]
 
@@ -33,3 +36,17 @@ def test_the_last_line_and_ci_take_the_committed_figures():
         assert "python .ci/demo_psnr.py" in (ROOT / ".ci" / script).read_text(encoding="utf-8")
     check = (ROOT / ".ci" / "demo_psnr.py").read_text(encoding="utf-8")
     assert "demo.EXPECTED" in check and "demo.expectation()" in check
+
+
+@pytest.mark.parametrize(
+    ("setting", "remains"),
+    [
+        ("train.seed=2", True),
+        ("train.device='cpu'", True),
+        ("train.iterations=300", False),
+        ("train.representation='field'", False),
+    ],
+)
+def test_the_committed_figures_are_not_expected_of_runs_with_other_settings(setting, remains):
+    assert demo.has_expectation(config.Config())
+    assert demo.has_expectation(config.Config().override([setting])) == remains
