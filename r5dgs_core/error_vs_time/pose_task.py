@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +14,8 @@ import numpy as np
 from .. import timing
 from ..data.dataset import GroundTruth
 from ..evaluation import ground_truth_poses, metrics
-from ..motion import models, rigid_fit, se3, torque_free_rotation
+from ..motion import models, rigid_fit, rotations, se3, torque_free_rotation
+from ..motion.history import UNKNOWN_TURN, PoseErrors
 from ..motion_fit import candidates, model_selection, noise, pose_weights
 from ..playback import group_dynamics, modes, scene_player
 from ..scene.scene import MotionGroup, Scene
@@ -133,31 +136,36 @@ def _of_models(
 
 
 def fit_all(scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], names: tuple[str, ...] | None) -> FittedMethod:
-    """Fit the tracks of the bodies as baking does, choosing from ``names``."""
+    """Fit the tracks of the bodies, choosing from ``names``; see `fit_group`."""
     started = time.process_time()
     fits = tuple(fit_group(scene, body.group, names) if body.group.role == "body" else None for body in bodies)
     return FittedMethod(fits, 1e3 * (time.process_time() - started))
 
 
 def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -> model_selection.Fit:
-    """Fit the track of a body as baking does.
+    """Fit the track of a body with the stored errors of its poses and the up axis, as baking does.
+
+    Rotations that the images do not determine are left out, also out of the confidence band. Unlike the motions of the
+    scene file, this fit knows neither the joints of parts nor the gravity that falling bodies share. It follows
+    rotation about a single unseen axis, and motion that baking has found to be noise but kept up to t_max.
 
     Args:
         scene: The scene.
         group: A motion group of role "body".
         names: Motion models to choose from, of `MODELS`; all if None.
     """
-    track, radius = scene.tracks.poses[group.id], group.model.radius
+    track, errors = _track(scene, group)
+    radius = group.model.radius
     first, last = group.seen or (-np.inf, np.inf)
-    rows, opacities = group_dynamics.opaque_members(scene, np.flatnonzero(scene.gaussians.motion_ids == group.id))
+    rows, _ = group_dynamics.opaque_members(scene, np.flatnonzero(scene.gaussians.motion_ids == group.id))
     # Only a free top needs the inertia, so it is computed only if that model is a candidate.
     shape = None
     if names is None or names == (candidates.FREE_TOP.name,):
-        shape = torque_free_rotation.inertia(scene.gaussians.means[rows] - group.pivot, opacities)
+        shape = torque_free_rotation.inertia(scene.gaussians.means[rows])
         shape = shape + _MIN_MOMENT * np.eye(3)
     seen = (scene.tracks.times >= first - _SAME) & (scene.tracks.times <= last + _SAME)
     turns = bool(np.any(track[:, 1:4] != 0))
-    known = pose_weights.from_errors(group.history.errors, seen, radius, turns, group.rigid_rms)
+    known = pose_weights.from_errors(errors, seen, radius, turns, group.rigid_rms)
     return model_selection.fit(
         scene.tracks.times,
         track[:, :4],
@@ -170,6 +178,24 @@ def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -
         drift=known.drift,
         up=UP_AXIS.get(scene.world_convention),
     )
+
+
+def _track(scene: Scene, group: MotionGroup) -> tuple[np.ndarray, PoseErrors | None]:
+    """Return the poses of a body [S, 7] and their errors, without its rotation if the images do not determine it.
+
+    The centre of the body then moves as before, because the place of the pivot in the true body is unknown.
+    """
+    track, errors = scene.tracks.poses[group.id], group.history.errors
+    if errors is None or not any(map(math.isfinite, errors.turn)):
+        return track, errors
+    if min(value for value in errors.turn if math.isfinite(value)) < UNKNOWN_TURN:
+        return track, errors
+    members = scene.gaussians.means[scene.gaussians.motion_ids == group.id].astype(np.float64)
+    center = np.median(members, axis=0) - group.pivot
+    plain = track.copy()
+    plain[:, :4] = rotations.identity(len(track))
+    plain[:, 4:] += rotations.rotate(track[:, :4], np.broadcast_to(center, (len(track), 3))) - center
+    return plain, dataclasses.replace(errors, turn=tuple(np.where(np.isinf(errors.turn), np.inf, 0.0).tolist()))
 
 
 def model_of(body: ground_truth_poses.Body, fit: model_selection.Fit | None) -> models.MotionModel:
