@@ -173,8 +173,8 @@ def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:
     measured, compared = (any(getattr(row, key) is not None for row in rows) for key in ("rigid_rms", "iou"))
     numbers = (*(["bends"] if measured else []), "sure", "strays", *(["IoU"] if compared else []))
     for name in ("id", "name", "count", "pixels", "views", "motion", *numbers):
-        left = name in ("name", "motion")
-        shown.add_column(name, justify="left" if left else "right", no_wrap=name != "name", overflow="fold")
+        words = name in ("name", "motion")
+        shown.add_column(name, justify="left" if words else "right", no_wrap=not words, overflow="fold")
     for row in rows:
         cells = [str(row.id), ", ".join([row.name, *row.aliases]), str(row.gaussians), f"{row.pixels:.0f}"]
         cells += [str(row.views), row.motion]

@@ -148,3 +148,17 @@ def test_the_table_fits_a_narrow_terminal(scene, data):
     rows = object_table.measure(scene, data.val, backend=BACKEND)
     assert all(len(line) <= 80 for line in shown(scene, rows, width=80).splitlines())
     assert "throw+spin" in shown(scene, rows, width=80)
+
+
+def test_a_narrow_terminal_shows_names_and_whole_warnings(scene, data):
+    band = Band((scene.t_max, 2 * scene.t_max), (0.1, 0.1), (0.1, 0.1), predictable_until=0.96)
+    found = History((Event(0.25, "start", 0.01), Event(0.55, "impact", 0.01)), (), band)
+    groups = [dataclasses.replace(g, history=found) if g.id == 1 else g for g in scene.groups]
+    hit = dataclasses.replace(scene, groups=tuple(groups))
+    rows = object_table.measure(hit, data.val, backend=BACKEND)
+    lines = shown(hit, rows, width=80).splitlines()
+    assert all(len(line) <= 80 for line in lines)
+    words, text = " ".join(lines).split(), found.text().replace(" ", "")
+    assert {"id", "name", "motion", "strays", "IoU", "mug,", "apple,", "car,"} <= {*words}
+    start, end = lines[2].index("motion"), lines[2].index("bends") - 1
+    assert text in "".join(line[start:end].strip() for line in lines).replace(" ", "")
