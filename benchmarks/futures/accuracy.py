@@ -19,9 +19,9 @@ Tracks of 15 poses on [0, 0.75] are drawn by `simulated_tracks` and fitted by `m
     slip       share of tracks with a slipped rotation
     ms         processor time per track
 
-The totals of a noise are: tracks; errors inside the band; failures (error above 20 % of the size), the share of them
-that is flagged, and the share of the other tracks that is flagged; found events, big and all; surplus events per track;
-and the share of tracks without true events in which an event was found.
+The totals of a noise are: tracks; errors inside the band; median half width; failures (error above 20 % of the size),
+the share of them that is flagged, and the share of the other tracks that is flagged; found events, big and all; surplus
+events per track; and the share of tracks without true events in which an event was found.
 """
 
 from __future__ import annotations
@@ -167,6 +167,21 @@ def text(row: dict[str, Any]) -> str:
     )
 
 
+MARKDOWN = (
+    "| motion | draws | error, median (90 %) | line | still | holds | width | flagged | with an event | events found |",
+    "|---|---|---|---|---|---|---|---|---|---|",
+)
+MARKDOWN_TOTALS = (
+    "| noise | tracks | errors inside the band | half width, median | failures | of these flagged | false alarms "
+    "| jumps above 5 sigma found | smooth tracks with an event |",
+    "|---|---|---|---|---|---|---|---|---|",
+)
+
+
+def _share(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
 def markdown(row: dict[str, Any]) -> str:
     """Row as a line of the tables in docs/results/predicted_motion.md."""
 
@@ -181,19 +196,35 @@ def markdown(row: dict[str, Any]) -> str:
         f"{row['holds']:.2f}",
         percent(row["width"]),
         *(f"{row[key]:.2f}" for key in ("flagged", "event")),
-        "-" if math.isnan(row["found"]) else f"{row['found']:.2f}",
+        _share(row["found"], 2),
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def markdown_totals(noise: str, total: dict[str, float]) -> str:
+    """Totals of a noise as a line of the table of all noises in docs/results/predicted_motion.md."""
+    flagged = total["failures_flagged"] * total["failures"] if total["failures"] else 0.0
+    cells = [
+        noise,
+        str(total["tracks"]),
+        f"{total['holds']:.3f}",
+        f"{total['width']:.1f}",
+        str(total["failures"]),
+        f"{flagged:.0f}",
+        *(_share(total[key], 3) for key in ("false_alarms", "big_events_found", "smooth_with_event")),
     ]
     return f"| {' | '.join(cells)} |"
 
 
 def overall(found: list[dict[str, Any]]) -> dict[str, float]:
-    """Coverage, quality of the flag, and found events, over all tracks of a noise."""
+    """Coverage, median half width, quality of the flag, and found events, over all tracks of a noise."""
     bad = [row["flagged"] for row in found if row["error"] > scoring.BAD]
     good = [row["flagged"] for row in found if row["error"] <= scoring.BAD]
     smooth = [row["event"] for row in found if row["true"] == 0]
     return {
         "tracks": len(found),
         "holds": float(np.mean([row["inside"] for row in found])),
+        "width": float(np.median([row["width"] for row in found])),
         "failures": len(bad),
         "failures_flagged": float(np.mean(bad)) if bad else float("nan"),
         "false_alarms": float(np.mean(good)) if good else float("nan"),
@@ -202,6 +233,15 @@ def overall(found: list[dict[str, Any]]) -> dict[str, float]:
         "surplus_events": float(np.mean([row["surplus"] for row in found])),
         "smooth_with_event": float(np.mean(smooth)) if smooth else float("nan"),
     }
+
+
+def _defined(value: Any) -> Any:
+    """Return a JSON tree with None instead of NaN."""
+    if isinstance(value, dict):
+        return {key: _defined(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_defined(one) for one in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def main() -> None:
@@ -214,13 +254,16 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--tracks", type=Path, metavar="FILE", help="write the results of all tracks, as JSON")
     parser.add_argument("--merge", type=Path, nargs="+", metavar="FILE", help="tabulate files of --tracks instead")
-    parser.add_argument("--markdown", action="store_true", help="print the rows of the tables in the documentation")
+    parser.add_argument("--markdown", action="store_true", help="print the tables of the documentation")
     options = parser.parse_args()
     rows, totals, tracks = [], {}, []
     merged = [track for path in options.merge or () for track in json.loads(path.read_text())]
-    print("" if options.markdown else HEAD)
+    if not options.markdown:
+        print(HEAD)
     for noise in options.noise:
         everything = []
+        if options.markdown:
+            print(f"{noise}\n\n{MARKDOWN[0]}\n{MARKDOWN[1]}")
         for name in options.motions:
             seeds = range(options.first, options.first + options.draws)
             if options.merge:
@@ -234,11 +277,17 @@ def main() -> None:
             print(markdown(rows[-1]) if options.markdown else text(rows[-1]), flush=True)
             tracks += [{**row, "noise": noise, "motion": name} for row in found]
         totals[noise] = overall(everything)
-        print(noise, {key: round(value, 3) for key, value in totals[noise].items()}, flush=True)
+        if options.markdown:
+            print(flush=True)
+        else:
+            print(noise, {key: round(value, 3) for key, value in totals[noise].items()}, flush=True)
+    if options.markdown:
+        print("\n".join([*MARKDOWN_TOTALS, *(markdown_totals(noise, total) for noise, total in totals.items())]))
     if options.tracks:
         options.tracks.write_text(json.dumps(tracks) + "\n")
     if options.json:
-        options.json.write_text(json.dumps({"rows": rows, "totals": totals}, indent=1) + "\n")
+        result = _defined({"rows": rows, "totals": totals})
+        options.json.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
 
 
 if __name__ == "__main__":
