@@ -1,15 +1,18 @@
-"""Errors of observed poses from images: as large as real errors, infinite without views, weights of a fit."""
+"""Errors of observed poses from images: as large as those of poses fitted to noisy images, infinite without views."""
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from r5dgs_core.bake import pose_errors
 from r5dgs_core.bake.unseen_rotations import Unseen
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
+from r5dgs_core.motion import rotations
 from r5dgs_core.motion.history import PoseErrors
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import sampling
 from tests.support import tiny_datasets
 
 HIDDEN = 2  # knot
@@ -53,6 +56,47 @@ def test_errors_follow_the_misfit_and_are_infinite_at_knots_that_no_image_shows(
         for name in ("place", "turn"):
             growth = np.median(np.array(getattr(noisy[group], name))[seen] / np.array(getattr(own, name))[seen])
             assert 2 < growth < 8
+
+
+def moved(scene, groups, axis, step):
+    """The scene with its bodies turned about axes 0 to 2, by radians, or shifted along axes 3 to 5, by world units."""
+    poses = scene.tracks.poses.copy()
+    for group in groups if axis < 3 else ():
+        poses[group, :, :4] = rotations.multiply(
+            rotations.rotvecs_to_quats(step * np.eye(3)[axis]), poses[group, :, :4]
+        )
+    if axis >= 3:
+        poses[groups, :, 1 + axis] += step
+    return scene_player.Player(scene.with_arrays(track_poses=poses))
+
+
+def fitted_errors(scene, data, groups, knot, noise, draws=40, step=0.01):
+    """Errors per component of rotations and displacements that fit images with noise best, by body; to first order."""
+    views = [view for view in data.train if abs(view.t - scene.tracks.times[knot]) < 1e-6]
+    players = [scene_player.Player(scene), *(moved(scene, groups, axis, step) for axis in range(6))]
+    slopes = {group: [] for group in groups}
+    for view in sampling.spread(views, pose_errors.VIEWS):
+        drawn = [scene_renderer.render_frame(scene, player.frame(view.t), view.camera) for player in players]
+        change = np.stack([picture.color.astype(np.float64) - drawn[0].color for picture in drawn[1:]], -1) / step
+        for group in groups:
+            near = ndimage.binary_dilation(drawn[0].ids == scene.groups[group].object_id, iterations=3)
+            slopes[group].append(change[near].reshape(-1, 6))
+    found = {}
+    for group, parts in slopes.items():
+        columns = np.concatenate(parts)
+        wrong = np.random.default_rng(0).normal(scale=noise, size=(len(columns), draws))
+        off = np.linalg.lstsq(columns, wrong, rcond=None)[0]
+        found[group] = np.sqrt((off[:3] ** 2).mean()), np.sqrt((off[3:] ** 2).mean())
+    return found
+
+
+def test_errors_are_as_large_as_those_of_poses_fitted_to_noisy_images(monkeypatch, given):
+    scene, data = given
+    claimed = measured(monkeypatch, scene, data, noise=0.02)
+    for knot in (0, 4):
+        for group, (turn, place) in fitted_errors(scene, data, list(claimed), knot, 0.02).items():
+            assert 0.5 < claimed[group].turn[knot] / turn < 2
+            assert 0.5 < claimed[group].place[knot] / place < 2
 
 
 def test_rotations_are_unknown_if_the_images_show_another_texture(monkeypatch, given):
