@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -70,20 +70,22 @@ def fit(
 
 
 def with_unknown_motion(
-    groups: Sequence[MotionGroup], observed: np.ndarray, times: np.ndarray
+    groups: Sequence[MotionGroup], observed: np.ndarray, times: np.ndarray, fitted: Collection[int]
 ) -> tuple[MotionGroup, ...]:
-    """Return the groups, with the band of an unknown motion for bodies that were seen at one time at most.
+    """Return the groups, with the band of an unknown motion for bodies that have too few poses for a fit.
 
     Args:
         groups: The motion groups.
         observed: Knots at which each group was placed. [G, S] bool
         times: Times of the knots. [S]
+        fitted: Indices of the groups whose motion was fitted; without a band, fewer than two poses were usable.
     """
     found, span = list(groups), float(times[-1] - times[0])
     for group in groups:
-        if group.role == "body" and observed[group.id].sum() < 2 and span > 0:
-            unknown = bands.unknown(float(times[-1]), span, group.model.radius)
-            found[group.id] = dataclasses.replace(group, history=dataclasses.replace(group.history, band=unknown))
+        lost = group.id in fitted and group.history.band is None
+        if group.role == "body" and span > 0 and (lost or observed[group.id].sum() < 2):
+            band = bands.of_unknown_motion(float(times[-1]), span, group.model.radius)
+            found[group.id] = dataclasses.replace(group, history=dataclasses.replace(group.history, band=band))
     return tuple(found)
 
 

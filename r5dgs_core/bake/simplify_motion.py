@@ -189,7 +189,7 @@ def simplify(
             history = dataclasses.replace(history, errors=pose_errors.with_unseen(history.errors, unseen[index]))
         groups[index] = dataclasses.replace(groups[index], model=model, history=history)
     slipped = {index: fit.slipped for index, fit in shared.items() if fit.slipped}
-    groups = future_fit.with_unknown_motion(groups, observed, scene.tracks.times)
+    groups = future_fit.with_unknown_motion(groups, observed, scene.tracks.times, shared)
     return Simplified(dataclasses.replace(bound, groups=groups), tuple(rows), slipped)
 
 

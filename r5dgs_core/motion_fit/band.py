@@ -31,6 +31,7 @@ _LINE = math.sqrt(12.0)  # drift at a constant rate over the span, in standard d
 _SOFT = 3.5  # difference of losses that reduces a candidate's weight by e
 _OUTLIER = families.SOFTNESS  # maximum loss of a pose in this difference
 _FARTHEST = 8.0  # maximum counted distance of another candidate, in radii
+_LATER = 5  # number of the knots past the first span, of a body that enters late
 _MAX_SCALE = 36.0  # maximum factor on the covariance from the errors of earlier predictions
 
 
@@ -51,7 +52,7 @@ def confidence_band(selected: Selected, variance: float, drift: Noise, until: fl
         drift: Drift of the track over its span.
         until: End of the band, spans past t_max.
     """
-    tau = np.linspace(0.0, until, MAX_KNOTS)
+    tau = _knots(until)
     chosen, noise_level, noise = selected.chosen, selected.noise_level, selected.noise
     place, turn = _variance(chosen, variance, tau)
     place2, turn2 = _spread(chosen, selected.solutions, noise_level, tau)
@@ -65,6 +66,13 @@ def confidence_band(selected: Selected, variance: float, drift: Noise, until: fl
     width = _MULTIPLE * np.sqrt(place + 2 / 3 * turn)
     wide = np.flatnonzero(width > WIDE)
     return Widths(tau, width, _MULTIPLE * np.sqrt(turn), _crossing(tau, width, int(wide[0])) if len(wide) else None)
+
+
+def _knots(until: float) -> np.ndarray:
+    """Times of the knots since t_max, spans: evenly spread over one span, and ever wider apart up to ``until``. [H]"""
+    if until <= 1:
+        return np.linspace(0.0, 1.0, MAX_KNOTS)
+    return np.concatenate([np.linspace(0.0, 1.0, MAX_KNOTS - _LATER), np.geomspace(1.0, until, _LATER + 1)[1:]])
 
 
 @dataclass(frozen=True)
@@ -107,8 +115,8 @@ def trusted(band: Band, radius: float) -> Band:
     return replace(band, predictable_until=until)
 
 
-def unknown(t_max: float, span: float, radius: float) -> Band:
-    """Return the band of a body that was seen at one time at most, so that its motion is unknown."""
+def of_unknown_motion(t_max: float, span: float, radius: float) -> Band:
+    """Return the band of a body with fewer than two poses, whose motion is unknown."""
     width = _FARTHEST * radius
     return Band((t_max, t_max + span), (width, width), (math.pi, math.pi), LEVEL, t_max)
 

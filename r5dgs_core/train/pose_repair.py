@@ -37,7 +37,8 @@ CLEARLY = 0.93  # largest image error of a new pose that is accepted, relative t
 MUCH = 0.7  # the same, of a new pose that does not explain the body either
 SIMILAR = 1.03  # image error below which the pose nearest to the prediction is taken, relative to the smallest error
 FAIR = 0.8  # image error above which starts from afar are tried, relative to that of an unexplained body
-APART = np.radians(3.0)  # smallest angle between different poses, and smallest distance in radii of the body
+APART = np.radians(3.0)  # smallest angle between different poses
+MOVED = 0.05  # smallest distance between different poses, radii of the body
 TURNS = np.radians((25.0, 50.0))  # rotations of the prediction about each axis that are tried as starts
 VIEWS = 3  # maximum number of views of a knot
 REFINED = 2  # number of starts that are refined
@@ -142,8 +143,8 @@ def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit
         seen: Knots that may predict it.
         limit: Picture error above which the body is not explained. Turns of the prediction are then tried; if they do
             not explain it either, it may bend, and keeps its pose unless the error becomes much smaller.
-        settled: True if all times have entered. Before, the body is not yet sharp, so that it is not sought from afar,
-            and neither moved without a turn, nor in a single view.
+        settled: True if all times have entered. Before, the body is not yet sharp, so it is not searched from afar,
+            moved without a turn, or registered in a single view.
     """
     look = BodyRegistration(trainer, _tracks(trainer), body, knot, VIEWS)
     predicted, carried = _predictions(trainer, body, knot, seen)
@@ -159,7 +160,7 @@ def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit
     least = min(error for _, error in found)
     near = [pose for pose, error in found if error <= SIMILAR * least]
     best = min(near, key=lambda pose: float(rotations.angle_between(pose[0], predicted[0][0])))
-    moved = np.linalg.norm(best[1] - own[1]) > APART * look.radius
+    moved = np.linalg.norm(best[1] - own[1]) > MOVED * look.radius
     before = look.error(own)
     most = max(limit, MUCH * before) if settled else limit
     better = (_apart(best, own) or (settled and moved)) and least < min(CLEARLY * before, most)
@@ -169,10 +170,10 @@ def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit
 
 
 def _predictions(trainer: Trainer, body: int, knot: int, seen: np.ndarray) -> tuple[list[Pose], list[Pose]]:
-    """Poses that other knots predict by constant spin: between neighbours, from before, from after; or the nearest.
+    """Poses that other knots predict: between neighbours, from before, from after; or the nearest.
 
     Returns:
-        The predicted rotations with the present displacement, and with the displacement of constant velocity.
+        Poses by constant spin at the present displacement, and poses by constant spin and constant velocity.
     """
     before, after = seen[seen < knot][::-1], seen[seen > knot]
     pairs = [(side[0], side[1]) for side in (before, after) if len(side) > 1]

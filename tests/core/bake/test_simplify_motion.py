@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r5dgs_core.bake import bake, bind_state, image_evidence, simplify_motion
+from r5dgs_core.bake import bake, bind_state, image_evidence, pose_errors, simplify_motion
 from r5dgs_core.config.config import NeedsSection
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.motion import rotations
+from r5dgs_core.motion.history import PoseErrors
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
@@ -122,16 +123,21 @@ def test_a_turn_that_carries_a_shadow_is_kept_while_it_is_seen_and_not_foretold(
     np.testing.assert_array_equal(later[1][BRICK], 0)
 
 
-@pytest.mark.default_cases("rest")
-def test_the_motion_of_a_body_that_was_seen_once_is_not_predictable(given):
-    _, truth, _ = given
-    observed = np.ones(truth.tracks.poses.shape[:2], bool)
-    observed[BRICK, 1:] = False
-    found = simplify_motion.simplify(truth, observed, None).scene
+@pytest.mark.parametrize("by", ["masks", "errors"])
+def test_the_motion_of_a_body_that_was_seen_once_is_not_predictable(given, by):
+    name, truth, _ = given
+    observed, measured = np.ones(truth.tracks.poses.shape[:2], bool), pose_errors.NOTHING
+    if by == "masks":
+        observed[BRICK, 1:] = False
+    else:
+        values = (0.01, *(np.inf,) * (len(TIMES) - 1))
+        measured = pose_errors.Measured({BRICK: PoseErrors(values, values)}, {})
+    found = simplify_motion.simplify(truth, observed, None, measured=measured).scene
     histories = {group.object_id: group.history for group in found.groups if group.role == "body"}
-    assert histories[BRICK].warning() == f"not predictable past {truth.t_max:.2f}"
-    assert histories[BRICK].band.half_width[0] > 1.0
     assert not histories[BALL].warning(predictability.horizon(truth))
+    if name != "rest" or by == "masks":
+        assert histories[BRICK].warning() == f"not predictable past {truth.t_max:.2f}"
+        assert histories[BRICK].band.half_width[0] > 1.0
 
 
 def test_without_images_only_what_is_too_small_to_be_seen_is_dropped(given):

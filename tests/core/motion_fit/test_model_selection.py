@@ -296,6 +296,20 @@ def test_a_body_that_enters_late_has_a_band_as_long_as_those_of_the_others(count
     assert fit.history.warning(T_MAX + HORIZON[0]).startswith("not predictable past")
 
 
+def test_the_start_of_the_scene_does_not_change_how_far_a_late_body_is_predictable():
+    times = np.linspace(0, T_MAX, 200)
+    quats, d, _, _ = problems.observe(MOTIONS["rolling"][0], times, np.random.default_rng(5), 0.01 * SIZE, 0.02)
+    late, bands = (np.arange(200) >= 192).astype(float), []
+    for first in (0, 150, 192):
+        fit = model_selection.fit(times[first:], quats[first:], d[first:], radius=RADIUS, weights=late[first:])
+        bands.append(fit.history.band)
+    span, until = T_MAX - times[192], [band.predictable_until - T_MAX for band in bands]
+    assert until == pytest.approx([until[-1]] * 3, abs=0.02 * span) and 0.1 * span < until[-1] < span
+    near = T_MAX + span * np.array([0.3, 0.7, 1.0])
+    for band in bands[:2]:
+        np.testing.assert_allclose(band.widths(near), bands[-1].widths(near), rtol=0.02)
+
+
 def test_a_drift_of_the_track_widens_the_band_and_not_the_fit():
     (plain, _), (wide, _) = (
         fitted("ballistic, spinning", np.random.default_rng(1), 2e-3, 2e-3, drift=drift)
