@@ -160,7 +160,7 @@ def _repair_knot(trainer: Trainer, body: int, knot: int, seen: np.ndarray, limit
     least = min(error for _, error in found)
     near = [pose for pose, error in found if error <= SIMILAR * least]
     best = min(near, key=lambda pose: float(rotations.angle_between(pose[0], predicted[0][0])))
-    moved = np.linalg.norm(best[1] - own[1]) > MOVED * look.radius
+    moved = float(np.linalg.norm(best[1] - own[1])) > MOVED * look.radius
     before = look.error(own)
     most = max(limit, MUCH * before) if settled else limit
     better = (_apart(best, own) or (settled and moved)) and least < min(CLEARLY * before, most)
