@@ -134,7 +134,7 @@ def _plan(
 
 
 def _length_notes(names: list[str], choice: Choice) -> list[str]:
-    """Remarks about time that only some cameras recorded, one about its begin and one about its end."""
+    """Remarks about time that only some cameras recorded, one about its beginning and one about its end."""
     begins, ends = choice.spans.T
     notes = []
     for unused, word in ((begins.max() - begins, "begins later"), (ends - ends.min(), "ends earlier")):
