@@ -67,6 +67,8 @@ class Context:
         if self._explained is None:
             return None
         pixels, given = self._explained[0], self._explained[1][view.name]
+        if not pixels.knows(given):
+            return None
         behind = train_views.behind(self.given, self.config)
         return pixels.of(given, datasets.load_image(given, behind), datasets.load_mask(given))
 

@@ -29,6 +29,10 @@ class ExplainedPixels:
         views = [view for view in dataset.train if view.mask_path is not None]
         self._usual = unexplained.of_cameras(views, read)
 
+    def knows(self, view: View) -> bool:
+        """Return True if the usual colours of a view's camera are known. Reads no file."""
+        return view.camera.name in self._usual
+
     def of(self, view: View, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray | None:
         """Return the explained pixels of a view; None if it has no mask or its camera is unknown. [H, W] bool
 
@@ -37,7 +41,7 @@ class ExplainedPixels:
             image: Its image, sRGB in [0, 1], in the colours of the given camera. [H, W, 3]
             mask: Its object ids, or None. [H, W]
         """
-        if mask is None or view.camera.name not in self._usual:
+        if mask is None or not self.knows(view):
             return None
         blocks = self._usual[view.camera.name].blocks(images.to_uint8(image), mask)
         return ~unexplained.enlarged(blocks, view.camera.height, view.camera.width)

@@ -201,3 +201,17 @@ def test_baking_finds_the_regions_of_the_run(crossed):
         assert np.array_equal(view.unexplained, ~context.explained(one))
     dropped = dataclasses.replace(context, state=of_run(unexplained_views.Decision(0.2, False)))
     assert dropped.explained(corrected.train[0]) is None
+
+
+def test_baking_reads_no_files_of_cameras_without_usual_colours(crossed, monkeypatch):
+    _, _, decision = decided(crossed)
+    unmasked = dataclasses.replace(
+        crossed, train=tuple(dataclasses.replace(view, mask_path=None) for view in crossed.train)
+    )
+    run_of = types.SimpleNamespace(config=tiny_datasets.settings())
+    context = Context(run_of, of_run(decision), unmasked, Normalization(np.zeros(3), 1.0), unmasked)
+    read = []
+    for name in ("load_image", "load_mask"):
+        monkeypatch.setattr(datasets, name, lambda view, *_: read.append(view.name))
+    assert [context.explained(view) for view in unmasked.train] == [None] * len(unmasked.train)
+    assert not read
