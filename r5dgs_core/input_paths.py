@@ -50,8 +50,12 @@ def check_target(path: Path) -> None:
         check_scene(path)
 
 
-def check_scene_output(out: Path) -> None:
+def check_scene_output(out: Path, made: Path | None = None) -> None:
     """Check the output path of a scene file: its suffix, which Blender's file browser filters by, and its folder.
+
+    Args:
+        out: The output path.
+        made: Folder that the command creates before it writes the scene file, if any.
 
     Raises:
         UsageError: The name has another suffix.
@@ -61,6 +65,8 @@ def check_scene_output(out: Path) -> None:
         raise errors.SceneFileError(f"{out}: is a folder; name the file, for example {out / 'scene.r5dgs'}")
     if out.suffix.lower() != SCENE_SUFFIX:
         raise errors.UsageError(f"{out}: expected a name that ends in {SCENE_SUFFIX}, which Blender filters files by")
+    if made is not None and not made.exists() and out.parent.absolute() == made.absolute():
+        return
     if not out.parent.is_dir():
         raise errors.SceneFileError(f"{out}: expected the folder {out.parent} to exist; create it first")
     if not _is_writable(out.parent):

@@ -98,7 +98,7 @@ def run_train(
     ``scene`` is the scene file to which the run is then baked (see `bake.run_bake`), if any.
     """
     if scene is not None:
-        input_paths.check_scene_output(scene)
+        input_paths.check_scene_output(scene, made=out)
     count = 1 if workers is None else workers.count
     settings = options.training_settings(out, config_path, overrides, preset=preset, resume=resume, processes=count)
     inputs.check_dataset(data)

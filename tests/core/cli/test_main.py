@@ -192,6 +192,14 @@ def test_train_can_write_the_scene_file_too(made, tiny, tmp_path, capsys):
     assert "expected a name that ends in .r5dgs" in line
 
 
+def test_train_accepts_a_scene_file_in_the_run_folder_that_it_makes(tmp_path, capsys):
+    run, data = tmp_path / "run", tmp_path / "no_data"
+    line = complaint(capsys, "train", data, "--out", run, "--scene", run / "scene.r5dgs")
+    assert str(data) in line and "create it first" not in line
+    line = complaint(capsys, "train", data, "--out", run, "--scene", tmp_path / "other" / "scene.r5dgs")
+    assert "create it first" in line
+
+
 def test_a_cap_and_a_preset_reach_the_run(tiny, tmp_path, capsys):
     run, given = tmp_path / "run", ["train", str(tiny.root), "--progress", "none", *OPTIONS]
     assert main.main([*given, "--out", str(run), "--max-gaussians", "120", "--preset", "fast"]) == 0
