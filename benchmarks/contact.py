@@ -36,7 +36,7 @@ TABLE = -0.0018  # height of the plane in which a resting cube's lowest corners 
 PLACE_NOISE, TURN_NOISE = 0.01 * WIDTH, np.radians(1.0)
 KNOWN = world.Material(0.18, 0.125)
 SHARE = 0.6
-FACE = 45.0  # degrees
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def read(folder: Path, which: str) -> list[np.ndarray]:
@@ -51,7 +51,7 @@ def read(folder: Path, which: str) -> list[np.ndarray]:
 def cube_world() -> world.World:
     """Cube in its own frame, over the table."""
     corners = 0.5 * WIDTH * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    plane = world.Plane(np.array([0.0, 0.0, 1.0]), TABLE)
+    plane = world.Plane(UP, TABLE)
     return world.World((world.Body(solid.of(corners)),), plane, np.array([0.0, 0.0, -9.81]))
 
 
@@ -99,7 +99,8 @@ def study(toss: np.ndarray, until: str, samples: int, seed: int) -> dict[str, An
     apart = float(np.linalg.norm(center - truth[1]))
     radius = float(sampled.radii(center, 0.9)[0])
     row |= {"covered": apart <= radius, "radius": radius / WIDTH}
-    row["other_faces"] = sampled.other_faces(found["contact"][0])
+    row["other_faces"] = sampled.other_faces(found["contact"][0], UP)
+    row["wrong_face"] = bool(futures.on_other_face(found["contact"][0], rotations.normalize(truth[0]), UP))
     row |= {"friction": estimate.material.friction, "restitution": estimate.material.restitution}
     return row
 
@@ -112,7 +113,7 @@ def _smooth(track: observed_track.Track, end: float) -> tuple[np.ndarray, np.nda
     """Prediction of the law that is fitted to the poses without contacts."""
     last = track.quats[-1], track.places[-1]
     quats = rotations.multiply(track.quats, rotations.conjugate(last[0]))
-    fit = model_selection.fit(track.times, quats, track.places - last[1], radius=0.5 * WIDTH, up=np.array([0, 0, 1.0]))
+    fit = model_selection.fit(track.times, quats, track.places - last[1], radius=0.5 * WIDTH, up=UP)
     turn, moved = models.evaluate(fit.model, end - track.times[-1])
     return rotations.multiply(turn, last[0]), last[1] + moved
 
@@ -133,7 +134,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
             "turn": np.median(errors[:, 1]),
             "turn_90": np.quantile(errors[:, 1], 0.9),
         }
-    wrong = np.array([row["contact"][1] > FACE for row in rows])
+    wrong = np.array([row["wrong_face"] for row in rows])
     result |= {
         "covered": np.mean([row["covered"] for row in rows]),
         "radius": np.median([row["radius"] for row in rows]),

@@ -15,7 +15,7 @@ from .world import Material, State
 WIDENED = 2.0  # factor on standard deviations of a fit to poses, calibrated on tosses of a cube
 CONTRADICTS = 29.1  # squared change of the poses, in units of the widened noise; 99 % of chi2 of 14 parameters
 _ATTEMPTS = 10
-_FACE = np.pi / 4  # angle beyond which two rotations put a body on different faces
+_FACE = np.pi / 4  # angle between up directions in the frame of a body beyond which it lies on different faces
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,21 @@ class Futures:
         """Angles to rotations [T, 4] within which the share ``level`` of the samples lies, rad. [T]"""
         return np.quantile(rotations.angle_between(self.quats, quats[:, None]), level, axis=1)
 
-    def other_faces(self, quat: np.ndarray) -> float:
-        """Share of the samples that end on another face than a predicted rotation. [4]"""
-        return float(on_other_face(self.quats[-1], quat).mean())
+    def other_faces(self, quat: np.ndarray, up: np.ndarray) -> float:
+        """Share of the samples that end on another face than a predicted rotation [4]; see `on_other_face`."""
+        return float(on_other_face(self.quats[-1], quat, up).mean())
 
 
-def on_other_face(quats: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    """True for rotations [..., 4] that put a body on another face than one does. [4]"""
-    return rotations.angle_between(quats, np.broadcast_to(quat, quats.shape)) > _FACE
+def on_other_face(quats: np.ndarray, quat: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """True for rotations [..., 4] that put a body on another face than one does [4]; turns about ``up`` do not. [...]
+
+    Args:
+        quats: Unit wxyz, from the body to the world. [..., 4]
+        quat: The one to compare with. [4]
+        up: Unit normal of the support, in the world. [3]
+    """
+    upward = rotations.rotate(rotations.conjugate(quats), np.broadcast_to(up, (*quats.shape[:-1], 3)))
+    return upward @ rotations.rotate(rotations.conjugate(quat), up) < np.cos(_FACE)
 
 
 def normals(count: int, rng: np.random.Generator) -> np.ndarray:
