@@ -26,7 +26,7 @@ class Odds:
         leaves: It is off the plane that supports it at the end.
         hits: It touches an object before any other, by name; objects that it never touches are left out.
         turns_over: It ends on another face than in the shown prediction, turns about the vertical aside; None for
-            balls, which have no faces.
+            balls, which have no faces, and without a known vertical.
     """
 
     name: str
@@ -64,12 +64,12 @@ def of(scene: Scene, count: int, seed: int = 0) -> list[Odds]:
     assert found.recording is not None
     times, quats = found.recording.times, found.recording.quats
     shown = quats[min(int(np.searchsorted(times, duration)), len(times) - 1)]
-    up = world_axes.UP_AXIS[scene.world_convention] if made.world.plane is None else made.world.plane.normal
+    up = world_axes.UP_AXIS.get(scene.world_convention) if made.world.plane is None else made.world.plane.normal
     numbers = [number for number, body in enumerate(made.bodies) if body.name in found.taken]
     return [_odds(made, number, sampled, shown[number], up) for number in numbers]
 
 
-def _odds(made: SceneWorld, number: int, sampled: list[Recording], shown: np.ndarray, up: np.ndarray) -> Odds:
+def _odds(made: SceneWorld, number: int, sampled: list[Recording], shown: np.ndarray, up: np.ndarray | None) -> Odds:
     """Odds of a body; ``shown`` is its rotation at the end of the shown prediction [4], ``up`` a unit vector [3]."""
     firsts = [_first(number, future) for future in sampled]
     hits = {
@@ -79,7 +79,7 @@ def _odds(made: SceneWorld, number: int, sampled: list[Recording], shown: np.nda
     rests = sum(bool(future.slow[number]) for future in sampled) / len(sampled)
     leaves = sum(_is_off(made, number, future) for future in sampled) / len(sampled)
     turns_over = None
-    if made.world.bodies[number].ball_radius is None:
+    if up is not None and made.world.bodies[number].ball_radius is None:
         ends = np.array([future.quats[-1, number] for future in sampled])
         turns_over = float(futures.on_other_face(ends, shown, up).mean())
     return Odds(made.bodies[number].name, rests, leaves, hits, turns_over)
