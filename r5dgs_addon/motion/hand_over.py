@@ -284,10 +284,11 @@ def _animate(proxy: bpy.types.Object, body: _Body, center: np.ndarray, frame: in
     """
     rigid = proxy.rigid_body
     rigid.collision_shape, rigid.mass = "CONVEX_HULL", max(rigid_bodies.DENSITY * proxy.pop("r5dgs_volume"), 1e-3)
-    own, simulated = body.anchor.r5dgs_contact, physics.has_contact(body.anchor)
-    if simulated or own.use_friction:
+    own, fitted = body.anchor.r5dgs_contact, physics.material(body.anchor)
+    rigid.friction, rigid.restitution = fitted or (rigid.friction, rigid.restitution)
+    if own.use_friction:
         rigid.friction = own.friction
-    if simulated or own.use_bounciness:
+    if own.use_bounciness:
         rigid.restitution = own.bounciness
     rigid.linear_damping = rigid.angular_damping = 0.0
     rigid.use_deactivation = False

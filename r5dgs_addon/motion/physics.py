@@ -60,12 +60,11 @@ def remember(
                 "follow_matrix": None if group.follow_matrix is None else np.asarray(group.follow_matrix).tolist(),
                 "reach": float(reaches[motion_id]) if motion_id else 0.0,
                 "allowed": tolerance * extent,
+                "material": materials.get(group.object_id) if motion_id else None,
             }
         )
-        if group.object_id in materials and motion_id:
-            friction, bounciness = materials[group.object_id]
-            anchor.r5dgs_contact.friction = friction
-            anchor.r5dgs_contact.bounciness = restitution.ASSUMED if bounciness is None else bounciness
+        if (fitted := material(anchor)) is not None:
+            anchor.r5dgs_contact.friction, anchor.r5dgs_contact.bounciness = fitted
         state.frames_per_unit = scene.frames_per_unit
         state.leader = state.learned_leader = leader
         set_fields(state, group.own_model)
@@ -120,6 +119,12 @@ def too_fast(anchors: Iterable[bpy.types.Object]) -> str:
 def has_motion(anchor: bpy.types.Object) -> bool:
     """True if an anchor has a learned motion."""
     return bool(anchor.r5dgs_motion.learned)
+
+
+def material(anchor: bpy.types.Object) -> tuple[float, float] | None:
+    """Return the fitted friction and bounciness of a body; None if its scene file has none."""
+    found = _parsed(anchor.r5dgs_motion.learned or "{}").get("material")
+    return None if found is None else (found[0], restitution.ASSUMED if found[1] is None else found[1])
 
 
 def has_contact(anchor: bpy.types.Object) -> bool:

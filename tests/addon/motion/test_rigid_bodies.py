@@ -181,17 +181,17 @@ def test_bodies_with_contacts_fall_with_the_gravity_of_their_smooth_motion(blend
     np.testing.assert_allclose(bpy.context.scene.gravity, np.array([0, 0, -3.0]) * (fps / 60) ** 2, rtol=1e-5)
 
 
-@pytest.mark.parametrize("edited", [False, True])
-def test_bodies_with_contacts_have_the_fitted_material_or_that_of_the_panel(blender, tmp_path, edited):
+@pytest.mark.parametrize("ticked", [False, True])
+def test_bodies_with_contacts_have_the_fitted_material_or_that_of_the_panel(blender, tmp_path, ticked):
     bpy = blender
     motions.load_again(bpy, make_thrown(tmp_path / "contact.r5dgs", contact=True))
     mug, apple = (bpy.data.objects[name] for name in ("mug anchor", "red apple anchor"))
-    if edited:
-        mug.r5dgs_contact.use_friction, mug.r5dgs_contact.friction = True, 0.9
+    assert mug.r5dgs_contact.friction == pytest.approx(0.2)
+    mug.r5dgs_contact.use_friction, mug.r5dgs_contact.friction = ticked, 0.9
     motions.choose(bpy, mug, apple)
     assert bpy.ops.r5dgs.hand_over() == {"FINISHED"}
     found = {name: bpy.data.objects[f"{name} proxy"].rigid_body for name in ("mug", "red apple")}
-    assert (found["mug"].friction, found["mug"].restitution) == pytest.approx((0.9 if edited else 0.2, 0.7))
+    assert (found["mug"].friction, found["mug"].restitution) == pytest.approx((0.9 if ticked else 0.2, 0.7))
     assert (found["red apple"].friction, found["red apple"].restitution) == (0.5, 0.0)  # Blender's own
 
 
