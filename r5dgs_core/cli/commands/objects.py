@@ -122,10 +122,15 @@ def _print_odds(rows: list[dict[str, Any]]) -> None:
     if not rows:
         print("no motion is predicted to touch anything")
     for row in rows:
-        hits = "".join(f", touches {name} first {share:.0%}" for name, share in row["hits"].items())
-        turned = "" if row["turns_over"] is None else f", ends on another side than shown {row['turns_over']:.0%}"
-        rest = f"comes to rest {row['rests']:.0%}, is off the ground at the end {row['leaves']:.0%}"
-        print(f"{row['name']}: {rest}{turned}{hits}")
+        print(odds_text(row))
+
+
+def odds_text(row: dict[str, Any]) -> str:
+    """Return the probabilities of contacts of an object, the fields of `contact.odds.Odds`, in words."""
+    hits = "".join(f", touches {name} first {share:.0%}" for name, share in row["hits"].items())
+    turned = "" if row["turns_over"] is None else f", ends on another side than shown {row['turns_over']:.0%}"
+    rest = f"comes to rest {row['rests']:.0%}, is off the ground at the end {row['leaves']:.0%}"
+    return f"{row['name']}: {rest}{turned}{hits}"
 
 
 def _draw_legend(path: Path, scene: Any, viewpoint: Any, mode: str, size: int | None, *, quiet: bool) -> None:
