@@ -25,7 +25,7 @@ import numpy as np
 from scipy import special
 
 from ..config.sections.needs import NeedsSection
-from ..motion import rotations
+from ..motion import rotations, se3
 from ..motion_fit import model_selection, shared_gravity
 from ..scene.scene import MotionGroup, Scene
 from . import bind_state, future_fit, image_evidence, needs, pose_errors, track_checks, unseen_rotations
@@ -320,7 +320,7 @@ def _future(poses: np.ndarray, parts: Sequence[_Simplification]) -> np.ndarray:
 def _without_spin(scene: Scene, group: int, poses: np.ndarray, unseen: Unseen) -> np.ndarray:
     """Return the poses of a body without rotation about its unseen axes. [S, 7]"""
     center = np.median(scene.gaussians.means[scene.gaussians.motion_ids == group].astype(np.float64), axis=0)
-    return unseen_rotations.without_spin(poses, unseen.axes, center - scene.groups[group].pivot)
+    return se3.without_spin(poses, unseen.axes, center - scene.groups[group].pivot)
 
 
 def _unseen_row(unseen: Unseen) -> dict[str, Any]:

@@ -165,26 +165,3 @@ def _interpolation(heights: np.ndarray) -> np.ndarray:
     """Return the weights of linear interpolation between values at `HEIGHTS` heights from -1 to 1. [P, HEIGHTS]"""
     nodes = np.linspace(-1, 1, HEIGHTS)
     return np.maximum(0.0, 1 - np.abs(heights[:, None] - nodes) / (nodes[1] - nodes[0]))
-
-
-def without_spin(poses: np.ndarray, axes: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Return the poses of a body without its rotation about unseen axes; its centre moves as before.
-
-    Args:
-        poses: Poses, rotation wxyz first. [S, 7]
-        axes: Unseen axes, in the body. [K, 3]
-        center: Centre of the body relative to the pivot of the poses. [3]
-    """
-    quats = rotations.normalize(poses[:, :4])
-    if len(axes) == 3:
-        left = rotations.identity(len(poses))
-    else:
-        twist = np.concatenate([quats[:, :1], (quats[:, 1:] @ axes[0])[:, None] * axes[0]], axis=1)
-        length = np.linalg.norm(twist, axis=1, keepdims=True)
-        twist = np.where(length > 1e-9, twist / np.maximum(length, 1e-9), rotations.identity(len(poses)))
-        left = rotations.multiply(quats, rotations.conjugate(twist))
-    result = poses.copy()
-    result[:, :4] = left
-    result[:, 4:] += rotations.rotate(quats, np.broadcast_to(center, (len(poses), 3)))
-    result[:, 4:] -= rotations.rotate(left, np.broadcast_to(center, (len(poses), 3)))
-    return result

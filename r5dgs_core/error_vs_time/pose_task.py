@@ -14,7 +14,7 @@ import numpy as np
 from .. import timing
 from ..data.dataset import GroundTruth
 from ..evaluation import ground_truth_poses, metrics
-from ..motion import models, rigid_fit, rotations, se3, torque_free_rotation
+from ..motion import models, rigid_fit, se3, torque_free_rotation
 from ..motion.history import UNKNOWN_TURN, PoseErrors
 from ..motion_fit import candidates, model_selection, noise, pose_weights
 from ..playback import group_dynamics, modes, scene_player
@@ -191,10 +191,7 @@ def _track(scene: Scene, group: MotionGroup) -> tuple[np.ndarray, PoseErrors | N
     if min(value for value in errors.turn if math.isfinite(value)) < UNKNOWN_TURN:
         return track, errors
     members = scene.gaussians.means[scene.gaussians.motion_ids == group.id].astype(np.float64)
-    center = np.median(members, axis=0) - group.pivot
-    plain = track.copy()
-    plain[:, :4] = rotations.identity(len(track))
-    plain[:, 4:] += rotations.rotate(track[:, :4], np.broadcast_to(center, (len(track), 3))) - center
+    plain = se3.without_spin(track, np.eye(3), np.median(members, axis=0) - group.pivot)
     return plain, dataclasses.replace(errors, turn=tuple(np.where(np.isinf(errors.turn), np.inf, 0.0).tolist()))
 
 

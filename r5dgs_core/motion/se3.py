@@ -272,3 +272,26 @@ def accelerated_spin(w: Array, v: Array, a: Array, durations: Array) -> Pose:
     turn = w * span
     d = span * v_matrix_times(turn, v + 0 * turn)
     return rotations.rotvecs_to_quats(turn), d + span**2 * phi_2_times(turn, a + 0 * turn)
+
+
+def without_spin(poses: np.ndarray, axes: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Return the poses of a body without its rotation about unseen axes; its centre moves as before.
+
+    Args:
+        poses: Poses, rotation wxyz first. [S, 7]
+        axes: Unseen axes, in the body. [K, 3]
+        center: Centre of the body relative to the pivot of the poses. [3]
+    """
+    quats = rotations.normalize(poses[:, :4])
+    if len(axes) == 3:
+        left = rotations.identity(len(poses))
+    else:
+        twist = np.concatenate([quats[:, :1], (quats[:, 1:] @ axes[0])[:, None] * axes[0]], axis=1)
+        length = np.linalg.norm(twist, axis=1, keepdims=True)
+        twist = np.where(length > 1e-9, twist / np.maximum(length, 1e-9), rotations.identity(len(poses)))
+        left = rotations.multiply(quats, rotations.conjugate(twist))
+    result = poses.copy()
+    result[:, :4] = left
+    result[:, 4:] += rotations.rotate(quats, np.broadcast_to(center, (len(poses), 3)))
+    result[:, 4:] -= rotations.rotate(left, np.broadcast_to(center, (len(poses), 3)))
+    return result

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from r5dgs_core.bake import unseen_rotations
 from r5dgs_core.bake.unseen_rotations import Surface
-from r5dgs_core.motion import rotations
+from r5dgs_core.motion import rotations, se3
 
 LIGHT = np.array([0.5, -0.3, 0.8]) / np.linalg.norm([0.5, -0.3, 0.8])
 AXIS = np.array([0.6, 0.0, 0.8])
@@ -94,11 +94,11 @@ def test_without_spin_the_axis_and_the_centre_move_as_before():
     poses = np.concatenate([quats, np.random.default_rng(0).normal(size=(9, 3))], axis=1)
     poses[-1, 4:] = 0
     for axes in (AXIS[None], np.eye(3)):
-        found = unseen_rotations.without_spin(poses, axes, center)
+        found = se3.without_spin(poses, axes, center)
         moved = [rotations.rotate(p[:, :4], np.broadcast_to(center, (9, 3))) + p[:, 4:] for p in (poses, found)]
         np.testing.assert_allclose(moved[1], moved[0], atol=1e-12)
         np.testing.assert_allclose(found[-1], [1, 0, 0, 0, 0, 0, 0], atol=1e-12)
-    found = unseen_rotations.without_spin(poses, AXIS[None], center)
+    found = se3.without_spin(poses, AXIS[None], center)
     pointed = [rotations.rotate(p[:, :4], np.broadcast_to(AXIS, (9, 3))) for p in (poses, found)]
     np.testing.assert_allclose(pointed[1], pointed[0], atol=1e-12)
     assert np.abs(found[:, 1:4] @ AXIS).max() < 1e-12
