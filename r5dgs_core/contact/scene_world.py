@@ -23,7 +23,6 @@ from .world import Body, Material, Plane, State, World
 SAMPLES = 32
 _LEAST_POSES = 3
 _MISFIT = 30.0  # mean squared residual in units of the noise above which contacts do not explain the poses
-_STANDS = 0.15  # the same of a body that stands on it; others are held by something
 _CORNERS = 8  # of a box
 _ROUNDS = 6  # of shrinking bodies that overlap
 
@@ -240,7 +239,7 @@ def _body(scene: Scene, body: SceneBody, below: Plane | None, pushed: bool, grav
     if body.moves:
         return dataclasses.replace(own, floor=floors.of(own, below, scene_bodies.track(scene, body), gravity))
     gap = float((body.solid.vertices @ below.normal).min()) - below.height
-    stands = abs(gap) <= _STANDS * body.solid.size and body.group.id
+    stands = abs(gap) <= solid.STANDS * body.solid.size and body.group.id
     if not stands and not pushed:
         return dataclasses.replace(own, material=world.NEUTRAL, fixed=True)
     if not stands and gap > 0:  # it stands on something else

@@ -25,7 +25,6 @@ WORLD, GROUND = "world", "ground"  # names that the files use; MuJoCo reserves t
 DENSITY = 1000.0  # unknown; masses of bodies are proportional to their volumes
 FRICTION = 0.3  # of bodies whose friction is unknown
 _UNIT = 1e-3  # largest difference of the length of a normal from 1
-_STANDS = 0.15  # of the size: distance from the ground up to which a body stands on it
 _NEAR = 0.2  # of the size: distance up to which the centre of rotation in flight replaces the centre of the hull
 
 
@@ -177,10 +176,12 @@ def _is_fixed(group: MotionGroup, poses: np.ndarray, body: Solid, up: np.ndarray
         up: Upward unit vector. [3]
         floor: Height of the ground along it, or None.
     """
+    if not group.id:
+        return True
     carried = group.parent is not None or group.follows is not None or group.joint is not None
-    if not group.id or carried or group.model.kind != "static" or poses[:, 1:].any():
-        return not group.id
-    return floor is None or abs(float((body.vertices @ up).min()) - floor) > _STANDS * body.size
+    if carried or group.model.kind != "static" or poses[:, 1:].any():
+        return False
+    return floor is None or abs(float((body.vertices @ up).min()) - floor) > solid.STANDS * body.size
 
 
 def time_step(scene: Scene) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 
 from .. import errors
 
+STANDS = 0.15  # of the size: distance from the ground up to which a body stands on it; others are held by something
 FOOT = 0.03  # of the size: height of the lowest layer of a hull that is pressed flat
 _MOST_FOOT = 0.12
 _MOST_OF_HEIGHT = 0.25  # the same as a share of the height of a hull that is thin
