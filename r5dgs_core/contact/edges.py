@@ -69,8 +69,8 @@ def first(scene: Scene, bodies: list[SceneBody], numbers: list[int], end: float,
 def _paths(scene: Scene, body: SceneBody, end: float) -> list[np.ndarray]:
     """Paths on which a body may move off its support, at equal steps of time. [T, 3] each
 
-    They are that of its law and, if the law is that of a driven body, the straight one with its velocity: drift of a
-    rolling ball's poses looks like a force.
+    The first is that of its law. A driven body also has a straight path with its velocity, because a drift in the
+    poses of a rolling ball looks like a force.
     """
     path = scene_bodies.predicted(body, np.linspace(0, max(end - scene.t_max, 0.0), _TIMES))[1]
     straight = path[0] + np.arange(_TIMES)[:, None] * (path[1] - path[0])

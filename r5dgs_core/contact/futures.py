@@ -46,11 +46,11 @@ class Futures:
 
 
 def on_other_face(quats: np.ndarray, quat: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """True for rotations [..., 4] that put a body on another face than one does [4]; turns about ``up`` do not. [...]
+    """Return True for rotations that put a body on another face than a given one; turns about ``up`` do not. [...]
 
     Args:
-        quats: Unit wxyz, from the body to the world. [..., 4]
-        quat: The one to compare with. [4]
+        quats: Rotations, unit wxyz, from the body to the world. [..., 4]
+        quat: The given rotation. [4]
         up: Unit normal of the support, in the world. [3]
     """
     upward = rotations.rotate(rotations.conjugate(quats), np.broadcast_to(up, (*quats.shape[:-1], 3)))
@@ -58,7 +58,7 @@ def on_other_face(quats: np.ndarray, quat: np.ndarray, up: np.ndarray) -> np.nda
 
 
 def normals(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw standard normal parameters: of ``count`` equally likely intervals, each holds one value. [count, 14]
+    """Draw standard normal parameters, one value from each of ``count`` equally likely intervals. [count, 14]
 
     Shares and quantiles of so many draws are as exact as those of twice as many independent ones.
 
