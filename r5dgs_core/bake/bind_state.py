@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import ConfigError
 from ..motion import rotations
 from ..motion.models import MotionModel
-from ..scene import spherical_harmonics, visibility
+from ..scene import presence, spherical_harmonics, visibility
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
 from ..shapes import silhouette_hull, solid
@@ -169,6 +169,7 @@ def _motion_group(
         group.follows,
         group.follow_matrix,
         seen=(float(seen[0]), float(seen[-1])) if len(seen) else None,
+        absent=() if group.absent is None else presence.intervals(times, group.absent),
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import errors
 from ..motion import models, rotations
-from ..scene import gravity, slipped_rotations, world_axes
+from ..scene import gravity, presence, slipped_rotations, world_axes
 from ..scene.scene import MotionGroup, Scene
 from ..shapes import solid
 from .observed_track import Track
@@ -45,11 +45,16 @@ class SceneBody:
 
 
 def of(scene: Scene) -> tuple[list[SceneBody], list[str]]:
-    """Return the bodies of a scene whose hulls are sound, and a line about each of the others."""
+    """Return the bodies of a scene whose hulls are sound, and a line about each of the others.
+
+    Bodies that are absent past t_max are left out.
+    """
     names = {item.id: item.name for item in scene.objects}
     found, lines = [], []
     for hull in scene.hulls:
         group, name = scene.groups[hull.motion_id], names[hull.object_id]
+        if presence.span(group.absent)[1] < np.inf:
+            continue
         try:
             shape = solid.of(hull.vertices)
         except errors.ConfigError as error:

@@ -7,14 +7,14 @@ from collections.abc import Collection
 import numpy as np
 
 from ..color import tints
-from ..scene import spherical_harmonics
+from ..scene import presence, spherical_harmonics
 from ..scene.splats import Splats
 from . import affine_transform
 from .scene_player import Player
 
 
 def at(player: Player, t: float, object_ids: Collection[int] | None = None) -> Splats:
-    """Return the Gaussians at a time as renderers without motion or shading need them.
+    """Return the Gaussians at a time as renderers without motion or shading need them, without absent ones.
 
     Args:
         player: The scene in a playback mode.
@@ -23,7 +23,8 @@ def at(player: Player, t: float, object_ids: Collection[int] | None = None) -> S
     """
     frame = player.frame(t)
     chosen = np.ones(len(frame.means), bool) if object_ids is None else np.isin(frame.object_ids, list(object_ids))
-    rows = np.flatnonzero(chosen)
+    gone = presence.absent_rows([group.absent for group in player.scene.groups], frame.motion_ids, t)
+    rows = np.flatnonzero(chosen if gone is None else chosen & ~gone)
     bind = affine_transform.bind_state(player.scene, rows)
     sh = bind.sh
     if sh.shape[1] > 1:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..scene import predictability
+from ..scene import predictability, presence
 from ..scene.scene import Scene
 from . import scene_player
 
@@ -30,6 +30,7 @@ def info(scene: Scene) -> dict[str, Any]:
                 "gaussians": int((scene.gaussians.motion_ids == g.id).sum()),
                 "model": g.model.kind if g.follows is None else f"follows {g.follows}",
                 "rigid_rms": g.rigid_rms,
+                **({"absent": presence.to_json(g.absent)} if g.absent else {}),
                 **({} if g.joint is None else {"parent": g.parent, "joint": g.joint.text()}),
             }
             for g in scene.groups

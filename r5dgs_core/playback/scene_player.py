@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..motion import quaternion_columns, rotations
+from ..scene import presence
 from ..scene.scene import Scene
 from . import group_dynamics, posing
 from .modes import every, split
@@ -42,7 +43,7 @@ class Frame:
         means: Centres relative to ``origin``, along the world's axes. [N, 3] float32
         quats: Unit wxyz. [N, 4] float32
         log_scales: Logarithms of the scales. [N, 3] float32
-        opacity_logits: As in the scene. [N] float32
+        opacity_logits: As in the scene; `presence.HIDDEN` for groups that are absent then. [N] float32
         sh: As in the scene, bind frame. [N, K, 3] float32
         shading_factor: Factor on the colour, >= 0, or None without shading. [N] float32
         object_ids: As in the scene. [N] int32
@@ -158,6 +159,14 @@ class Player:
             self._apply_own_motion(moved, t - scene.t_max, center)
         return self._frame(t, moved, quats, displacements, center)
 
+    def _opacity_logits(self, t: float) -> np.ndarray:
+        """Opacity logits at a time: those of the scene, and `presence.HIDDEN` for groups that are absent. [N]"""
+        gaussians = self.scene.gaussians
+        gone = presence.absent_rows([group.absent for group in self.scene.groups], gaussians.motion_ids, t)
+        if gone is None:
+            return gaussians.opacity_logits
+        return np.where(gone, np.float32(presence.HIDDEN), gaussians.opacity_logits)
+
     def frame_at_poses(
         self,
         group_quats: np.ndarray,
@@ -170,7 +179,7 @@ class Player:
         Args:
             group_quats: Rotation of each group about its pivot, unit wxyz. [G, 4]
             group_displacements: Displacement of each pivot, world. [G, 3]
-            t: Time stored in the frame.
+            t: Time stored in the frame, at which groups may be absent; all are there if it is NaN.
             origin: As for `frame`.
         """
         poser, center = self._poser, _checked_origin(origin)
@@ -188,7 +197,7 @@ class Player:
             means=moved.means,
             quats=moved.quats,
             log_scales=moved.log_scales,
-            opacity_logits=gaussians.opacity_logits,
+            opacity_logits=self._opacity_logits(t),
             sh=gaussians.sh,
             shading_factor=moved.shading,
             object_ids=gaussians.object_ids,

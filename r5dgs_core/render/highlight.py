@@ -11,12 +11,12 @@ from collections.abc import Collection
 import numpy as np
 
 from ..playback import scene_player
+from ..scene import presence
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from . import scene_renderer
 
 DIMMED = 0.3  # brightness factor of unselected objects, which also lose their colour
-_ABSENT = -40.0  # opacity logit of an invisible Gaussian
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # Rec. 601, for display-referred colours
 
 
@@ -54,7 +54,7 @@ def isolate(
 def without_others(frame: scene_player.Frame, object_ids: Collection[int]) -> scene_player.Frame:
     """Return a frame in which the Gaussians of all other objects are invisible."""
     wanted = np.isin(frame.object_ids, list(object_ids))
-    logits = np.where(wanted, frame.opacity_logits, np.float32(_ABSENT)).astype(np.float32)
+    logits = np.where(wanted, frame.opacity_logits, np.float32(presence.HIDDEN)).astype(np.float32)
     return dataclasses.replace(frame, opacity_logits=logits)
 
 

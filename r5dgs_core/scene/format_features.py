@@ -44,7 +44,8 @@ PARTS = Feature("parts", required=False, since="0.2.0")
 HULLS = Feature("hulls", required=False, since="0.2.0")
 TRAJECTORY = Feature("trajectory", required=False, since="0.2.0")
 QUANTISED = Feature("quantised", required=True, since="0.2.0")
-_KNOWN_NAMES = {one.name for one in (ORIGIN, MOTIONS, EVENTS, PARTS, HULLS, TRAJECTORY, QUANTISED)}
+ABSENCE = Feature("absence", required=False, since="0.2.0")
+_KNOWN_NAMES = {one.name for one in (ORIGIN, MOTIONS, EVENTS, PARTS, HULLS, TRAJECTORY, QUANTISED, ABSENCE)}
 
 
 def _used(scene: Scene, quantised: bool) -> list[Feature]:
@@ -55,6 +56,7 @@ def _used(scene: Scene, quantised: bool) -> list[Feature]:
     found += [PARTS] if any(group.joint is not None for group in scene.groups) else []
     found += [HULLS] if scene.hulls else []
     found += [TRAJECTORY] if any(group.smooth is not None for group in scene.groups) else []
+    found += [ABSENCE] if any(group.absent for group in scene.groups) else []
     return found + ([QUANTISED] if quantised else [])
 
 

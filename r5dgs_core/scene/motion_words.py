@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..motion.models import KINDS
-from . import predictability
+from . import predictability, presence
 from .scene import MotionGroup, Scene
 
 STILL = 0.05  # maximum motion of a still object, as a share of its radius
@@ -23,8 +23,8 @@ def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
             words.append("still")
         else:
             words.append(KINDS[group.model.kind].word)
-        if history := group.history.text(end):
-            words[-1] += f"; {history}"
+        if more := [part for part in (presence.text(group.absent), group.history.text(end)) if part]:
+            words[-1] += f"; {', '.join(more)}"
     return ", ".join(dict.fromkeys(words)) or "pinned"
 
 

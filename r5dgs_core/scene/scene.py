@@ -18,6 +18,7 @@ import numpy as np
 from ..motion import history
 from ..motion.joint import Joint
 from ..motion.models import MotionModel
+from . import presence
 from .array_types import DTYPES
 from .cameras import Camera
 from .hull import Hull
@@ -73,6 +74,7 @@ class MotionGroup:
         parent: Group of another part of the same object that carries this one past t_max and in Blender, or None.
         joint: Joint with the parent; None without a parent.
         smooth: Motion past t_max without contacts, if ``model`` is a trajectory that has them; else None.
+        absent: Times at which the group is not in the scene (`presence`), in order.
     """
 
     id: int
@@ -90,6 +92,7 @@ class MotionGroup:
     parent: int | None = None
     joint: Joint | None = None
     smooth: MotionModel | None = None
+    absent: tuple[presence.Interval, ...] = ()
 
     @property
     def home(self) -> np.ndarray:

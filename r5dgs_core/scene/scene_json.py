@@ -11,7 +11,7 @@ import numpy as np
 from .. import __version__, errors, findings, strict_json
 from ..motion.joint import Joint
 from ..motion.models import MotionModel
-from . import history_json, joint_json, units
+from . import history_json, joint_json, presence, units
 from .cameras import Camera
 from .json_row import Row
 from .lookup_table import POOLINGS, EmbeddingSource, EncoderCard, LookupTable
@@ -141,6 +141,7 @@ def _read_group(row: Row) -> MotionGroup:
         history=findings.attempt(row.guard, lambda: history_json.read(row)),
         parent=row.optional("parent", int),
         joint=findings.attempt(row.guard, lambda: _read_joint(row)),
+        absent=findings.attempt(row.guard, lambda: presence.read(row)),
     )
 
 
@@ -209,6 +210,7 @@ def _group_tree(group: MotionGroup) -> dict[str, Any]:
         **history_json.to_json(group.history),
         **({} if group.smooth is None else {"trajectory": group.model.to_dict()}),
         **({} if group.joint is None else {"parent": group.parent, "joint": joint_json.to_json(group.joint)}),
+        **({"absent": presence.to_json(group.absent)} if group.absent else {}),
     }
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors, findings
-from . import array_shapes, cameras, hull_json, model_checks, part_checks
+from . import array_shapes, cameras, hull_json, model_checks, part_checks, presence
 from .array_types import DTYPES, EMBEDDINGS
 from .lookup_table import LookupTable
 from .row_runs import runs
@@ -310,6 +310,9 @@ def _check_group(
     with guard():
         if group.seen is not None and not group.seen[0] <= group.seen[1]:
             _fail(place, where, "'seen' as first and last time, in order", group.seen)
+    with guard():
+        if not presence.are_sound(group.absent) or (row == 0 and group.absent):
+            _fail(place, where, "'absent' as increasing times, none of group 0", group.absent)
     if row == 0:
         with guard():
             still = group.model.is_static and not (scene.tracks.poses[0] != scene.tracks.poses[0, -1]).any()

@@ -20,6 +20,7 @@ class GroupTrack:
         observed: Knots at which the object was visible enough to be located. [S] bool
         follows: Group whose displacement it follows through ``follow_matrix``, or None.
         follow_matrix: Linear map from that group's displacement to its own. [3, 3]
+        absent: Knots at which the object is not in the scene; None if there are none. [S] bool
     """
 
     object_id: int
@@ -30,6 +31,7 @@ class GroupTrack:
     observed: np.ndarray
     follows: int | None = None
     follow_matrix: np.ndarray | None = None
+    absent: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

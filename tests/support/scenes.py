@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from r5dgs_core.motion import models, rotations
@@ -141,6 +143,15 @@ def make_scene(
         provenance={"generator": "tests/scenes.py", "seed": seed},
         needs=({"name": "tracks", "value": 0.5, "threshold": 0.01, "decision": "on", "reason": "bodies move"},),
     )
+
+
+def with_absence(scene: Scene, *absent: tuple[float, float], object_id: int = 1) -> Scene:
+    """The scene with an object and its shadow absent at some times."""
+    groups = (
+        dataclasses.replace(group, absent=absent) if group.id and group.object_id == object_id else group
+        for group in scene.groups
+    )
+    return dataclasses.replace(scene, groups=tuple(groups))
 
 
 def orbit_camera(angle_rad: float, width: int = 96, height: int = 72) -> cameras.Camera:

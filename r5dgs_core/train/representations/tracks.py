@@ -27,6 +27,7 @@ from .representation import FIELD, TRACKS, Representation
 ROUGHNESS_EVERY = 4  # steps between evaluations of the roughness; its weight is multiplied by this
 REBASE_EVERY = 100  # steps
 DRIFT = 0.15  # distance of a track from the path of the masks above which it has drifted, radii of the object
+ABSENT = "tracks.absent"  # only present if an object is absent at some time
 MIN_KNOTS = 3  # minimum number of knots that determine the usual offset of a track from the path
 
 
@@ -250,6 +251,8 @@ class TracksRepresentation(Representation):
         named = track_state.tensors_of(self.tracks)
         named["tracks.entered"] = torch.tensor(self._entered)
         named["light"] = self.light.detach()
+        if self._absent.any():
+            named[ABSENT] = torch.from_numpy(self._absent)
         if self._gains is not None:
             named[residual.GAINS] = self._gains
         return named if self.residuals is None else named | residual.tensors_of(self.residuals)
@@ -292,6 +295,7 @@ class TracksRepresentation(Representation):
         follow = tracks.follow_matrix().detach().numpy().astype(np.float64)
         unturned, nowhere = rotations.identity(len(tracks.times)), np.zeros((len(tracks.times), 3))
         groups = [GroupTrack(0, "pinned", centers[0], unturned, nowhere, np.ones(len(tracks.times), bool))]
+        gone = {row: tensors[ABSENT][row - 1].numpy() for row in set(owners) - {0}} if ABSENT in tensors else {}
         for body in range(1, tracks.bodies):
             groups.append(
                 GroupTrack(
@@ -301,6 +305,7 @@ class TracksRepresentation(Representation):
                     quats[body],
                     displacements[body],
                     observed[owners[body] - 1],
+                    absent=gone.get(owners[body]),
                 )
             )
         for caster in tracks.casters.tolist():
@@ -314,6 +319,7 @@ class TracksRepresentation(Representation):
                     observed[owners[caster] - 1],
                     caster,
                     follow,
+                    gone.get(owners[caster]),
                 )
             )
         light, field = tensors["light"].numpy().astype(np.float64), residual.residual_of(tensors)

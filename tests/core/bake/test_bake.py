@@ -179,6 +179,20 @@ def test_an_object_that_lost_all_its_gaussians_stays_in_the_table(trained, tmp_p
     scene_file.read(scene_file.write(scene, tmp_path / "s.r5dgs"))
 
 
+def test_a_scene_knows_when_its_objects_are_absent(trained, baked, tmp_path):
+    state, last = checkpoint.load(trained.folder), len(baked.tracks.times) - 1
+    state.tensors["tracks.absent"] = torch.zeros(2, last + 1, dtype=torch.bool)
+    state.tensors["tracks.absent"][1, [0, 1, last]] = True
+    made = run_folder.create_run(tmp_path, datasets.read(trained.dataset_root), trained.config)
+    checkpoint.save(tmp_path, state)
+    scene, middles = bake.bake(made), 0.5 * (baked.tracks.times[:-1] + baked.tracks.times[1:])
+    ball = ((-np.inf, middles[1]), (middles[-1], np.inf))
+    expected = [ball if group.role != "pinned" and group.object_id == 2 else () for group in scene.groups]
+    assert [group.absent for group in scene.groups] == expected and len(set(expected)) == 2
+    assert {group.role for group in scene.groups if group.absent} == {"body", "shadow"}
+    assert not any(group.absent for group in baked.groups)
+
+
 def test_a_baked_scene_survives_its_file(baked, tmp_path):
     again = scene_file.read(scene_file.write(baked, tmp_path / "tiny.r5dgs"))
     np.testing.assert_array_equal(again.gaussians.object_ids, baked.gaussians.object_ids)
@@ -216,6 +230,7 @@ def test_an_object_that_comes_late_moves_on_smoothly_before_and_is_measured_wher
     scene = bake.bake(train_briefly(data, tmp_path / "run"))
     group = next(g for g in scene.groups if g.role == "body" and g.object_id == tiny_datasets.BALL)
     assert group.seen is not None and group.seen[0] >= 0.4 and group.seen[1] == scene.t_max
+    assert group.absent == ((-np.inf, pytest.approx(0.375)),)  # between the knots 0.3 and 0.45
     path = scene.tracks.poses[group.id][:, 4:]
     start = int(np.searchsorted(scene.tracks.times, group.seen[0]))
     velocity = path[start + 1] - path[start]

@@ -133,6 +133,15 @@ def test_absent_bodies_and_their_shadows_are_neither_drawn_nor_trained():
     assert gaussians.params["opacity_logits"].grad.tolist() == [0.25, 0, 0]
 
 
+def test_a_checkpoint_holds_the_times_at_which_bodies_are_absent():
+    motion, gone = make([1] * 7, [1, 1, 0, 0, 0, 0, 0]), [True] * 2 + [False] * 5
+    found = motion.observed_motion(motion.tensors(), np.array([0, 1]), np.ones((1, 7), bool), None, config.Config())
+    assert [group.role for group in found.groups] == ["pinned", "body", "shadow"]
+    assert found.groups[0].absent is None
+    assert [group.absent.tolist() for group in found.groups[1:]] == [gone, gone]
+    assert tracks_representation.ABSENT not in make([1] * 7).tensors()
+
+
 def test_a_restored_run_continues_with_the_same_knots():
     motion, other = make([1] * 7), make([1] * 7)
     grow(motion, 3, 3)
