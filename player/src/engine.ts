@@ -18,6 +18,8 @@ export class Engine {
   private readonly room: pc.Entity; // parent of the eye, which VR moves in it
   private readonly drawn: Drawn[] = [];
   private still = 0;
+  private time = 0;
+  private hidden = new Set<Piece>();
   private viewer: Eye = { place: [0, 0, 0], turn: [0, 0, 0, 1] };
   private lens: Lens = { fx: 1, fy: 1, cx: 0.5, cy: 0.5, width: 1, height: 1 };
   private waiting: (() => void)[] = [];
@@ -99,7 +101,9 @@ export class Engine {
   // Move and shade all pieces to their state at a scene time.
   pose(t: number): void {
     const { model } = this;
+    this.time = t;
     for (const { piece, entity } of this.drawn) {
+      entity.enabled = this.shows(piece);
       const { place, turn } = model.worldPose(piece, t);
       entity.setLocalPosition(...place);
       entity.setLocalRotation(...turn);
@@ -112,10 +116,15 @@ export class Engine {
     this.redraw();
   }
 
+  private shows(piece: Piece): boolean {
+    return !this.hidden.has(piece) && this.model.isThere(piece.group, this.time);
+  }
+
   // Tint the pieces for which there is a colour, and show only visible ones.
   look(tints: Map<Piece, number[]>, hidden: Set<Piece>): void {
+    this.hidden = hidden;
     for (const { piece, entity } of this.drawn) {
-      entity.enabled = !hidden.has(piece);
+      entity.enabled = this.shows(piece);
       entity.gsplat!.setParameter("uTint", tints.get(piece) ?? [0, 0, 0, 0]);
       entity.gsplat!.workBufferUpdate = pc.WORKBUFFER_UPDATE_ONCE;
     }

@@ -28,6 +28,7 @@ export interface Group {
   band?: Band;
   events?: { time: number; kind: string }[];
   joint?: { kind: string };
+  absent?: [number | null, number | null][]; // scene times; null without end
   node: number;
 }
 
@@ -121,6 +122,11 @@ export class Model {
       }
     }
     return [...sizes].sort((a, b) => b[1] - a[1])[0]?.[0];
+  }
+
+  // Whether a group is in the scene at a scene time.
+  isThere(group: Group, t: number): boolean {
+    return !group.absent?.some(([first, last]) => (first ?? -Infinity) <= t && t < (last ?? Infinity));
   }
 
   // Time of the animations at a scene time.

@@ -25,6 +25,7 @@ export class Motion {
   private readonly parents: number[];
   private readonly rest: Pose[];
   private curves = new Map<number, { translation?: Curve; rotation?: Curve }>();
+  moves = false; // something changes over time
 
   constructor(private readonly glb: Glb) {
     const nodes = glb.tree.nodes;
@@ -40,7 +41,9 @@ export class Motion {
   use(mode: string): void {
     this.curves = new Map();
     const animation: Animation | undefined = this.glb.tree.animations?.find((one) => one.name === mode);
+    this.moves = animation !== undefined;
     for (const channel of animation?.channels ?? []) {
+      if (channel.target.path === "scale") continue; // of absent objects, for other programs
       const sampler = animation!.samplers[channel.sampler];
       const found = this.curves.get(channel.target.node) ?? {};
       const path = channel.target.path as "translation" | "rotation";
@@ -50,8 +53,6 @@ export class Motion {
       this.curves.set(channel.target.node, found);
     }
   }
-
-  get moves(): boolean { return this.curves.size > 0; }
 
   // Pose in the frame of the parent.
   local(node: number, t: number): Pose {

@@ -30,18 +30,19 @@ export class Overlay {
     this.context.setTransform(ratio, 0, 0, ratio, 0, 0);
   }
 
-  // Draw for a group, or clear if there is none. Lens and sizes are in CSS pixels.
+  // Draw for a group while it is in the scene, or clear if there is none. Lens and sizes are in CSS pixels.
   draw(group: Group | undefined, eye: Eye, lens: Lens, past: string, future: string): void {
     const { context: c, model } = this;
     c.clearRect(0, 0, lens.width, lens.height);
     if (!group || group.node < 0 || !model.motion.moves) return;
-    const place = (t: number): Vec => model.motion.world(group.node, model.clock(t)).place;
+    const place = (t: number): Vec | null => model.isThere(group, t) ? model.motion.world(group.node, model.clock(t)).place : null;
     if (group.band && model.end > model.tMax) {
       c.fillStyle = future;
       c.globalAlpha = 0.3;
       c.beginPath(); // one shape, so that overlapping discs do not add up
       for (let k = 0; k <= STEPS; k++) {
-        const t = model.tMax + ((model.end - model.tMax) * k) / STEPS, at = projected(eye, lens, place(t));
+        const t = model.tMax + ((model.end - model.tMax) * k) / STEPS, center = place(t);
+        const at = center && projected(eye, lens, center);
         if (!at) continue;
         const radius = (lens.fx * widthAt(group.band, t)) / at[2];
         c.moveTo(at[0] + radius, at[1]);
@@ -54,7 +55,7 @@ export class Overlay {
     this.line(future, model.tMax, model.end, place, eye, lens, [6, 4]);
   }
 
-  private line(color: string, from: number, to: number, place: (t: number) => Vec, eye: Eye, lens: Lens, dash: number[]): void {
+  private line(color: string, from: number, to: number, place: (t: number) => Vec | null, eye: Eye, lens: Lens, dash: number[]): void {
     if (!(to > from)) return;
     const c = this.context;
     c.strokeStyle = color;
@@ -62,7 +63,7 @@ export class Overlay {
     c.setLineDash(dash);
     c.beginPath();
     for (let k = 0, pen = false; k <= STEPS; k++) {
-      const at = projected(eye, lens, place(from + ((to - from) * k) / STEPS));
+      const center = place(from + ((to - from) * k) / STEPS), at = center && projected(eye, lens, center);
       if (!at) pen = false;
       else if (pen) c.lineTo(at[0], at[1]);
       else { c.moveTo(at[0], at[1]); pen = true; }

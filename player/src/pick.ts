@@ -11,7 +11,8 @@ interface Hit { depth: number; alpha: number; object: number }
 
 // Id of the object, or null for none. Pixel coordinates from the upper left corner; pixel centres are at + 0.5.
 export function pick(model: Model, t: number, eye: Eye, lens: Lens, x: number, y: number, hidden: Set<Piece>): number | null {
-  const hits = model.pieces.flatMap((piece) => (hidden.has(piece) ? [] : hitsOf(model, piece, t, eye, lens, x, y)));
+  const shown = model.pieces.filter((piece) => !hidden.has(piece) && model.isThere(piece.group, t));
+  const hits = shown.flatMap((piece) => hitsOf(model, piece, t, eye, lens, x, y));
   hits.sort((a, b) => a.depth - b.depth);
   const votes = new Map<number, number>();
   let passed = 1;

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from ..motion import rotations
 from ..playback import group_curves, played_splats
 from ..playback.group_dynamics import GroupMotion
 from ..playback.scene_player import Player, available
-from ..scene import spherical_harmonics
+from ..scene import presence, spherical_harmonics
 from ..scene.scene import Scene
 from ..scene.splats import Splats, to_opacities
 from . import glb_motion, linear_times, registry, scene_nodes, scene_notes
@@ -44,8 +44,9 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     ids = {(piece.object_id, piece.group): number for number, piece in enumerate(_numbered(pieces), 1)}
     rows = np.concatenate([np.arange(piece.rows.start, piece.rows.stop) for piece in pieces])
     members = np.concatenate([np.full(p.rows.stop - p.rows.start, ids.get(p[1:], 0)) for p in pieces])
-    splats = played_splats.at(Player(scene), scene.t_max)
-    gaussians = _gaussians(fourdgs, Splats(**{f: getattr(splats, f)[rows] for f in _FIELDS}), members)
+    splats = _bound(scene, None)
+    windows = _windows(scene, end)[scene.gaussians.motion_ids[rows]]
+    gaussians = _gaussians(fourdgs, Splats(**{f: getattr(splats, f)[rows] for f in _FIELDS}), members, windows)
     poses_at = functools.cache(GroupMotion(scene).poses)  # of all groups; their tracks share most times
     moving = {group: _track(scene, poses_at, group, end) for group in {piece.group for piece in pieces} - {0}}
     names = {item.id: item.name for item in scene.objects}
@@ -78,8 +79,21 @@ def _numbered(pieces: list[scene_nodes.NodePiece]) -> list[scene_nodes.NodePiece
     return [piece for piece in pieces if piece.group or piece.object_id]
 
 
-def _gaussians(fourdgs: Any, splats: Splats, members: np.ndarray) -> Any:
-    """The Gaussians as ``fourdgs.GaussianSet``, visible at all times."""
+def _bound(scene: Scene, object_ids: Collection[int] | None) -> Splats:
+    """Gaussians at t_max, also of groups that are absent then."""
+    groups = tuple(dataclasses.replace(group, absent=()) for group in scene.groups)
+    return played_splats.at(Player(dataclasses.replace(scene, groups=groups)), scene.t_max, object_ids)
+
+
+def _windows(scene: Scene, end: float) -> np.ndarray:
+    """Seconds since the first observed time from which and until which each group is visible. [G, 2]"""
+    spans = np.array([presence.span(group.absent) for group in scene.groups])
+    found = glb_motion.seconds_per_unit(scene.units) * (spans - scene.tracks.times[0])
+    return np.stack([found[:, 0].clip(0), np.where(spans[:, 1] > end, np.inf, found[:, 1])], axis=-1)
+
+
+def _gaussians(fourdgs: Any, splats: Splats, members: np.ndarray, windows: np.ndarray) -> Any:
+    """The Gaussians as ``fourdgs.GaussianSet``, visible from the first to the second of ``windows``. [N, 2]"""
     count, degree = len(splats.means), int(np.sqrt(splats.sh.shape[1])) - 1
     rgb = spherical_harmonics.dc_to_rgb(splats.sh[:, 0].astype(np.float64)).clip(0, 1)
     zeros = np.zeros(count, np.float32)
@@ -92,8 +106,8 @@ def _gaussians(fourdgs: Any, splats: Splats, members: np.ndarray) -> Any:
         motions=np.zeros((count, 3), np.float32),
         mu_t=zeros,
         sigma_t=zeros + np.inf,
-        win_lo=np.zeros(count),
-        win_hi=np.full(count, np.inf),
+        win_lo=windows[:, 0].copy(),
+        win_hi=windows[:, 1].copy(),
         sh=stored.transpose(0, 2, 1).reshape(count, -1) if degree else None,
         sh_degree=degree,
         object_id=members.astype(np.int64),
@@ -147,7 +161,7 @@ def losses(scene: Scene, options: registry.Options) -> list[str]:
         found.append("motion of single Gaussians past t_max (modes standard and hybrid)")
     if scene.shading is not None:
         found.append("colours other than those of t_max")
-    dc = spherical_harmonics.dc_to_rgb(played_splats.at(Player(scene), scene.t_max, options.object_ids).sh[:, 0])
+    dc = spherical_harmonics.dc_to_rgb(_bound(scene, options.object_ids).sh[:, 0])
     outside = int(((dc < -_ROUNDING) | (dc > 1 + _ROUNDING)).any(1).sum())
     if outside:
         found.append(f"{outside} Gaussians have mean colours outside [0, 1], which are clipped")
@@ -155,6 +169,9 @@ def losses(scene: Scene, options: registry.Options) -> list[str]:
     clipped = int((np.abs(scene.gaussians.sh[shown, 1:]) > HIGH).any((1, 2)).sum())
     if clipped:
         found.append(f"{clipped} Gaussians have harmonics beyond {HIGH:g}, which are clipped")
+    groups = (scene.groups[g] for g in np.unique(scene.gaussians.motion_ids[shown]))
+    if any(np.isfinite(interval).all() for group in groups for interval in group.absent):
+        found.append("absence of objects between their first entry and their last exit")
     if len(scene.background_sh) > 1 or scene.background_sh.any():
         found.append("the sky, in other programs")
     if scene.gaussians.identities is not None:

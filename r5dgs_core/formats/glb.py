@@ -40,11 +40,11 @@ def build(scene: Scene, options: registry.Options) -> tuple[dict[str, Any], gltf
     """Content of a file, for `gltf.write`. Raises ConfigError if no Gaussian is selected."""
     arrays = gltf.Arrays()
     tree = _Nodes()
-    groups = _add_groups(scene, options, tree, arrays)
+    groups, meshes = _add_groups(scene, options, tree, arrays)
     _add_cameras(scene, tree)
     end = scene_nodes.end(scene, options)
     played = _modes(scene)
-    animations = [glb_motion.animation(scene, groups, end, arrays, *mode) for mode in played]
+    animations = [glb_motion.animation(scene, groups, meshes, end, arrays, *mode) for mode in played]
     up, size = _Y_UP @ cameras.WORLD_TO_BLENDER[scene.world_convention], scene.units.meters_per_unit
     scale = {} if size is None else {"scale": [size] * 3}
     root = tree.add(scene.name, None, rotation=_xyzw(up), **scale, children=tree.roots)
@@ -112,10 +112,17 @@ class _Nodes:
         return number
 
 
-def _add_groups(scene: Scene, options: registry.Options, tree: _Nodes, arrays: gltf.Arrays) -> dict[int, int]:
-    """Add a node for each motion group with selected Gaussians, and for their parents; returns their numbers."""
+def _add_groups(
+    scene: Scene, options: registry.Options, tree: _Nodes, arrays: gltf.Arrays
+) -> tuple[dict[int, int], dict[int, int]]:
+    """Add a node for each motion group with selected Gaussians, and for their parents.
+
+    Returns:
+        Their numbers by group, and the group of each node with Gaussians.
+    """
     pieces = scene_nodes.pieces(scene, options.object_ids)
     numbers: dict[int, int] = {}
+    meshes: dict[int, int] = {}
     names = {item.id: item.name for item in scene.objects}
     group_names = scene_nodes.group_names(scene)
 
@@ -136,8 +143,8 @@ def _add_groups(scene: Scene, options: registry.Options, tree: _Nodes, arrays: g
         tree.meshes.append(glb_splats.mesh(scene, rows, group.home + origin, factors, arrays, name))
         extras = {"r5dgs": {"group": motion_id, "object": object_id}}
         moved = {"translation": origin.tolist()} if origin.any() else {}
-        tree.add(name, node_of(group), mesh=len(tree.meshes) - 1, extras=extras, **moved)
-    return numbers
+        meshes[tree.add(name, node_of(group), mesh=len(tree.meshes) - 1, extras=extras, **moved)] = motion_id
+    return numbers, meshes
 
 
 def _add_cameras(scene: Scene, tree: _Nodes) -> None:

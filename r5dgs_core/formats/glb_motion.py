@@ -14,6 +14,7 @@ import numpy as np
 from ..motion import cubic_curves, rotations
 from ..motion.cubic_curves import Keys
 from ..playback import group_curves, group_dynamics
+from ..scene import presence
 from ..scene.scene import MotionGroup, Scene
 from ..scene.units import Units
 from .gltf import Arrays, Content
@@ -33,13 +34,20 @@ def home(groups: Sequence[MotionGroup], group: MotionGroup) -> np.ndarray:
 
 
 def animation(
-    scene: Scene, nodes: Mapping[int, int], end: float, arrays: Arrays, mode: str, source: str
+    scene: Scene,
+    nodes: Mapping[int, int],
+    meshes: Mapping[int, int],
+    end: float,
+    arrays: Arrays,
+    mode: str,
+    source: str,
 ) -> dict[str, Any] | None:
-    """Add the motion of all groups in one playback mode; None if nothing moves.
+    """Add the motion of all groups in one playback mode; None if nothing changes.
 
     Args:
         scene: The scene.
         nodes: Number of the node of each motion group.
+        meshes: Motion group of each node with Gaussians, by the number of the node.
         end: Last scene time.
         arrays: Arrays of the file.
         mode: Name of the animation.
@@ -65,7 +73,24 @@ def animation(
                 {"input": clocks[clock.tobytes()], "output": arrays.add(_output(keys, offset)), "interpolation": CUBIC}
             )
             channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path}})
+    for node, motion_id in meshes.items():
+        if scene.groups[motion_id].absent:
+            times, sizes = _sizes(scene.groups[motion_id], start, end)
+            clock = arrays.add((pace * (times - start)).astype(np.float32), bounds=True)
+            samplers.append({"input": clock, "output": arrays.add(sizes), "interpolation": "STEP"})
+            channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": "scale"}})
     return {"name": mode, "samplers": samplers, "channels": channels} if channels else None
+
+
+def _sizes(group: MotionGroup, start: float, end: float) -> tuple[np.ndarray, np.ndarray]:
+    """Scene times from the start to the end at which a group enters or leaves, and its scales: 0 while it is absent.
+
+    Returns:
+        Times [K], and scales [K, 3] that hold until the next time.
+    """
+    times = [start, *(t for interval in group.absent for t in interval if start < t < end)]
+    there = [float(not presence.is_absent(group.absent, t)) for t in times]
+    return np.array(times), np.repeat(np.array(there, np.float32), 3).reshape(-1, 3)
 
 
 def _output(keys: Keys, offset: np.ndarray | None) -> np.ndarray:

@@ -21,7 +21,7 @@ from ..color import tints
 from ..motion import cubic_curves, rotations
 from ..playback import group_curves
 from ..playback.scene_player import Player, available
-from ..scene import cameras
+from ..scene import cameras, presence
 from ..scene.scene import MotionGroup, Scene
 from ..scene.splats import to_opacities
 from . import glb_motion, linear_times, registry, scene_nodes
@@ -184,6 +184,15 @@ class _Tree:
                 prim.SetCustomDataByKey("r5dgs:object", item.id)
                 prim.SetCustomDataByKey("r5dgs:name", item.name)
                 prim.SetCustomDataByKey("r5dgs:aliases", ", ".join(item.aliases))
+                self._add_absence(prim, scene.groups[piece.group])
+
+    def _add_absence(self, prim: Any, group: MotionGroup) -> None:
+        """Make the Gaussians of a group invisible while it is absent; its parts stay visible."""
+        pxr, start = _pxr(), float(self._scene.tracks.times[0])
+        if group.absent:
+            shown = prim.CreateAttribute("visibility", pxr.Sdf.ValueTypeNames.Token, False)
+            for t in (start, *(t for interval in group.absent for t in interval if start < t < self._end)):
+                shown.Set("invisible" if presence.is_absent(group.absent, t) else "inherited", code(self._scene, t))
 
     def _define(self, path: str, rows: np.ndarray, home: np.ndarray, factors: np.ndarray | None) -> Any:
         pxr = _pxr()

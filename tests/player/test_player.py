@@ -217,6 +217,28 @@ def boxes_of(*selectors):
         .map((b) => [b.left, b.top, b.right, b.bottom])"""
 
 
+def test_an_absent_object_is_neither_drawn_nor_picked(browser, scene, tmp_path):
+    made = scenes.with_absence(dataclasses.replace(scene, cameras=scene.cameras[:1]), (-np.inf, 0.3), (0.75, np.inf))
+    url = page_of(made, tmp_path)
+    found = player_checks.compare(browser, made, url, SIDE, END, tmp_path)
+    assert len(found) == 5 and min(one.psnr for one in found) > 43
+    browser.open(f"{url}?t=0&object=mug")
+    drawn = "r5dgs.engine.drawn.filter((one) => one.entity.enabled).map((one) => one.piece.group.id)"
+    inked = "r5dgs.overlay.context.getImageData(0, 0, overlay.width, overlay.height).data.some((value) => value > 0)"
+    for t, there in ((0, False), (0.35, True), (0.74, True), (0.75, False), (1.3, False)):
+        browser.eval(f"r5dgs.go({t})")
+        assert ({1, 5} <= set(browser.eval(drawn))) == there and {2, 3} <= set(browser.eval(drawn))
+        browser.eval("r5dgs.isolate(1)")
+        assert set(browser.eval(drawn)) == ({1} if there else set())
+        browser.eval("r5dgs.isolate(null)")
+    assert browser.eval(inked)
+    lost = dataclasses.replace(made, groups=tuple(dataclasses.replace(one, absent=()) for one in made.groups))
+    picked = player_checks.picks(browser, made, url, SIDE)
+    assert 1 not in picked and 1 in player_checks.picks(browser, lost, page_of(lost, tmp_path), SIDE)
+    assert all(right == tried for right, tried in picked.values())
+    assert_quiet(browser, url)
+
+
 def test_it_fits_a_phone(browser, url, tmp_path):
     browser.open(f"{url}?t=0.4&object=mug", 360, 640, touch=True)
     assert browser.eval("document.documentElement.scrollWidth") <= 360

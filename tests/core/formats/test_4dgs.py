@@ -111,3 +111,22 @@ def test_foreign_damaged_and_empty_files_are_refused(scene, tmp_path, capsys):
     path.write_bytes(data)
     line = complaint(capsys, "import", path, "--out", tmp_path / "b.r5dgs", "--knots", "5", status=2)
     assert "--knots" in line
+
+
+def test_absent_objects_have_a_window(tmp_path):
+    scene = scenes.with_absence(scenes.make_scene(n=300), (-np.inf, 0.1), (0.6, np.inf))
+    found = written(scene, tmp_path)
+    names = {entry.object_id: entry.label for entry in found.objects.table.entries}
+    own = np.array([names.get(int(member)) == scene.object(1).name for member in found.gaussians.object_id])
+    shadow = int((scene.gaussians.motion_ids == 4).sum())
+    assert found.gaussians.count == 300
+    for t, there in ((0.0, False), (0.12, True), (0.59, True), (0.61, False), (1.2, False)):
+        shown = np.zeros(300, bool)
+        shown[fourdgs.state_at_with_objects(found.gaussians, found.objects, t)["indices"]] = True
+        assert shown[own].all() == shown[own].any() == there
+        assert (~shown).sum() == (0 if there else scene.object(1).count + shadow)
+    again = fourdgs_reader.read(tmp_path / "scene.4dgs")
+    assert [group.absent for group in again.groups] == [group.absent for group in scene.groups]
+    twice = scenes.with_absence(scene, (0.1, 0.2))
+    lost = "absence of objects between their first entry and their last exit"
+    assert lost in fourdgs_file.losses(twice, OPTIONS) and lost not in fourdgs_file.losses(scene, OPTIONS)

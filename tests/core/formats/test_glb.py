@@ -383,3 +383,33 @@ def test_the_khronos_validator_finds_only_the_unknown_extension(tmp_path):
             or EXTENSION not in issue["message"] + issue["pointer"]
         ]
         assert others == [] and len(report["messages"]) > 4
+
+
+def test_absent_objects_have_no_size(tmp_path):
+    scene = scenes.with_absence(dataclasses.replace(scenes.make_scene(), units=Units(2.0)), (-np.inf, 0.1), (0.3, 0.4))
+    (path,) = glb.export(scene, tmp_path / "a.glb", OPTIONS)
+    content = Gltf(path)
+    (animation,) = content.tree["animations"]
+    hidden = {}
+    for channel in animation["channels"]:
+        if channel["target"]["path"] == "scale":
+            node, sampler = content.tree["nodes"][channel["target"]["node"]], animation["samplers"][channel["sampler"]]
+            assert sampler["interpolation"] == "STEP" and "mesh" in node
+            np.testing.assert_allclose(content.array(sampler["input"])[:, 0], 2 * np.array([0, 0.1, 0.3, 0.4]))
+            np.testing.assert_array_equal(content.array(sampler["output"]), np.outer([0, 1, 0, 1], [1, 1, 1]))
+            hidden[node["extras"]["r5dgs"]["group"]] = node
+    assert set(hidden) == {1, 4}
+    again = glb_reader.read(path)
+    assert [group.absent for group in again.groups] == [group.absent for group in scene.groups]
+    np.testing.assert_allclose(again.tracks.poses, scene.tracks.poses, atol=1e-5)
+
+
+def test_a_still_object_that_enters_is_an_animation(tmp_path):
+    scene = scenes.make_scene(objects=1)
+    scene = scenes.with_absence(
+        scene.with_arrays(track_poses=np.tile(scene.tracks.poses[:, -1:], (1, 13, 1))), (0.2, 0.3)
+    )
+    groups = tuple(dataclasses.replace(group, model=models.STATIC) for group in scene.groups)
+    (path,) = glb.export(dataclasses.replace(scene, groups=groups), tmp_path / "a.glb", OPTIONS)
+    (animation,) = Gltf(path).tree["animations"]
+    assert {channel["target"]["path"] for channel in animation["channels"]} == {"scale"}

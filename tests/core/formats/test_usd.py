@@ -188,3 +188,20 @@ def test_losses_are_told_and_errors_leave_no_file(scene, tmp_path, capsys, monke
     assert [p.name for p in out.iterdir()] == ["a.usd"]
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert "pip install 'r5dgs[usd]'" in complaint(capsys, *arguments, "--overwrite")
+
+
+def test_absent_objects_are_invisible_but_not_what_they_carry(tmp_path):
+    from pxr import Usd, UsdGeom
+
+    arm = arms.make_arm("hinge")
+    root = next(group.parent for group in arm.groups if group.parent is not None)
+    groups = [dataclasses.replace(one, absent=((-np.inf, 0.1), (0.3, 0.4)) * (one.id == root)) for one in arm.groups]
+    stage = written(dataclasses.replace(arm, groups=tuple(groups)), tmp_path)
+    prims = [prim for prim in stage.Traverse() if prim.GetCustomDataByKey("r5dgs:object") is not None]
+    own = [prim for prim in prims if prim.GetParent().GetCustomDataByKey("r5dgs:group") == root]
+    assert own and len(own) < len(prims)
+    for t, there in ((-1.0, False), (0.0, False), (0.12, True), (0.3, False), (0.39, False), (0.41, True), (1.2, True)):
+        when = Usd.TimeCode(usd.code(arm, t))
+        shown = [UsdGeom.Imageable(prim).ComputeVisibility(when) == "inherited" for prim in prims]
+        assert shown == [there or prim not in own for prim in prims], t
+    assert not any(prim.GetAttribute("visibility").HasAuthoredValue() for prim in prims if prim not in own)
