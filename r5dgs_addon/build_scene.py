@@ -29,6 +29,7 @@ from .scene import (
     loaded_scenes,
     object_names,
     point_clouds,
+    presence_keys,
     relink,
     timeline,
     viewport_display,
@@ -130,6 +131,8 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         root = _root(collection, scene, options.world_convention or scene.world_convention)
         _describe(collection, scene, path, root, times)
         anchors = _objects(collection, root, scene, options.sh_degree)
+        for cloud in loaded_scenes.members(collection, "CLOUD"):
+            presence_keys.write(cloud, scene.groups[cloud.r5dgs.motion_id], times)
         viewport_display.show(collection, options.display)
         first_view.remember(collection, scene)
         if options.cameras:

@@ -16,7 +16,7 @@ import numpy as np
 from ...r5dgs_core.scene import cameras
 from ...r5dgs_core.shapes import depth_surface
 from .. import compat
-from ..scene import hull_meshes, loaded_scenes
+from ..scene import hull_meshes, loaded_scenes, presence_keys
 from ..worker import jobs
 from . import mesh_merge, render_request, view_cameras, visible_clouds
 
@@ -124,12 +124,14 @@ def remove(scene: bpy.types.Scene) -> None:
 
 
 def _add_hull(proxies: bpy.types.Collection, visible: visible_clouds.VisibleCloud) -> None:
-    """Add the convex hull of a point cloud as its child, so that it follows the cloud's motion."""
+    """Add the convex hull of a point cloud as its child, so that it follows the cloud's motion and visibility."""
     cloud = visible.object
     corners = hull_meshes.corners(cloud, stored=visible.edit is None)
     data = hull_meshes.new_mesh(f"{cloud.name} shadow proxy", corners)
     if data is not None:
-        _new_proxy(proxies, data).parent = cloud
+        proxy = _new_proxy(proxies, data)
+        proxy.parent = cloud
+        presence_keys.follow(proxy, cloud)
 
 
 def _add_surface(proxies: bpy.types.Collection, view: view_cameras.ViewCamera, arrays: dict[str, np.ndarray]) -> None:

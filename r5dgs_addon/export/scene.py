@@ -22,6 +22,7 @@ from ..scene import (
     object_names,
     object_tint,
     point_clouds,
+    presence_keys,
     retiming,
     timeline,
 )
@@ -64,6 +65,7 @@ class _Member:
     matrices: list[np.ndarray] = field(default_factory=list)
     pivot: np.ndarray | None = None
     parent: np.ndarray | None = None
+    absent: list[bool] = field(default_factory=list)
     points: evaluated_points.Comparison = field(default_factory=evaluated_points.Comparison)
     keys: set[str] = field(default_factory=set)
 
@@ -120,7 +122,7 @@ def edited_steps(
         )
     when = np.concatenate([source.tracks.times, _later(times)])
     earlier, total = _earlier(context.scene, times), len(when) + 1 + further
-    with frame_range.frame_kept(context.scene):
+    with frame_range.frame_kept(context.scene), presence_keys.ignored([member.cloud for member in members]):
         before = []
         for frame in earlier:
             depsgraph, back = _go_to(context, collection, frame)
@@ -251,6 +253,7 @@ def _record_poses(
     depsgraph, back = _go_to(context, collection, frame)
     for member in members:
         member.matrices.append(back @ _matrix(member.cloud, depsgraph))
+        member.absent += presence_keys.absent_at(member.cloud, [frame]).tolist()
         found = evaluated_points.of(member.cloud, depsgraph, collection.r5dgs.gaussians)
         if found.edit is None or not found.edit.bent:
             member.keys.add("" if found.edit is None else found.edit.key)
@@ -300,6 +303,7 @@ def _pieces(member: _Member, source: Scene, place: point_edits.Place | None) -> 
             model=model,
             allowed=TOLERANCE * source.extent + KEY_TOLERANCE_SHARE * keys,
             tint=object_tint.tint(cloud) if object_tint.is_tinted(cloud) else None,
+            absent=np.array(member.absent, bool),
         )
     ]
 

@@ -86,6 +86,7 @@ def duplicate(
             for cloud in clouds_of(anchor):
                 twin = cloud.copy()
                 collection.objects.link(twin)
+                _copy_actions(twin)
                 twin.parent, twin.matrix_parent_inverse = copy, cloud.matrix_parent_inverse
             copies[anchor] = copy
         for anchor, copy in copies.items():
@@ -149,7 +150,7 @@ def delete(context: bpy.types.Context, anchors: list[bpy.types.Object], shadows:
                 child.parent = None
                 child.matrix_world = place
     data = {obj.data for obj in removed if obj.data is not None}
-    actions = {action for anchor in everyone for action in _actions(anchor)}
+    actions = {action for obj in removed for action in _actions(obj)}
     bpy.data.batch_remove(removed)
     bpy.data.batch_remove([item for item in (*data, *actions) if item.users - item.use_fake_user == 0])
     for home in collections:

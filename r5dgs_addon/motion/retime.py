@@ -6,7 +6,7 @@ import bpy
 
 from ...r5dgs_core import errors
 from .. import compat
-from ..scene import loaded_scenes, point_clouds, retiming, timeline
+from ..scene import loaded_scenes, point_clouds, presence_keys, retiming, timeline
 from . import curve_place, duplicate_delete, exact_mode, extrapolate
 
 NAME = "R5DGS Retiming"
@@ -27,7 +27,7 @@ WHICH = (
 
 
 def anchors(context: bpy.types.Context, collection: bpy.types.Collection, which: str) -> list[bpy.types.Object]:
-    """Anchors to retime: those with a motion, or with points that bend.
+    """Anchors to retime: those with a motion, or with points that bend, enter or leave.
 
     Args:
         context: Context with the selected objects.
@@ -49,7 +49,13 @@ def _moves(anchor: bpy.types.Object) -> bool:
         return True
     bound = point_clouds.BIND + "position"
     clouds = [one for one in duplicate_delete.clouds_of(anchor) if one.type == "POINTCLOUD"]
-    return any(one.data.attributes.get(bound) is not None for one in clouds)
+    return any(one.data.attributes.get(bound) is not None or presence_keys.is_keyed(one) for one in clouds)
+
+
+def _keyed_clouds(anchor: bpy.types.Object) -> list[tuple[bpy.types.Object, curve_place.Place]]:
+    """Point clouds of an anchor that enter or leave, with the location of their keys."""
+    found = [cloud for cloud in duplicate_delete.clouds_of(anchor) if presence_keys.is_keyed(cloud)]
+    return [(one, curve_place.Place(one.animation_data.action, compat.slot_of(one.animation_data))) for one in found]
 
 
 def keys(kind: str, first: float, last: float, frame: float, speed: float, hold: float) -> list[tuple[float, float]]:
@@ -108,19 +114,19 @@ def apply(
     first, last = times.frame(times.t_start), times.frame(times.t_end)
     copied = _copied(context) if kind == "ACTIVE" else None
     made = keys(kind, first, max(last, first + 1), context.scene.frame_current_final, speed, hold)
-    for anchor, place in zip(wanted, places, strict=True):
+    clouds = [cloud for anchor in wanted for cloud in _keyed_clouds(anchor)]
+    for obj, place in (*zip(wanted, places, strict=True), *clouds):
+        obj.update_tag(refresh={"TIME"})
         if kind == "NONE":
-            _remove(anchor)
-            anchor.update_tag(refresh={"TIME"})
+            _remove(obj)
             continue
-        strip = retiming.strip_of(anchor) or _new_strip(anchor, place)
+        strip = retiming.strip_of(obj) or _new_strip(obj, place)
         curve = strip.fcurves.find("strip_time")
         _write(
             curve,
             made if copied is None else copied[0],
             (kind in ("LOOP", "PING_PONG") if copied is None else copied[1]),
         )
-        anchor.update_tag(refresh={"TIME"})
     context.view_layer.update()
     exact_mode.refresh()
 
@@ -135,12 +141,12 @@ def _copied(context: bpy.types.Context) -> tuple[list[tuple[float, float]], bool
     return [tuple(point.co) for point in curve.keyframe_points], any(m.type == "CYCLES" for m in curve.modifiers)
 
 
-def _new_strip(anchor: bpy.types.Object, place: curve_place.Place) -> bpy.types.NlaStrip:
-    """Turn the action of an anchor into a strip with animated time that covers all frames."""
-    animation = anchor.animation_data_create()
+def _new_strip(obj: bpy.types.Object, place: curve_place.Place) -> bpy.types.NlaStrip:
+    """Turn the action of an object into a strip with animated time that covers all frames."""
+    animation = obj.animation_data_create()
     track = animation.nla_tracks.new()
     track.name = NAME
-    action = place.action or bpy.data.actions.new(anchor.name)
+    action = place.action or bpy.data.actions.new(obj.name)
     animation.action = None
     strip = track.strips.new(NAME, 1, action)
     compat.choose_slot(strip, place.slot)
@@ -163,15 +169,15 @@ def _write(curve: bpy.types.FCurve, made: list[tuple[float, float]], repeats: bo
         curve.modifiers.new("CYCLES")
 
 
-def _remove(anchor: bpy.types.Object) -> None:
-    """Make the action of a retimed anchor its active one again."""
-    strip = retiming.strip_of(anchor)
+def _remove(obj: bpy.types.Object) -> None:
+    """Make the action of a retimed object its active one again."""
+    strip = retiming.strip_of(obj)
     if strip is None:
         return
-    animation, action, slot = anchor.animation_data, strip.action, compat.slot_of(strip)
+    animation, action, slot = obj.animation_data, strip.action, compat.slot_of(strip)
     track = next(one for one in animation.nla_tracks if strip.name in one.strips and one.strips[strip.name] == strip)
     animation.nla_tracks.remove(track)
     if curve_place.Place(action, slot).curves() or len(compat.channels(action, slot)):
-        compat.play(anchor, action, slot)
+        compat.play(obj, action, slot)
     elif not action.users:
         bpy.data.actions.remove(action)

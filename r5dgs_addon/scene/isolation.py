@@ -6,7 +6,7 @@ in the .blend, so that a saved file can be restored. Only objects of loaded scen
 
 import bpy
 
-from . import loaded_scenes, selection
+from . import loaded_scenes, presence_keys, selection
 
 
 def isolate(context: bpy.types.Context, wanted: list[selection.Wanted]) -> int:
@@ -30,7 +30,7 @@ def isolate(context: bpy.types.Context, wanted: list[selection.Wanted]) -> int:
             hide = item not in wanted
             if hide and obj.r5dgs.role == "CLOUD" and (obj in shown_here or obj.library is None):
                 hidden.add(item)  # otherwise instanced from a library, and cannot be hidden alone
-            before = (obj.hide_get(view_layer=layer), obj.hide_render)
+            before = (obj.hide_get(view_layer=layer), presence_keys.is_hidden_in_renders(obj))
             after = (hide if obj in shown_here else before[0], _may_render(obj, hide))
             if before != after:
                 record = state.hidden.add()
@@ -60,11 +60,12 @@ def is_isolated(scene: bpy.types.Scene) -> bool:
 
 def _may_render(obj: bpy.types.Object, hide: bool) -> bool:
     """New value of ``hide_render``, unchanged for anchors (never rendered) and linked objects (read-only)."""
-    return hide if obj.r5dgs.role == "CLOUD" and obj.library is None else obj.hide_render
+    changes = obj.r5dgs.role == "CLOUD" and obj.library is None
+    return hide if changes else presence_keys.is_hidden_in_renders(obj)
 
 
 def _set(obj: bpy.types.Object, layer: bpy.types.ViewLayer | None, hide: bool, hide_render: bool) -> None:
     if layer is not None:
         obj.hide_set(hide, view_layer=layer)
-    if obj.hide_render != hide_render:
-        obj.hide_render = hide_render
+    if presence_keys.is_hidden_in_renders(obj) != hide_render:
+        presence_keys.hide_in_renders(obj, hide_render)

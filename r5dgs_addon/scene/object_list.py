@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core.color import srgb
-from . import object_names, object_tint, selection
+from . import object_names, object_tint, presence_keys, selection
 
 GREY = (0.5, 0.5, 0.5)
 
@@ -59,14 +59,16 @@ def set_hidden(entry: bpy.types.PropertyGroup, hide: bool) -> None:
 
 def is_hidden_in_renders(entry: bpy.types.PropertyGroup) -> bool:
     """True if all point clouds of the object are disabled in renders."""
-    return all(cloud.hide_render for cloud in object_names.clouds(entry.id_data, entry.object_id))
+    return all(
+        presence_keys.is_hidden_in_renders(cloud) for cloud in object_names.clouds(entry.id_data, entry.object_id)
+    )
 
 
 def set_hidden_in_renders(entry: bpy.types.PropertyGroup, hide: bool) -> None:
     """Disable or enable the object in renders."""
     for cloud in object_names.clouds(entry.id_data, entry.object_id):
         if cloud.library is None:
-            cloud.hide_render = hide
+            presence_keys.hide_in_renders(cloud, hide)
 
 
 def active_row(state: bpy.types.PropertyGroup) -> int:

@@ -16,6 +16,7 @@ import numpy as np
 from ..motion import fit_drawn_curve, models, rotations
 from ..motion.models import MotionModel
 from ..playback import affine_transform, group_dynamics
+from ..scene import presence
 from ..scene.scene import MotionGroup, Scene
 from . import piece_clusters
 from .piece_clusters import Cluster, PieceMotion
@@ -142,12 +143,21 @@ def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[
             cluster.source,
             cluster.motion,
             cluster.id,
-            group=groups[cluster.id][0],
+            group=replace(groups[cluster.id][0], absent=_absent(cluster, times)),
             poses=course.poses,
             same=groups[cluster.id][1],
         )
         for cluster, course in zip(found, courses, strict=True)
     ]
+
+
+def _absent(cluster: Cluster, times: np.ndarray) -> tuple[presence.Interval, ...]:
+    """Intervals at which the new group of a cluster is absent: those of the file if they hide it at the same times."""
+    known = cluster.source.absent
+    given = cluster.first.absent if cluster.pieces else None
+    if cluster.id == 0 or given is None or given.tolist() == [presence.is_absent(known, t) for t in times]:
+        return known
+    return presence.intervals(times, given)
 
 
 def _course(scene: Scene, cluster: Cluster, known: np.ndarray) -> _Course:

@@ -36,6 +36,7 @@ class Piece:
         model: Their motion past t_max before ``parent``, or None for the file's.
         allowed: Position tolerance, world units.
         tint: Factor on their display-referred colour, or None. [3]
+        absent: True at times at which they are not in the scene; None for the times of the file. [T] bool
     """
 
     name: str
@@ -50,6 +51,7 @@ class Piece:
     model: MotionModel | None = None
     allowed: float = 0.0
     tint: np.ndarray | None = None
+    absent: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from r5dgs_core.motion import models, rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import row_runs, scene_file, slipped_rotations, validation
 from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, LookupTable
-from tests.support.scenes import make_scene
+from tests.support.scenes import make_scene, with_absence
 
 TURN = rotations.quats_to_rotmats(rotations.normalize(np.array([0.3, -0.5, 0.7, 0.2])))
 LATER = np.linspace(0.75, 1.0, 21)[1:]
@@ -334,3 +334,17 @@ def test_records_of_slipped_rotations_stay_with_their_groups():
 def test_everything_may_be_deleted():
     result, _ = edit(rich_scene(), [])
     assert len(result.gaussians.means) == 0 and [item.id for item in result.objects] == [0]
+
+
+@pytest.mark.parametrize("move", [np.eye(4), matrix_of(TURN, (1.0, 2.0, 3.0))])
+def test_times_of_absence_are_kept_or_follow_the_edit(move):
+    scene = with_absence(make_scene(n=120), (-np.inf, 0.123), (0.33, 0.36))
+    times, pieces = times_of(scene), pieces_of(scene, after={1: move})
+    result, _ = edit(scene, pieces)
+    assert {group.absent for group in result.groups if group.object_id == 1} == {scene.groups[1].absent}
+    kept = np.array([bool(scene.groups[1].absent) and (t < 0.123 or t == 0.35) for t in times])
+    same = [dataclasses.replace(one, absent=kept if one.motion_id in (1, 4) else 0 * kept > 0) for one in pieces]
+    assert [group.absent for group in edit(scene, same)[0].groups] == [group.absent for group in result.groups]
+    later = [dataclasses.replace(one, absent=times > (0.65 if one.object_id == 2 else 9)) for one in pieces]
+    found = {group.object_id: group.absent for group in edit(scene, later)[0].groups if group.role == "body"}
+    assert found == {1: (), 2: ((pytest.approx(0.65), np.inf),), 3: ()}
