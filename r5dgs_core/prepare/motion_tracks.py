@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +12,10 @@ from scipy import ndimage
 from ..capture.calibration.lens import Lens
 from ..data import masks as id_images
 from .camera_source import CameraSource
+from .frame_store import FrameStore
 
 WIDTH = 240  # of the reduced frames, pixels
-MOST_FRAMES = 600  # per camera, consecutive; bounds memory
+MOST_FRAMES = 600  # per camera, consecutive
 BACKGROUND_FRAMES = 41
 LEAST_PATH = 2.0  # least extent of the path of an object, px
 LEAST_PIXELS = 20  # of an object's mask
@@ -52,14 +53,14 @@ def track(source: CameraSource, lens: Lens, report: Callable[[int], None]) -> Mo
     wanted = range(first, min(first + MOST_FRAMES, len(source.times)))
     step = step_of(source.width)
     found: list[int] = []
-    stack = np.empty((len(wanted), source.height // step, source.width // step, 3), np.uint8)
+    stack = FrameStore()
     for count, (index, pixels) in enumerate(source.read(list(wanted)), 1):
         found.append(index)
-        stack[count - 1] = reduce(pixels, step)
+        stack.append(reduce(pixels, step))
         report(count)
     if len(found) < 4:
         return MotionTrack(np.zeros(0), np.zeros((0, 2)), 1.0 / lens.fx, np.zeros(0))
-    places = centers(stack[: len(found)])
+    places = centers(stack)
     seen = np.isfinite(places[:, 0])
     pixels = (places[seen] + 0.5) * step
     rays = lens.unproject(pixels) if len(pixels) else np.zeros((0, 3))
@@ -130,14 +131,18 @@ def reduce(pixels: np.ndarray, step: int) -> np.ndarray:
     return (cells // step**2).astype(np.uint8)
 
 
-def background(stack: np.ndarray) -> np.ndarray:
-    """Return the median of frames spread over time. [F, h, w, 3] -> [h, w, 3] int16"""
+def background(stack: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the median of frames [h, w, 3] spread over time. [h, w, 3] int16"""
     chosen = np.unique(np.linspace(0, len(stack) - 1, BACKGROUND_FRAMES).astype(int))
-    return np.median(stack[chosen], axis=0).astype(np.int16)
+    return np.median([stack[k] for k in chosen.tolist()], axis=0).astype(np.int16)
 
 
-def centers(stack: np.ndarray) -> np.ndarray:
-    """Centre (x, y) of the largest region that differs from the background, NaN if there is none. [F, 2]"""
+def centers(stack: Sequence[np.ndarray]) -> np.ndarray:
+    """Centre (x, y) of the largest region that differs from the background, NaN if there is none. [F, 2]
+
+    Args:
+        stack: F frames. [h, w, 3] uint8 each
+    """
     behind = background(stack)
     area = behind[..., 0].size
     found = np.full((len(stack), 2), np.nan)

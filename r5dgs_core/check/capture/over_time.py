@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,6 +13,7 @@ from ...color import srgb
 from ...data import dataset as datasets
 from ...findings import Collector
 from ...prepare import motion_tracks
+from ...prepare.frame_store import FrameStore
 from . import pictures
 from .pictures import Album
 from .recording import LEAST, Recording
@@ -23,6 +25,7 @@ DOUBLED, MOVES = 0.1, 0.5  # maximum change of a repeated image, minimum change 
 _REGULAR = 0.8  # least share of equal intervals for a camera with a constant rate
 _MOVING = 20  # difference from the background, levels
 _CELLS = 6  # least number of moving cells
+_BAND = 1 << 21  # values of all images that are in memory at once
 _SMOOTH = 5  # number of images in the running median of the exposure
 
 
@@ -40,11 +43,9 @@ def check(one: Recording, place: str, seconds: float | None, collect: Collector,
     if len(one.views) < LEAST:
         return
     behind = motion_tracks.background(one.stack)
-    # image by image, as the differences of all channels would need several times the memory of the images
-    apart = np.stack([np.abs(picture.astype(np.int16) - behind).max(-1) for picture in one.stack])
     _check_doubled(one, place, collect, album)
-    _check_exposure(one, behind, apart, place, collect, album)
-    _check_blur(one, apart, place, collect, album)
+    _check_exposure(one, behind, place, collect, album)
+    _check_blur(one, behind, place, collect, album)
 
 
 def check_dropped(
@@ -74,9 +75,7 @@ def check_dropped(
 
 
 def _check_doubled(one: Recording, place: str, collect: Collector, album: Album) -> None:
-    change = np.array(
-        [np.abs(a.astype(np.int16) - b).mean() for a, b in zip(one.stack[1:], one.stack[:-1], strict=True)]
-    )
+    change = np.array([np.abs(a.astype(np.int16) - b).mean() for a, b in itertools.pairwise(one.stack)])
     usual = float(np.median(change))
     if usual <= 0.02:
         return
@@ -97,12 +96,23 @@ def _check_doubled(one: Recording, place: str, collect: Collector, album: Album)
     )
 
 
-def _check_exposure(
-    one: Recording, behind: np.ndarray, apart: np.ndarray, place: str, collect: Collector, album: Album
-) -> None:
+def _apart(colors: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """Return the differences of colours [..., 3] from the background, levels. [...] int16"""
+    return np.abs(colors.astype(np.int16) - behind).max(-1)
+
+
+def _usual_difference(stack: FrameStore, behind: np.ndarray) -> np.ndarray:
+    """Return the median over time of the differences from the background, computed in bands to save memory. [h, w]"""
+    rows = max(1, _BAND // (len(stack) * behind[0].size))
+    tops = range(0, len(behind), rows)
+    bands = [(top, min(top + rows, len(behind))) for top in tops]
+    return np.concatenate([np.median(_apart(stack.rows(a, b), behind[a:b]), axis=0) for a, b in bands])
+
+
+def _check_exposure(one: Recording, behind: np.ndarray, place: str, collect: Collector, album: Album) -> None:
     """Compare static parts of the images that are neither black nor white with their median over time."""
     usable = ((behind > 24) & (behind < 230)).all(-1)
-    quiet = np.median(apart, axis=0)
+    quiet = _usual_difference(one.stack, behind)
     usable &= quiet <= np.quantile(quiet[usable], 0.7) if usable.any() else usable
     if usable.sum() < 50:
         return
@@ -128,14 +138,17 @@ def _check_exposure(
             )
 
 
-def _check_blur(one: Recording, apart: np.ndarray, place: str, collect: Collector, album: Album) -> None:
+def _check_blur(one: Recording, behind: np.ndarray, place: str, collect: Collector, album: Album) -> None:
     """Compare the sharpness of moving parts between images; the sharpest images show that they have edges."""
-    moving = apart > _MOVING
-    counts = moving.sum((1, 2))
-    seen = np.flatnonzero(counts >= _CELLS)
+    counts, found = np.zeros(len(one.stack), int), []
+    for k, picture in enumerate(one.stack):
+        moving = _apart(picture, behind) > _MOVING
+        counts[k] = moving.sum()
+        if counts[k] >= _CELLS:
+            found.append(float(np.quantile(one.edges[k][moving].astype(np.float32), 0.9)))
+    seen, sharp = np.flatnonzero(counts >= _CELLS), np.array(found)
     if len(seen) < LEAST:
         return
-    sharp = np.array([float(np.quantile(one.edges[k][moving[k]].astype(np.float32), 0.9)) for k in seen])
     usual = float(np.quantile(sharp, 0.9))
     blurred = sharp < BLURRED * usual
     large = counts[seen] >= 0.5 * np.median(counts[seen])  # something that leaves the view is not blurred
@@ -145,7 +158,7 @@ def _check_blur(one: Recording, apart: np.ndarray, place: str, collect: Collecto
     crops = [(worst, "blurred"), (best, "sharp")]
 
     def draw() -> Figure:
-        panels = [(_moving_crop(one, moving[k], k), f"{title}: {one.views[k].image_path.name}") for k, title in crops]
+        panels = [(_moving_crop(one, behind, k), f"{title}: {one.views[k].image_path.name}") for k, title in crops]
         return pictures.side_by_side(panels)
 
     collect.add(
@@ -156,9 +169,9 @@ def _check_blur(one: Recording, apart: np.ndarray, place: str, collect: Collecto
     )
 
 
-def _moving_crop(one: Recording, moving: np.ndarray, index: int) -> np.ndarray:
+def _moving_crop(one: Recording, behind: np.ndarray, index: int) -> np.ndarray:
     """Return the part of a full image that moves. [h, w, 3]"""
-    y, x = np.nonzero(moving)
+    y, x = np.nonzero(_apart(one.stack[index], behind) > _MOVING)
     top, bottom = int(np.quantile(y, 0.02)) * one.step, (int(np.quantile(y, 0.98)) + 1) * one.step
     left, right = int(np.quantile(x, 0.02)) * one.step, (int(np.quantile(x, 0.98)) + 1) * one.step
     return datasets.load_image(one.views[index])[top:bottom, left:right]

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...data.views import View
 from ...prepare import motion_tracks
+from ...prepare.frame_store import FrameStore
 
 LEAST = 8  # minimum number of images of a camera for rules about time
 
@@ -19,14 +20,14 @@ class Recording:
 
     Attributes:
         views: Its views, by time.
-        stack: Reduced images. [F, h, w, 3] uint8
-        edges: Mean gradient of the full image in each reduced pixel, levels per pixel. [F, h, w] float16
+        stack: Reduced images. [h, w, 3] uint8 each
+        edges: Mean gradient of the full image in each reduced pixel, levels per pixel. [h, w] float16 each
         step: Full pixels per reduced pixel.
     """
 
     views: tuple[View, ...]
-    stack: np.ndarray
-    edges: np.ndarray
+    stack: FrameStore
+    edges: FrameStore
     step: int
 
     @property
@@ -61,7 +62,7 @@ class Gathered:
     def __init__(self, most: int):
         self._most = most
         self.views: list[View] = []
-        self._stack, self._edges = np.empty((0, 0, 0, 3), np.uint8), np.empty((0, 0, 0), np.float16)
+        self._stack, self._edges = FrameStore(), FrameStore()
 
     @property
     def full(self) -> bool:
@@ -71,16 +72,14 @@ class Gathered:
     def add(self, view: View, color: np.ndarray) -> None:
         """Add an image. [H, W, 3] uint8"""
         picture, edges = _reduced(color)
-        if not self.views:  # one array from the first image on, as stacking a list needs twice the memory
-            self._stack = np.empty((self._most, *picture.shape), np.uint8)
-            self._edges = np.empty((self._most, *edges.shape), np.float16)
-        self._stack[len(self.views)], self._edges[len(self.views)] = picture, edges
+        self._stack.append(picture)
+        self._edges.append(edges)
         self.views.append(view)
 
     def recording(self) -> Recording:
         """Return the images; there is at least one."""
-        count, step = len(self.views), motion_tracks.step_of(self.views[0].camera.width)
-        return Recording(tuple(self.views), self._stack[:count], self._edges[:count], step)
+        step = motion_tracks.step_of(self.views[0].camera.width)
+        return Recording(tuple(self.views), self._stack, self._edges, step)
 
 
 def _reduced(color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
