@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ... import folder_lock, input_paths, terminal
 from ...config import config
 from .. import inputs, options
+
+if TYPE_CHECKING:
+    from ...scene.scene import Scene
 
 NAME = "bake"
 SHORT = "convert a run to a scene file"
@@ -44,7 +48,7 @@ def run_bake(
     with_needs: bool = False,
     threads: int | None = None,
     progress_kind: str = "none",
-) -> None:
+) -> Scene:
     """Convert a run to a scene file (see `bake.bake.run_bake`) and print a summary, optionally with the needs table."""
     input_paths.check_scene_output(out)
     config.require_needs(overrides)
@@ -63,7 +67,8 @@ def run_bake(
         if progress_kind == "json":
             progress({"event": "written", "scene": str(out)})
     if progress_kind == "json":
-        return
+        return scene
     print(f"written: {terminal.printable(str(out))}\n{scene_summary.summary(scene, out)}")
     if with_needs:
         terminal.console().print(evaluation_table.needs(scene.needs))
+    return scene

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from ..exit_status import ExitStatus
 from . import bake
 
 if TYPE_CHECKING:
+    from ...scene.scene import Scene
     from ...train.workers import Workers
 
 NAME = "train"
@@ -95,7 +97,8 @@ def run_train(
 ) -> None:
     """Train a run folder from a data set (see `train.run.train`), and name objects whose motion is not predictable.
 
-    ``scene`` is the scene file to which the run is then baked (see `bake.run_bake`), if any.
+    ``scene`` is the scene file to which the run is then baked (see `bake.run_bake`), if any. Otherwise, the motion is
+    fitted without the images for these names only.
     """
     if scene is not None:
         input_paths.check_scene_output(scene, made=out)
@@ -104,11 +107,11 @@ def run_train(
     inputs.check_dataset(data)
     from ...bake import quick_fit
     from ...progress import make
-    from ...scene import camera_correction, predictability
     from ...train import interrupt, run
     from ...train.workers import ALONE
 
     options.use_threads(threads)
+    fitted = None
     with make(progress_kind) as progress:
         trained = run.train(
             data,
@@ -120,16 +123,30 @@ def run_train(
             progress=progress,
             workers=workers or ALONE,
         )
-        with interrupt.at_once(f"{out} is trained; stopped while its motion was fitted"):
-            progress({"event": "prepare", "text": "motion past the last observed time"})
-            fitted = quick_fit.scene_of(trained)
-        lines = predictability.warnings(fitted)
-        refined = [f"cameras: {text}" for text in camera_correction.sizes(fitted.provenance["cameras"]).values()]
-        if progress_kind == "json":
+        if scene is None:
+            with interrupt.at_once(f"{out} is trained; stopped while its motion was fitted"):
+                progress({"event": "prepare", "text": "motion past the last observed time"})
+                fitted = quick_fit.scene_of(trained)
+    if fitted is not None:
+        _report(fitted, progress_kind, summarized=False)
+    elif scene is not None:
+        baking = f"r5dgs bake {shlex.quote(str(out))} --out {shlex.quote(str(scene))}"
+        with interrupt.at_once(f"{out} is trained; stopped before {scene} was written. To write it: {baking}"):
+            baked = bake.run_bake(out, scene, None, threads=threads, progress_kind=progress_kind)
+        _report(baked, progress_kind, summarized=True)
+
+
+def _report(fitted: Scene, progress_kind: str, *, summarized: bool) -> None:
+    """Print the refinement of the cameras and what is not predictable, unless the summary of a bake has."""
+    from ...progress import make
+    from ...scene import camera_correction, predictability
+
+    lines = predictability.warnings(fitted)
+    refined = [f"cameras: {text}" for text in camera_correction.sizes(fitted.provenance.get("cameras", {})).values()]
+    if progress_kind == "json":
+        with make(progress_kind) as progress:
             for event, texts in (("cameras", refined), ("warning", lines)):
                 for line in texts:
                     progress({"event": event, "text": line})
-    if progress_kind == "auto":
+    if progress_kind == "auto" and not summarized:
         terminal.print_lines([*refined, *lines])
-    if scene is not None:
-        bake.run_bake(out, scene, None, threads=threads, progress_kind=progress_kind)
