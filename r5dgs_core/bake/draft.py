@@ -58,8 +58,12 @@ class Context:
     def tensors(self) -> dict[str, Tensor]:
         return self.state.tensors
 
-    def explained(self, view: View) -> np.ndarray | None:
+    def explained(self, view: View, image: np.ndarray) -> np.ndarray | None:
         """Return the pixels of a training view that training has not left out; None for all. [H, W] bool
+
+        Args:
+            view: The view.
+            image: Its image on the run's background, in the colours of its camera. [H, W, 3]
 
         Raises:
             DatasetError: An image is missing or cannot be read.
@@ -67,10 +71,7 @@ class Context:
         if self._explained is None:
             return None
         pixels, given = self._explained[0], self._explained[1][view.name]
-        if not pixels.knows(given):
-            return None
-        behind = train_views.behind(self.given, self.config)
-        return pixels.of(given, datasets.load_image(given, behind), datasets.load_mask(given))
+        return pixels.of(given, image, datasets.load_mask(given)) if pixels.knows(given) else None
 
     @functools.cached_property
     def _explained(self) -> tuple[ExplainedPixels, dict[str, View]] | None:

@@ -68,7 +68,8 @@ class ImageEvidence:
         scene: The scene with the trained motion; groups stay within the observed time.
         views: Views, as from `sample`.
         behind: Colour behind transparent pixels; None if the images are opaque. [3]
-        explained: Returns the pixels of a view to compare; None for all. [H, W] bool
+        explained: Returns the pixels of a view to compare, given its image in the colours of its camera; None for all.
+            [H, W] bool
 
     Raises:
         DatasetError: An image is missing or cannot be read.
@@ -79,13 +80,16 @@ class ImageEvidence:
         scene: Scene,
         views: Sequence[datasets.View],
         behind: np.ndarray | None,
-        explained: Callable[[datasets.View], np.ndarray | None] = lambda view: None,
+        explained: Callable[[datasets.View, np.ndarray], np.ndarray | None] = lambda view, image: None,
     ):
         # With an infinite t_max, the player uses the track at the last knot, too, and never the motion model.
         self._scene = dataclasses.replace(scene, t_max=math.inf)
         self._views = views
-        self._truths = [datasets.load_image(view, behind) for view in views]
-        self._explained = [explained(view) for view in views]
+        self._truths, self._explained = [], []
+        for view in views:
+            given = datasets.load_given_image(view, behind)
+            self._truths.append(datasets.in_scene_colors(view, given))
+            self._explained.append(explained(view, given))
         self._clusters = _clusters(views)
         self.remember()
 

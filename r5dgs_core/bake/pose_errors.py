@@ -95,7 +95,7 @@ def measure(
     config: Config,
     groups: Collection[int],
     masked: bool,
-    explained: Callable[[datasets.View], np.ndarray | None] = lambda view: None,
+    explained: Callable[[datasets.View, np.ndarray], np.ndarray | None] = lambda view, image: None,
 ) -> Measured:
     """Return the errors of the observed poses of some groups, and the rotations that are not seen.
 
@@ -105,7 +105,8 @@ def measure(
         config: Configuration of the run.
         groups: The bodies.
         masked: True if the masks of the data set have the ids of the scene's objects.
-        explained: Returns the pixels of a view that training has not left out; None for all. [H, W] bool
+        explained: Returns the pixels of a view that training has not left out, given its image in the colours of its
+            camera; None for all. [H, W] bool
 
     Raises:
         DatasetError: An image is missing or cannot be read.
@@ -124,10 +125,11 @@ def measure(
                 center = view.camera.center  # float32 is most precise near the cameras
                 posed_at[view.t] = [posed_scene.pose_frame(scene, player.frame(view.t, center)) for player in players]
             posed = posed_at[view.t]
-            truth, ids = datasets.load_image(view, behind), datasets.load_mask(view) if masked else None
+            given, ids = datasets.load_given_image(view, behind), datasets.load_mask(view) if masked else None
+            truth = datasets.in_scene_colors(view, given)
             if ids is None or number == 0:
                 picture = scene_renderer.render_frame(scene, posed[0], view.camera)
-                squared, pixels = (np.clip(picture.color, 0, 1) - truth) ** 2, explained(view)
+                squared, pixels = (np.clip(picture.color, 0, 1) - truth) ** 2, explained(view, given)
                 misfits.append(float((squared if pixels is None else squared[pixels]).mean()))
                 ids = picture.ids if ids is None else ids
             for group in groups:

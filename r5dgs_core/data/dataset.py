@@ -282,7 +282,16 @@ def load_image(view: View, background: np.ndarray | None = None) -> np.ndarray:
 
     The colours of a view with a correction are converted to those of the scene, and then not limited to 0 to 1.
     """
-    image = images.composite(load_rgba(view), background)
+    return in_scene_colors(view, load_given_image(view, background))
+
+
+def load_given_image(view: View, background: np.ndarray | None = None) -> np.ndarray:
+    """Load the image of a view composited on a colour, in the colours of its camera. [H, W, 3] float32"""
+    return images.composite(load_rgba(view), background)
+
+
+def in_scene_colors(view: View, image: np.ndarray) -> np.ndarray:
+    """Convert an image in the colours of a view's camera to those of the scene. [H, W, 3]"""
     return image if view.correction is None else view.correction.unseen(image)
 
 

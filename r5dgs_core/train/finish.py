@@ -101,11 +101,11 @@ def _refined(trainer: Trainer) -> Dataset:
     return refined_dataset.apply(trainer.dataset, found)
 
 
-def _explained(trainer: Trainer) -> Callable[[View], np.ndarray | None]:
+def _explained(trainer: Trainer) -> Callable[[View, np.ndarray], np.ndarray | None]:
     """Return a function that returns the pixels of a view that the run has not left out; None for all. [H, W] bool"""
     given = {view.name: view for view in trainer.given_views}
 
-    def pixels(view: View) -> np.ndarray | None:
+    def pixels(view: View, image: np.ndarray) -> np.ndarray | None:
         left_out = given[view.name].unexplained
         return None if left_out is None else ~left_out
 

@@ -35,8 +35,9 @@ class HeldOutPsnr:
     def __init__(self, trainer: Trainer, count: int):
         self._trainer = trainer
         self._views = [
-            (view.name, trainer.normalization.camera(view.camera), view.t, _load(view, trainer.behind))
+            (view.name, trainer.normalization.camera(view.camera), view.t, _in_8_bits(image))
             for view in spread(trainer.dataset.val, count)
+            for image in (datasets.load_image(view, trainer.behind),)
         ]
 
     def __len__(self) -> int:
@@ -66,7 +67,7 @@ def training_psnr(
     dataset: datasets.Dataset,
     behind: np.ndarray | None,
     draw: Callable[[datasets.View], np.ndarray],
-    explained: Callable[[datasets.View], np.ndarray | None],
+    explained: Callable[[datasets.View, np.ndarray], np.ndarray | None],
 ) -> float:
     """Return the mean PSNR on the training views, or on `TRAINING_VIEWS` of them spread evenly, dB.
 
@@ -74,18 +75,23 @@ def training_psnr(
         dataset: The data set.
         behind: Background of transparent pixels, as for `train_views.load`. [3] or None
         draw: Renders a view. [H, W, 3]
-        explained: Returns the pixels of a view to compare; None for all. [H, W] bool
+        explained: Returns the pixels of a view to compare, given its image in the colours of its camera; None for all.
+            [H, W] bool
 
     Raises:
         DatasetError: An image is missing or cannot be read.
     """
-    chosen = spread(dataset.train, TRAINING_VIEWS)
-    return float(np.mean([psnr_8_bit(draw(view), _load(view, behind), explained(view)) for view in chosen]))
+    found = []
+    for view in spread(dataset.train, TRAINING_VIEWS):
+        given = datasets.load_given_image(view, behind)
+        target = _in_8_bits(datasets.in_scene_colors(view, given))
+        found.append(psnr_8_bit(draw(view), target, explained(view, given)))
+    return float(np.mean(found))
 
 
-def _load(view: datasets.View, behind: np.ndarray | None) -> np.ndarray:
-    """Return the image of a view on the run's background. [H, W, 3] uint8"""
-    return np.round(np.clip(datasets.load_image(view, behind), 0, 1) * 255).astype(np.uint8)
+def _in_8_bits(image: np.ndarray) -> np.ndarray:
+    """Convert colours in [0, 1], limited to that range, to 8 bits. [H, W, 3] uint8"""
+    return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
 def psnr_8_bit(image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None) -> float:

@@ -198,7 +198,7 @@ def test_pixels_that_training_has_left_out_are_no_evidence(given, whole, monkeyp
     views = image_evidence.sample(data.train)
     found = []
     for changed in (np.zeros_like(region), region, ~region):
-        evidence = image_evidence.ImageEvidence(truth, views, None, lambda view: ~region)
+        evidence = image_evidence.ImageEvidence(truth, views, None, lambda view, image: ~region)
         for image in evidence._truths:
             image[changed] = 1 - image[changed]
         evidence.remember()

@@ -18,7 +18,7 @@ from r5dgs_core.data import masks, unexplained
 from r5dgs_core.evaluation import evaluate, explained
 from r5dgs_core.raster import RasterStats
 from r5dgs_core.scene.camera_correction import Correction
-from r5dgs_core.train import checkpoint, checkpoint_content, losses, run, train_views, unexplained_views
+from r5dgs_core.train import checkpoint, checkpoint_content, losses, run, train_views, unexplained_views, view_psnr
 from r5dgs_core.train.initialization import background_images
 from r5dgs_core.train.normalization import Normalization
 from r5dgs_core.train.step_graphs import StepInputs
@@ -198,20 +198,32 @@ def test_baking_finds_the_regions_of_the_run(crossed):
     run_of = types.SimpleNamespace(config=tiny_datasets.settings())
     context = Context(run_of, of_run(decision), corrected, Normalization(np.zeros(3), 1.0), crossed)
     for view, one in zip(views, corrected.train, strict=True):
-        assert np.array_equal(view.unexplained, ~context.explained(one))
+        assert np.array_equal(view.unexplained, ~context.explained(one, datasets.load_given_image(one)))
     dropped = dataclasses.replace(context, state=of_run(unexplained_views.Decision(0.2, False)))
-    assert dropped.explained(corrected.train[0]) is None
+    assert dropped.explained(corrected.train[0], datasets.load_given_image(corrected.train[0])) is None
 
 
-def test_baking_reads_no_files_of_cameras_without_usual_colours(crossed, monkeypatch):
+def test_baking_reads_each_image_once_per_comparison(crossed, monkeypatch):
+    """The usual colours of the cameras are computed before."""
+    _, _, decision = decided(crossed)
+    run_of = types.SimpleNamespace(config=tiny_datasets.settings())
+    context = Context(run_of, of_run(decision), crossed, Normalization(np.zeros(3), 1.0), crossed)
+    context.explained(crossed.train[0], datasets.load_given_image(crossed.train[0]))
+    read, load, some = [], datasets.load_rgba, dataclasses.replace(crossed, train=crossed.train[:4])
+    monkeypatch.setattr(datasets, "load_rgba", lambda view: read.append(view.name) or load(view))
+    black = np.zeros((some.train[0].camera.height, some.train[0].camera.width, 3))
+    view_psnr.training_psnr(some, None, lambda view: black, context.explained)
+    assert read == [view.name for view in some.train]
+
+
+def test_baking_reads_no_masks_of_cameras_without_usual_colours(crossed, monkeypatch):
     _, _, decision = decided(crossed)
     unmasked = dataclasses.replace(
         crossed, train=tuple(dataclasses.replace(view, mask_path=None) for view in crossed.train)
     )
     run_of = types.SimpleNamespace(config=tiny_datasets.settings())
     context = Context(run_of, of_run(decision), unmasked, Normalization(np.zeros(3), 1.0), unmasked)
-    read = []
-    for name in ("load_image", "load_mask"):
-        monkeypatch.setattr(datasets, name, lambda view, *_: read.append(view.name))
-    assert [context.explained(view) for view in unmasked.train] == [None] * len(unmasked.train)
+    read, image = [], datasets.load_given_image(crossed.train[0])
+    monkeypatch.setattr(datasets, "load_mask", lambda view, *_: read.append(view.name))
+    assert [context.explained(view, image) for view in unmasked.train] == [None] * len(unmasked.train)
     assert not read
