@@ -16,6 +16,8 @@ import resource
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -59,23 +61,27 @@ def repeat(source: Path, target: Path, count: int, seconds: float) -> None:
                         written.mux(packet)
 
 
-def measure(source: Path, out: Path, lines: int, results: Any) -> None:
-    """Prepare a data set; puts processor seconds and peak memory into a queue."""
+def measure(source: Path, out: Path, lines: int) -> dict[str, Any]:
+    """Prepare a data set; returns processor seconds and the peak memory of this process."""
     from r5dgs_core.cli.commands import prepare
 
     before = resource.getrusage(resource.RUSAGE_SELF)
     began = time.monotonic()
     plan = prepare.run_prepare(source, out, lines=lines, sync="motion")
     after = resource.getrusage(resource.RUSAGE_SELF)
-    results.put(
-        {
-            "images": sum(len(indices) for indices in plan.choice.indices),
-            "cpu_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
-            "wall_s": time.monotonic() - began,
-            "peak_mb": after.ru_maxrss / 1024,
-            "offset_error_ms": 1e3 * max(abs(offset.seconds) for offset in plan.offsets),
-        }
-    )
+    return {
+        "images": sum(len(indices) for indices in plan.choice.indices),
+        "cpu_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+        "wall_s": time.monotonic() - began,
+        "peak_mb": after.ru_maxrss / 1024,
+        "offset_error_ms": 1e3 * max(abs(offset.seconds) for offset in plan.offsets),
+    }
+
+
+def in_own_process(function: Callable[..., Any], *given: Any) -> Any:
+    """Return the result of a function in a new process; raises its exception, or BrokenProcessPool if it is killed."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *given).result()
 
 
 def main() -> None:
@@ -87,23 +93,17 @@ def main() -> None:
     parser.add_argument("--lines", type=int, default=960)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    context = multiprocessing.get_context("spawn")
     rows, least = [], min(args.frames)
     if any(frames % least for frames in args.frames):
         parser.error(f"--frames: expected multiples of {least}, the smallest number")
     with tempfile.TemporaryDirectory() as folder:
         written = Path(folder) / "written"
-        writer = context.Process(target=write_videos, args=(written, args.cameras, least, *args.size))
-        writer.start()
-        writer.join()
+        in_own_process(write_videos, written, args.cameras, least, *args.size)
         for frames in args.frames:
             source, out = Path(folder) / f"videos_{frames}", Path(folder) / f"data_{frames}"
             repeat(written, source, frames // least, least / RATE)
-            results = context.Queue()
-            process = context.Process(target=measure, args=(source, out, args.lines, results))
-            process.start()
-            rows.append({"cameras": args.cameras, "frames": frames, **results.get()})
-            process.join()
+            found = in_own_process(measure, source, out, args.lines)
+            rows.append({"cameras": args.cameras, "frames": frames, **found})
             row = rows[-1]
             print(
                 f"{row['cameras']} cameras x {frames} frames: {row['cpu_s']:.1f} s of processor time "
