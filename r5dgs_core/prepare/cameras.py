@@ -127,10 +127,11 @@ def _matched(calibration: Calibration, recordings: Sequence[str]) -> dict[str, C
     if found is None and len(by_name) == len(recordings) == 1:
         found = {recordings[0]: next(iter(by_name))}
     if found is None:
+        without = names.unmatched(recordings, list(by_name))
         raise errors.DatasetError(
-            f"{calibration.path}: expected the cameras {', '.join(recordings)}, found {', '.join(by_name)}. Remedy: "
-            "give recordings and calibrated cameras the same names, or name the calibration of these cameras with "
-            "--calibration"
+            f"{calibration.path}: expected the cameras {', '.join(recordings)}, found {', '.join(by_name)}; no camera "
+            f"matches {', '.join(without)}. Remedy: give recordings and calibrated cameras the same names, remove "
+            "recordings that are not calibrated, or name the calibration of these cameras with --calibration"
         )
     return {recording: by_name[name] for recording, name in found.items()}
 

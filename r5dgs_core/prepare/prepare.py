@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,7 @@ def prepare(request: Request, progress: Progress) -> Plan:
         plan = _plan(request, opened, calibration, known, progress)
         capture_file.write(out, record.content(plan, identity, finished=False))
         lost = _write_images(plan, out, progress)
+        plan = _with_lost(plan, lost)
         record.write_points(plan, out)
         record.write_cameras(plan, out, lost)
         capture_file.write(out, record.content(plan, identity, finished=True, lost=lost))
@@ -79,7 +81,10 @@ def prepare(request: Request, progress: Progress) -> Plan:
 
 
 def _begin(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, Any] | None:
-    """Return the record of a run with the identity, or None; with ``overwrite``, remove that of another run."""
+    """Return the record of a run with the identity, or None.
+
+    The data set of another run is removed if it is unfinished, or with ``overwrite``.
+    """
     present = capture_file.read(out)
     if present is None:
         own = {folder_lock.LOCK_FILE, unknown_cameras.FILE, unknown_cameras.WORK}
@@ -91,7 +96,7 @@ def _begin(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, A
         return None
     if present.get("identity") == wanted:
         return present
-    if not overwrite:
+    if present.get("finished") and not overwrite:
         changed = [key for key in wanted if present.get("identity", {}).get(key) != wanted[key]]
         raise errors.DatasetError(
             f"{out}: was prepared from other input or settings ({', '.join(changed)}); name another folder with --out, "
@@ -125,7 +130,7 @@ def _plan(
     indices = tuple(camera.usable[index] for camera, index in zip(opened, choice.indices, strict=True))
     choice = frame_choice.replace_indices(choice, indices)
     if known is None:
-        notes += _length_notes(names, choice)
+        notes += _length_notes(names, choice) + _unused_notes(opened, calibration)
     timeline = data_splits.arrange(names, choice, request.hold_out)
     sizes = [(source.width, source.height) for source in sources]
     counts = [sum(split == "train" for split in splits) for splits in timeline.splits]
@@ -143,6 +148,27 @@ def _length_notes(names: list[str], choice: Choice) -> list[str]:
             cameras = ", ".join(names[k] for k in cut)
             notes.append(f"{cameras}: up to {unused.max():.2f} s are not used, because {names[unused.argmin()]} {word}")
     return notes
+
+
+def _unused_notes(opened: list[Camera], calibration: Calibration) -> list[str]:
+    """A remark about calibrated cameras that have no recording, if there are any."""
+    used = {camera.calibrated.name for camera in opened}
+    unused = [camera.name for camera in calibration.cameras if camera.name not in used]
+    return [f"{', '.join(unused)}: calibrated, but without a recording"] if unused else []
+
+
+def _with_lost(plan: Plan, lost: dict[str, list[int]]) -> Plan:
+    """Return the plan with a remark about each camera whose frames cannot be decoded."""
+    cameras = []
+    for camera, indices in zip(plan.cameras, plan.choice.indices, strict=True):
+        if gone := lost[camera.name]:
+            note = (
+                f"{len(gone)} of {len(indices)} frames cannot be decoded and are left out, the first is frame {gone[0]}"
+            )
+            notes = (*camera.source.notes, f"{note}; copy the recording again")
+            camera = replace(camera, source=replace(camera.source, notes=notes))
+        cameras.append(camera)
+    return replace(plan, cameras=tuple(cameras))
 
 
 def _write_images(plan: Plan, out: Path, progress: Progress) -> dict[str, list[int]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,7 +78,7 @@ def probe(path: Path) -> VideoFile:
             codec=stream.codec_context.name,
             pts=stamps,
             time_base=base,
-            declared=int(stream.frames),
+            declared=int(stream.frames) or _declared(stream.metadata.get("DURATION", ""), stamps * base),
             sound=bool(container.streams.audio),
             color=wide_color.of(int(first.color_trc), int(first.color_primaries)),
             matrix_known=int(first.colorspace) not in (0, 2),
@@ -98,20 +99,38 @@ def read(video: VideoFile, wanted: Sequence[int]) -> Iterator[tuple[int, np.ndar
     if not by_stamp:
         return
     last = max(by_stamp)
-    av = _library()
     with _opened(video.path) as container:
         stream = _stream(container, video.path)
         stream.thread_type = "AUTO"
         container.seek(min(by_stamp), stream=stream, backward=True)
+        for frame in _frames(container, stream):
+            index = None if frame.pts is None or frame.is_corrupt else by_stamp.get(frame.pts)
+            if index is not None:
+                yield index, _pixels(frame, video)
+            if frame.pts is not None and frame.pts >= last:
+                return
+
+
+def _frames(container: Any, stream: Any) -> Iterator[Any]:
+    """Decode frames; after a damaged packet, go on with the next key frame. The caller reports missing frames."""
+    av = _library()
+    packets, damaged = container.demux(stream), False
+    while True:
         try:
-            for frame in container.decode(stream):
-                index = None if frame.pts is None or frame.is_corrupt else by_stamp.get(frame.pts)
-                if index is not None:
-                    yield index, _pixels(frame, video)
-                if frame.pts is not None and frame.pts >= last:
-                    return
+            packet = next(packets, None)
         except av.error.FFmpegError:
-            return  # the caller reports the frames that are missing
+            return  # the file ends early
+        if packet is None:
+            return
+        try:
+            decoded = packet.decode()
+        except av.error.FFmpegError:
+            damaged = True
+            continue
+        for frame in decoded:
+            damaged = damaged and not frame.key_frame
+            if not damaged:
+                yield frame
 
 
 def _pixels(frame: Any, video: VideoFile) -> np.ndarray:
@@ -159,6 +178,21 @@ def _first_frame(container: Any, stream: Any, path: Path) -> Any:
         raise errors.DatasetError(
             f"{path}: the camera has no frames that can be decoded; copy the video again or remove it"
         ) from error
+
+
+def _declared(duration: str, times: np.ndarray) -> int:
+    """Return the number of frames by the duration in the tags of a Matroska file, 0 if unknown.
+
+    Args:
+        duration: Duration, such as "00:00:01.500000000", or "".
+        times: Times of the frames that the file has, s. [F]
+    """
+    found = re.fullmatch(r"(\d+):(\d+):(\d+\.?\d*)", duration)
+    if found is None or len(times) < 2:
+        return 0
+    hours, minutes, seconds = map(float, found.groups())
+    step = float(np.median(np.diff(times)))
+    return len(times) + max(0, round((3600 * hours + 60 * minutes + seconds - times[-1]) / step) - 1)
 
 
 def _stamps(container: Any, stream: Any, path: Path) -> tuple[np.ndarray, float]:

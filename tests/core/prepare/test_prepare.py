@@ -22,14 +22,14 @@ from tests.support import recordings
 COEFFICIENTS = (-0.12, 0.03, 0.002, -0.001, 0.0)
 COUNT = 6
 WIDTH, HEIGHT = 96, 72
+RIG = recordings.make_rig(3, WIDTH, HEIGHT, COEFFICIENTS)
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     """Three short videos of the tiny scene through distorted lenses, with their calibration."""
-    rig = recordings.make_rig(3, WIDTH, HEIGHT, COEFFICIENTS)
     folder = tmp_path_factory.mktemp("capture") / "videos"
-    return recordings.record(folder, rig, [np.arange(COUNT) / 10] * 3, recordings.draw_tiny)
+    return recordings.record(folder, RIG, [np.arange(COUNT) / 10] * 3, recordings.draw_tiny)
 
 
 def prepared(source, out, **fields):
@@ -127,6 +127,23 @@ def test_other_settings_need_overwrite_and_replace_everything(capture, tmp_path)
         prepared(capture, out, lines=24)
     found = prepared(capture, out, lines=24, overwrite=True)
     assert found.train[0].camera.height == 24 and not found.val
+
+
+def test_an_unfinished_data_set_of_other_input_is_replaced(capture, tmp_path):
+    """A user who corrects a damaged recording repeats the same command."""
+    videos, out = tmp_path / "videos", tmp_path / "data"
+    shutil.copytree(capture, videos)
+    pixels = recordings.draw_tiny(RIG.cameras[2], RIG.lenses[2], 0.0)
+    (videos / "cam2.mp4").unlink()
+    for k in range(COUNT):
+        images.write_png(videos / "cam2" / f"{k:06d}.png", pixels)
+    whole = (videos / "cam2" / "000003.png").read_bytes()
+    (videos / "cam2" / "000003.png").write_bytes(whole[:100])
+    with pytest.raises(errors.DatasetError, match=r"cam2/000003.png"):
+        prepared(videos, out, lines=36, rate=10)
+    (videos / "cam2" / "000003.png").write_bytes(whole)
+    images.write_png(videos / "cam2" / "000006.png", pixels)
+    assert len(prepared(videos, out, lines=36, rate=10).train) == 3 * COUNT
 
 
 def test_a_folder_with_other_files_is_not_touched(capture, tmp_path):
@@ -256,7 +273,9 @@ def test_other_lenses_of_later_frames_and_other_units_need_overwrite(tmp_path):
 def test_the_calibration_of_other_cameras_is_refused(capture, tmp_path):
     shutil.copytree(capture, tmp_path / "videos")
     (tmp_path / "videos" / "cam2.mp4").rename(tmp_path / "videos" / "side.mp4")
-    with pytest.raises(errors.DatasetError, match="expected the cameras cam0, cam1, side, found cam0, cam1, cam2"):
+    with pytest.raises(
+        errors.DatasetError, match="expected .* cam1, side, found cam0, cam1, cam2; no camera matches side"
+    ):
         prepared(tmp_path / "videos", tmp_path / "data")
     assert not (tmp_path / "data").exists()
 
@@ -269,8 +288,7 @@ def test_cameras_that_cannot_be_reconstructed_are_named_with_the_options(capture
 
 def test_recordings_of_different_lengths_are_cut_and_named(capture, tmp_path):
     shutil.copytree(capture, tmp_path / "videos")
-    rig = recordings.make_rig(3, WIDTH, HEIGHT, COEFFICIENTS)
-    frames = [recordings.draw_tiny(rig.cameras[0], rig.lenses[0], k / 10) for k in range(3)]
+    frames = [recordings.draw_tiny(RIG.cameras[0], RIG.lenses[0], k / 10) for k in range(3)]
     recordings.write_video(tmp_path / "videos" / "cam0.mp4", frames, np.arange(3) / 10)
     plan = command.run_prepare(tmp_path / "videos", tmp_path / "data", sync="none")
     assert [len(indices) for indices in plan.choice.indices] == [3, 3, 3]
@@ -285,6 +303,18 @@ def test_frames_that_cannot_be_decoded_are_left_out_and_listed(capture, tmp_path
     assert len(found.train) == 3 * COUNT - 1
     record = json.loads((tmp_path / "data" / "capture.json").read_text())
     assert [camera["undecodable"] for camera in record["cameras"]] == [[], [2], []]
+    assert [camera["used"] for camera in record["cameras"]] == [COUNT, COUNT - 1, COUNT]
+    note = f"1 of {COUNT} frames cannot be decoded and are left out, the first is frame 2; copy the recording again"
+    assert record["cameras"][1]["notes"] == [note]
+    plan = command.run_prepare(capture, tmp_path / "data", sync="none", lines=36)
+    assert f"  {note}" in command.summary(plan)
+
+
+def test_calibrated_cameras_without_a_recording_are_named(capture, tmp_path):
+    shutil.copytree(capture, tmp_path / "videos")
+    (tmp_path / "videos" / "cam1.mp4").unlink()
+    plan = command.run_prepare(tmp_path / "videos", tmp_path / "data", sync="none", lines=36)
+    assert "cam1: calibrated, but without a recording" in command.summary(plan)
 
 
 def test_the_estimate_counts_no_more_pixels_than_training_keeps():

@@ -115,6 +115,32 @@ def test_a_video_that_lacks_its_end_is_used_up_to_there_and_named(tmp_path):
     assert f"the file ends early, with {len(source.times)} of 30 frames" in source.notes[0]
 
 
+def test_a_matroska_file_that_lacks_its_end_is_named(tmp_path):
+    """It has no number of frames."""
+    frames = [np.random.default_rng(k).integers(0, 255, (*SIZE, 3), np.uint8) for k in range(30)]
+    path = recordings.write_video(tmp_path / "a.mkv", frames, np.arange(30) / 30)
+    assert not opened(path).notes
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    source = opened(path)
+    assert 5 < len(source.times) < 30
+    assert f"the file ends early, with {len(source.times)} of 30 frames" in source.notes[0]
+
+
+def test_frames_after_damage_are_read_from_the_next_key_frame_on(tmp_path):
+    path = recordings.write_video(tmp_path / "a.mp4", recordings.gray_frames(36), np.arange(36) / 10)
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+    keys = [k for k, packet in enumerate(packets) if packet.is_keyframe]
+    data = bytearray(path.read_bytes())
+    for packet in packets[3 : keys[1]]:
+        data[packet.pos : packet.pos + packet.size] = bytes(packet.size)
+    path.write_bytes(bytes(data))
+    found = dict(video_file.read(video_file.probe(path), range(36)))
+    after = sorted(packet.pts for packet in packets).index(packets[keys[1]].pts)
+    assert 5 < after < 20 and set(range(after, 36)) <= set(found) and len(found) < 36
+    assert all(bars(pixels) == index % 24 for index, pixels in found.items() if index % 24 < 22)
+
+
 @pytest.mark.parametrize("content", [b"", b"not a video", None])
 def test_a_damaged_file_is_refused(tmp_path, content):
     path = tmp_path / "a.mp4"
