@@ -173,7 +173,7 @@ def _with_lost(plan: Plan, lost: dict[str, list[int]]) -> Plan:
 
 def _write_images(plan: Plan, out: Path, progress: Progress) -> dict[str, list[int]]:
     """Write the images that are missing. Returns indices of frames that cannot be decoded, by camera."""
-    total, done = sum(len(indices) for indices in plan.choice.indices), 0
+    total, done, reported = sum(len(indices) for indices in plan.choice.indices), 0, 0
     write = images.write_png if plan.request.lossless else images.write_jpeg
     lost = {}
     for number, camera in enumerate(plan.cameras):
@@ -186,6 +186,7 @@ def _write_images(plan: Plan, out: Path, progress: Progress) -> dict[str, list[i
             write(paths[index], plan.rectifier(number, index).image(pixels))
             written.add(index)
             done += 1
+            reported = done
             progress({"event": "images", "done": done, "total": total, "text": camera.name})
         gone = [index for index in missing if index not in written]
         done += len(gone)
@@ -194,5 +195,6 @@ def _write_images(plan: Plan, out: Path, progress: Progress) -> dict[str, list[i
                 f"{camera.source.paths[0]}: none of the {len(gone)} requested frames can be decoded; copy it again"
             )
         lost[camera.name] = gone
-    progress({"event": "images", "done": total, "total": total, "text": ""})
+    if reported < total:
+        progress({"event": "images", "done": total, "total": total, "text": plan.cameras[-1].name})
     return lost

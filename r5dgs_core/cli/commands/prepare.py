@@ -181,6 +181,9 @@ def run_prepare(
         terminal.print_lines(summary(made))
     _make_masks(made, masks, {"model": model, "words": words}, progress_kind)
     _check_capture(made, progress_kind)
+    if progress_kind == "auto":
+        data = shlex.quote(str(out))
+        terminal.print_lines([f"written: {out}. Next: r5dgs train {data} --out RUN --scene SCENE.r5dgs"])
     return made
 
 
@@ -240,7 +243,7 @@ def _check_capture(plan: Plan, progress_kind: str) -> None:
 
 
 def summary(plan: Plan) -> list[str]:
-    """Return the lines that describe a prepared data set and the next command."""
+    """Return the lines that describe a prepared data set."""
     lines = []
     for number, camera in enumerate(plan.cameras):
         source, offset = camera.source, plan.offsets[number]
@@ -262,8 +265,6 @@ def summary(plan: Plan) -> list[str]:
     )
     seconds = timeline.t_max * timeline.seconds_per_unit
     lines.append(f"{seconds:.2f} s are observed; t_max is {timeline.t_max:.3g}")
-    data = shlex.quote(str(plan.request.out))
-    lines.append(f"written: {plan.request.out}. Next: r5dgs train {data} --out RUN --scene SCENE.r5dgs")
     return lines
 
 

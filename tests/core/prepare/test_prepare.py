@@ -146,6 +146,15 @@ def test_an_unfinished_data_set_of_other_input_is_replaced(capture, tmp_path):
     assert len(prepared(videos, out, lines=36, rate=10).train) == 3 * COUNT
 
 
+def test_the_next_command_follows_the_findings(capture, tmp_path, capsys):
+    out = tmp_path / "my data"
+    command.run_prepare(capture, out, sync="none", lines=36, progress_kind="auto")
+    *before, last = capsys.readouterr().out.splitlines()
+    assert last == f"written: {out}. Next: r5dgs train '{out}' --out RUN --scene SCENE.r5dgs"
+    assert [line for line in before if line.startswith("D72 warning")]
+    assert len([line for line in before if line.startswith(f"images {3 * COUNT} of")]) == 1
+
+
 def test_a_folder_with_other_files_is_not_touched(capture, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(errors.DatasetError, match="expected an empty folder or a prepared data set, found notes.txt"):
