@@ -2,7 +2,9 @@
 
 import json
 import math
+import os
 import sys
+from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 
@@ -26,6 +28,7 @@ PROGRAMS = {
         *("--set", "train.iterations=10"),
     ),
     "extrapolation.modes": ("{run}",),
+    "prepare": ("--cameras=2", "--frames", "12", "--size", "64", "48", "--lines=48"),
     "raster.first_frame": ("--count", "200", "--size", "32", "--degrees", "0,0", "--repeats", "1"),
     "raster.frames": ("--count", "200", "--size", "32", "--frames", "3", "--degrees", "1,2", "--threads", "1"),
     "raster.harmonics": ("--count", "50", "--size", "16", "--turns", "1"),
@@ -59,6 +62,7 @@ LONG = (  # more than five seconds each
     "large_scene",
     "motion",
     "playback",
+    "prepare",
     "raster.first_frame",
     "raster.frames",
     "raster.harmonics",
@@ -105,3 +109,13 @@ def test_a_benchmark_prints_a_table_and_writes_finite_figures(
     if target.exists() or "--json" in given:
         found = figures(json.loads(target.read_text()))
         assert found and all(map(math.isfinite, found))
+
+
+def test_a_failing_or_killed_process_ends_the_benchmark_of_prepare(monkeypatch):
+    with benchmark_modules.importing(monkeypatch) as load:
+        run_in_process = load("prepare").in_own_process
+        assert run_in_process(abs, -3) == 3
+        with pytest.raises(ZeroDivisionError):
+            run_in_process(divmod, 1, 0)
+        with pytest.raises(BrokenProcessPool):
+            run_in_process(os._exit, 3)

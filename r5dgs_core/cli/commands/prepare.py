@@ -181,9 +181,6 @@ def run_prepare(
         terminal.print_lines(summary(made))
     _make_masks(made, masks, {"model": model, "words": words}, progress_kind)
     _check_capture(made, progress_kind)
-    if progress_kind == "auto":
-        data = shlex.quote(str(out))
-        terminal.print_lines([f"written: {out}. Next: r5dgs train {data} --out RUN --scene SCENE.r5dgs"])
     return made
 
 
@@ -226,7 +223,7 @@ def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: st
 
 
 def _check_capture(plan: Plan, progress_kind: str) -> None:
-    """Check the data set, and add the findings to its record."""
+    """Check the data set, add the findings to its record, and print them before the next command."""
     from ...check import check
     from ...prepare import capture_file
 
@@ -239,7 +236,8 @@ def _check_capture(plan: Plan, progress_kind: str) -> None:
     rows = [{k: v.replace(f"{out}/", "").replace(str(out), ".") for k, v in row.items()} for row in rows]
     capture_file.write(out, {**capture, "checks": rows})
     if progress_kind == "auto":
-        terminal.print_lines(map(str, found))
+        next_command = f"r5dgs train {shlex.quote(str(plan.request.out))} --out RUN --scene SCENE.r5dgs"
+        terminal.print_lines([*map(str, found), f"written: {plan.request.out}. Next: {next_command}"])
 
 
 def summary(plan: Plan) -> list[str]:
