@@ -105,8 +105,9 @@ def apply(collection: bpy.types.Collection, answer: dict[str, Any]) -> list[bpy.
         if found is None:
             found = {"model": learned["smooth"], "smooth": None, "history": {**learned["history"], "band": None}}
             found["history"] = {name: value for name, value in found["history"].items() if value is not None}
-        learned |= {name: found[name] for name in ("model", "smooth", "history")}
+        learned |= {name: found[name] for name in ("model", "smooth", "history", "material") if name in found}
         state.learned, own.former = json.dumps(learned), ""
+        physics.show_material(anchor)
         with motion_fields.not_at_once(state):
             physics.reset(anchor)
     for follower in extrapolate.followers(changed):

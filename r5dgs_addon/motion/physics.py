@@ -63,8 +63,7 @@ def remember(
                 "material": materials.get(group.object_id) if motion_id else None,
             }
         )
-        if (fitted := material(anchor)) is not None:
-            anchor.r5dgs_contact.friction, anchor.r5dgs_contact.bounciness = fitted
+        show_material(anchor)
         state.frames_per_unit = scene.frames_per_unit
         state.leader = state.learned_leader = leader
         set_fields(state, group.own_model)
@@ -122,9 +121,18 @@ def has_motion(anchor: bpy.types.Object) -> bool:
 
 
 def material(anchor: bpy.types.Object) -> tuple[float, float] | None:
-    """Return the fitted friction and bounciness of a body; None if its scene file has none."""
+    """Return the fitted friction and bounciness of a body; None if no contacts were fitted."""
     found = _parsed(anchor.r5dgs_motion.learned or "{}").get("material")
     return None if found is None else (found[0], restitution.ASSUMED if found[1] is None else found[1])
+
+
+def show_material(anchor: bpy.types.Object) -> None:
+    """Set the fields of the panel *Contact* that the user has not ticked to the fitted material, if there is one."""
+    fitted, own = material(anchor), anchor.r5dgs_contact
+    if fitted is not None and not own.use_friction:
+        own.friction = fitted[0]
+    if fitted is not None and not own.use_bounciness:
+        own.bounciness = fitted[1]
 
 
 def has_contact(anchor: bpy.types.Object) -> bool:

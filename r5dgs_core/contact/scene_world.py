@@ -137,6 +137,13 @@ class SceneWorld:
                 used[number] = wishes.material(group, material)
             yield state, used
 
+    def fitted(self) -> dict[int, tuple[float, float]]:
+        """Friction and restitution without the user's changes, as they are simulated, by group."""
+        pairs = zip(self.bodies, self.world.bodies, strict=True)
+        return {
+            body.group.id: (own.material.friction, restitution.limited(own.material.restitution)) for body, own in pairs
+        }
+
     def text(self, number: int, material: Material) -> str:
         """Material of a body in words, as it is simulated."""
         words = f"friction {material.friction:.2g}, restitution {restitution.limited(material.restitution):.2g}"

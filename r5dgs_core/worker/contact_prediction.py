@@ -20,9 +20,9 @@ def predict(request: dict[str, Any]) -> dict[str, Any]:
     """Answer a `ContactRequest`.
 
     Returns:
-        ``motions``: group, ``model`` (`MotionModel.to_dict`), ``smooth``, the model without contacts, and ``history``
-        of each body that gets contacts; ``taken``: its material in words by name; ``lines``: the reasons why others do
-        not.
+        ``motions``: group, ``model`` (`MotionModel.to_dict`), ``smooth``, the model without contacts, ``history`` and
+        ``material``, the friction and restitution without the user's changes, of each body that gets contacts;
+        ``taken``: its material in words by name; ``lines``: the reasons why others do not.
 
     Raises:
         ConfigError: A field is invalid, or nothing can collide with an obstacle.
@@ -44,12 +44,14 @@ def predict(request: dict[str, Any]) -> dict[str, Any]:
         until=max(asked.until, scene.t_max),
     )
     found = scene_future.predict(scene, wishes)
+    fitted = {} if found.world is None else found.world.fitted()
     motions = [
         {
             "group": group.id,
             "model": group.model.to_dict(),
             "smooth": group.smooth.to_dict(),
             "history": history_json.to_json(group.history),
+            "material": fitted.get(group.id),
         }
         for group in found.groups
         if group.smooth is not None

@@ -99,6 +99,20 @@ def test_a_box_stops_at_a_mesh_of_the_collection(blender, stopped):
     assert stopped.r5dgs_contact.result.startswith("Nothing touches anything")
 
 
+@pytest.mark.parametrize("ticked", [False, True])
+def test_rigid_bodies_get_the_material_of_the_prediction_or_that_of_the_panel(blender, boxes, worker, ticked):
+    boxes.r5dgs_contact.obstacles = add_wall(blender)
+    own = blender.data.objects[NAME].r5dgs_contact
+    own.use_friction, own.friction = ticked, 0.9
+    assert blender.ops.r5dgs.predict_contacts() == {"FINISHED"}
+    fitted = motions.addon("motion.physics").material(blender.data.objects[NAME])
+    assert fitted is not None and own.friction == pytest.approx(0.9 if ticked else fitted[0])
+    motions.choose(blender, blender.data.objects[NAME])
+    assert blender.ops.r5dgs.hand_over() == {"FINISHED"}
+    found = blender.data.objects["box 1 proxy"].rigid_body
+    assert (found.friction, found.restitution) == pytest.approx((own.friction, fitted[1]))
+
+
 def test_off_and_on_again_restores_the_former_keys_exactly(blender, stopped):
     curve = motions.curves(blender.data.objects[NAME])["location", 0]
     curve.keyframe_points[-1].co[1] += 0.01  # an edit by hand

@@ -47,13 +47,15 @@ def test_a_sliding_box_stops_at_an_obstacle_and_moves_on_without(path):
     (motion,) = found["motions"]
     model, smooth = MotionModel.from_dict(motion["model"]), MotionModel.from_dict(motion["smooth"])
     assert motion["group"] == 1 and list(found["taken"]) == ["box 1"] and motion["history"]["band"]["half_width"]
+    chosen = ask(path, obstacles={"wall": wall(0.6)}, frictions={1: 0.9})["result"]
+    assert chosen["motions"][0]["material"] == motion["material"] and 0 < motion["material"][0] < 0.9
     assert models.evaluate(smooth, 0.8)[1][0] > 0.9
     assert models.evaluate(model, 0.8)[1][0] < 0.6 - 0.05 - SIZE / 2 + 0.05 * SIZE
 
 
 def test_the_users_wishes_reach_the_prediction(path, monkeypatch):
     given = []
-    unchanged = SimpleNamespace(groups=(), taken={}, lines=())
+    unchanged = SimpleNamespace(groups=(), taken={}, lines=(), world=None)
     monkeypatch.setattr(scene_future, "predict", lambda scene, wishes: given.append(wishes) or unchanged)
     changes = {"frictions": {2: 0.05}, "restitutions": {1: 0.4}, "masses": {2: 50.0}, "gravity": 0.4}
     assert ask(path, **changes, obstacles={"wall": wall(0.6)})["result"] == {"motions": [], "taken": {}, "lines": []}
