@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -50,25 +51,51 @@ def repair(trainer: Trainer, least: float = APART) -> int:
         trainer: A run with tracks.
         least: Smallest change of a rotation, rad; a ball whose track is less wrong keeps it.
     """
-    motion = trainer.motion
-    assert isinstance(motion, TracksRepresentation)
-    bent = set() if motion.residuals is None else set(motion.residuals.bodies)
-    owners = motion.tracks.owners.tolist()
-    bodies = [k for k in range(1, motion.tracks.bodies) if k not in bent and owners.count(owners[k]) == 1]
-    ids = [int(trainer.object_ids[owners[body]]) for body in bodies]
-    if not bodies:
-        return 0
-    groups, count = _by_knot(trainer), 0
-    for body, object_id, outlines in zip(bodies, ids, ball_outlines.gather(groups, ids), strict=True):
-        places = trainer.places.centers[owners[body] - 1]
-        ball = ball_outlines.fit(outlines, places, trainer.times)
-        ball = None if ball is None else _completed(motion.tracks, body, ball)
-        found = None if ball is None else find(trainer, motion.tracks, body, _pixels(groups, object_id, ball), least)
-        if ball is not None and found is not None:
-            _write(trainer, motion.tracks, body, ball, found)
+    tracks, residuals = _tracks(trainer), trainer.motion.residuals
+    bent = set() if residuals is None else set(residuals.bodies)
+    count = 0
+    for body, ball, pixels in _balls(trainer, [k for k in range(1, tracks.bodies) if k not in bent]):
+        found = find(trainer, tracks, body, pixels, least)
+        if found is not None:
+            _write(trainer, tracks, body, ball, found)
             count += 1
-            log.info("object %d: rotations of a ball aligned by its texture", object_id)
+            log.info("object %d: rotations of a ball aligned by its texture", _object_id(trainer, body))
     return count
+
+
+def rigid(trainer: Trainer, bodies: Sequence[int]) -> set[int]:
+    """Return those of some bodies that are balls whose images one turning texture explains, so that none bends."""
+    tracks, found = _tracks(trainer), set()
+    for body, _, pixels in _balls(trainer, bodies):
+        if len(pixels.knots) >= MIN_PIXELS:
+            aligned = ball_texture.align(pixels, _quats(tracks, body), trainer.times)
+            if aligned.error < TEXTURED * aligned.plain:
+                found.add(body)
+    return found
+
+
+def _balls(trainer: Trainer, bodies: Sequence[int]) -> Iterator[tuple[int, Ball, SurfacePixels]]:
+    """Yield those of some bodies that have the outlines of balls and are whole objects, with their pixels."""
+    tracks = _tracks(trainer)
+    owners = tracks.owners.tolist()
+    whole = [body for body in bodies if owners.count(owners[body]) == 1]
+    if not whole:
+        return
+    ids, groups = [_object_id(trainer, body) for body in whole], _by_knot(trainer)
+    for body, object_id, outlines in zip(whole, ids, ball_outlines.gather(groups, ids), strict=True):
+        ball = ball_outlines.fit(outlines, trainer.places.centers[owners[body] - 1], trainer.times)
+        if ball is not None:
+            ball = _completed(tracks, body, ball)
+            yield body, ball, _pixels(groups, object_id, ball)
+
+
+def _tracks(trainer: Trainer) -> Tracks:
+    assert isinstance(trainer.motion, TracksRepresentation)
+    return trainer.motion.tracks
+
+
+def _object_id(trainer: Trainer, body: int) -> int:
+    return int(trainer.object_ids[_tracks(trainer).owners[body]])
 
 
 def _offset(tracks: Tracks, body: int, ball: Ball) -> np.ndarray:

@@ -4,7 +4,8 @@ Once all times have entered and the tracks have settled, training continues for 
 bodies. Then the residuals of each body are left out in turn, and the increase of the error on that body is measured on
 views that these steps did not use. The run then returns to its state before the trial, and only bodies with an increase
 above a threshold keep their residuals, or are divided into rigid parts if these explain the views as well
-(`part_trial`). If no body does, the run continues exactly as without a trial, bit for bit.
+(`part_trial`). Balls whose images one turning texture explains stay rigid (`ball_repair`). If no body keeps residuals,
+the run continues exactly as without a trial, bit for bit.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from ..config.config import Config
 from ..errors import TrainingError
 from ..model import residual_field
 from ..model.residual_field import ResidualField
-from . import part_trial
+from . import ball_repair, part_trial, pose_repair
 from .checkpoint import Checkpoint
 from .representations import registry, residual
 from .trainer import Trainer
@@ -65,6 +66,10 @@ def decide(trainer: Trainer, progress: Progress) -> None:
     before = trainer.state()
     trial = _try(trainer, progress)
     kept = flexible(trial.gains, trial.field, trainer.config)
+    if kept and trainer.config.needs.residuals != "on" and pose_repair.applies(trainer):
+        trainer.restore(before)
+        balls = ball_repair.rigid(trainer, kept)  # what they gain are errors of their tracks, which will be repaired
+        kept = [body for body in kept if body not in balls]
     gains = {residual.GAINS: torch.from_numpy(trial.gains)}
     state = dataclasses.replace(before, tensors=before.tensors | gains)
     divided = _divided(trainer, state, trial, kept)

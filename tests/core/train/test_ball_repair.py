@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.model import residual_field
 from r5dgs_core.motion import rotations
-from r5dgs_core.train import ball_repair
+from r5dgs_core.train import ball_repair, part_trial, residual_trial
 from r5dgs_core.train.ball_outlines import Ball
 from tests.support import tiny_datasets
 
@@ -75,3 +76,31 @@ def test_a_sound_track_keeps_its_bits(trainer):
     assert ball_repair.repair(trainer) == 0
     after = trainer.state().tensors
     assert all(torch.equal(after[name], before[name]) for name in before)
+
+
+@pytest.fixture
+def bending(trainer, monkeypatch):
+    """The trainer, whose trial of residuals finds a gain for both bodies."""
+    tensors = trainer.state().tensors
+    weights = torch.sigmoid(tensors["gaussians.opacity_logits"])
+    field = residual_field.spread(
+        tensors["gaussians.means"], tensors["gaussians.motion_ids"], weights, [BRICK, BALL], 8, len(trainer.times)
+    )
+    found = residual_trial.Trial(field, np.array([2.0, 2.0]), np.ones((2, 2)), [], [])
+    monkeypatch.setattr(residual_trial, "_try", lambda *_: found)
+    monkeypatch.setattr(part_trial, "divide", lambda *_: None)
+    return trainer
+
+
+@pytest.mark.parametrize(("settings", "bent"), [((), [BRICK]), (("needs.residuals=on",), [BRICK, BALL])])
+def test_a_ball_with_one_turning_texture_does_not_bend(bending, settings, bent):
+    bending.config = bending.config.override(["train.repair=true", *settings])
+    residual_trial.decide(bending, lambda _: None)
+    assert bending.motion.residuals.bodies == bent
+
+
+def test_a_ball_whose_texture_changes_may_bend(bending, monkeypatch):
+    bending.config = bending.config.override(["train.repair=true"])
+    monkeypatch.setattr(ball_repair, "TEXTURED", 0.0)
+    residual_trial.decide(bending, lambda _: None)
+    assert bending.motion.residuals.bodies == [BRICK, BALL]
