@@ -28,6 +28,7 @@ _REACH = 12.0  # distance up to which a support is searched, in sizes
 _STRIP = 0.75  # half width of the part of a surface, in sizes, that shows its border at a path
 _HOLES = 0.15  # share of empty cells above which a support is not convex
 _SEEN = 0.3  # opacity of a Gaussian that may carry a body
+_PROOF = 3  # weight of an empty place, as depths at the border of a surface are blurred outwards
 
 
 @dataclass(frozen=True)
@@ -177,8 +178,8 @@ def _trimmed(
     close = (np.abs(points @ [-out[1], out[0]]) < _STRIP * size) & (np.abs(points @ out) < size)
     across = points[close] @ out
     order = np.argsort(across)
-    signs = np.repeat([1, -1], [len(carried), len(empty)])[close][order]
-    border = max(across[order][np.argmax(np.cumsum(signs))], (start - place) @ out)  # beyond it, most are empty
+    signs = np.repeat([1, -_PROOF], [len(carried), len(empty)])[close][order]
+    border = max(across[order][np.argmax(np.cumsum(signs))], (start - place) @ out)  # beyond it, a quarter is empty
     reach = (corners - place) @ out - border
     cut = [corners[reach <= 0]]
     for a, b in itertools.pairwise([*range(len(corners)), 0]):
