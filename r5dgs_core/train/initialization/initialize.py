@@ -122,8 +122,8 @@ def start(
     if by_motion and config.curriculum.start != "first":
         first = (len(times) - 1) // 2
     backgrounds = background_images.compute(_at_once(views, times, first) if by_motion else views)
-    # With random points, the sweep serves only to find the sky and the plane.
-    swept = min(init.background_points, 5000) if init.placement == "random" else init.background_points
+    # With random points or those of a reconstruction, the sweep serves mainly to find the sky and the plane.
+    swept = init.background_points if init.placement == "scene" and cloud is None else min(init.background_points, 5000)
     views, backgrounds, search, colors = _balanced(views, backgrounds, swept, config)
     centers, translations, clouds = _bodies(views, times, places, first, init, rng)
     eyes = np.stack([v.camera.center for v in views])

@@ -6,12 +6,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError
 from r5dgs_core.scene import cameras
-from r5dgs_core.train.initialization import background_images, scatter
+from r5dgs_core.train.initialization import background_images, plane_sweep, scatter
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
@@ -75,3 +76,27 @@ def test_a_data_set_with_a_reconstruction_starts_from_its_points(tiny):
     means = trainer.normalization.points_to_world(trainer.gaussians.means.detach().numpy())
     nearest = np.linalg.norm(means[:, None] - points[None], axis=-1).min(0)
     assert (nearest < 1e-4).mean() > 0.4  # masks cover the others
+
+
+@pytest.mark.parametrize("cap", [0, 900])
+def test_a_large_reconstruction_is_thinned_only_to_the_cap(tiny, cap, monkeypatch):
+    data, sweep, swept = datasets.read(tiny.root), plane_sweep.Sweep, []
+    monkeypatch.setattr(plane_sweep, "Sweep", lambda *given: swept.append(given[1]) or sweep(*given))
+    points = np.random.default_rng(1).uniform(-1, 1, (9000, 3)) * [1.5, 1.5, 0.01]
+    known = dataclasses.replace(data, points=points, point_colors=np.full((9000, 3), 0.25))
+    settings = ("train.iterations=4", "init.background_points=9000", f"densify.max_gaussians={cap}")
+    trainer = Trainer(known, tiny_datasets.settings(*settings))
+    groups = trainer.gaussians.motion_ids.numpy()
+    assert swept == [5000] * len(swept)  # it takes long, and places none of them
+    if cap:
+        assert len(groups) == cap > (groups == 0).sum()
+        return
+    normalised = (points - trainer.normalization.origin) / trainer.normalization.scale
+    free = scatter.behind_objects(normalised, points, trainer.views, 9000, np.random.default_rng(0))[0]
+    assert trainer._conditions.cap == len(groups) > len(free) > 4000
+    near = KDTree(trainer.gaussians.means[groups == 0].detach().numpy()).query(free)[0]
+    assert near.max() < 1e-5
+    solid = groups <= 2  # the others are shadows, which are flat
+    means, sizes = (trainer.gaussians.params[name].detach().numpy()[solid] for name in ("means", "log_scales"))
+    spacing = KDTree(means).query(means, k=4)[0][:, 1:].mean(1)
+    np.testing.assert_allclose(np.exp(sizes[:, 0]), np.clip(spacing, 0.005, 0.2), rtol=1e-3)
