@@ -33,6 +33,8 @@ PROGRAMS = {
     "raster.frames": ("--count", "200", "--size", "32", "--frames", "3", "--degrees", "1,2", "--threads", "1"),
     "raster.harmonics": ("--count", "50", "--size", "16", "--turns", "1"),
     "training.held_out_times": ("{data}", *SHORT, "--set", "train.iterations=10"),
+    "training.image_size": ("{data}", "--lines", "18", "36", *SHORT, "--set", "train.iterations=10"),
+    "training.reconstruction": ("{data}", "{scene}", "--points", "3000", *SHORT, "--set", "train.iterations=10"),
     "training.memory": ("--size=48", "--cameras=5", "--times=3", "--objects=2", "--gaussians=500", *SHORT),
     "training.length": ("--size=32", "--cameras=4", "--times", "3", "--steps=1", "--objects=1"),
     "motion": ("--gaussians", "100", "--bodies", "2", "--size", "small", "--rounds", "1"),
@@ -69,9 +71,11 @@ LONG = (  # more than five seconds each
     "raster.static_layer",
     "training.curve",
     "training.held_out_times",
+    "training.image_size",
     "training.length",
     "training.memory",
     "training.network_playback",
+    "training.reconstruction",
     "words",
 )
 
@@ -94,7 +98,7 @@ def test_a_benchmark_prints_a_table_and_writes_finite_figures(
     if "{field}" in PROGRAMS[name]:
         run.train(tiny.root, field, tiny_datasets.settings("train.representation='field'", "train.iterations=40"))
     places = {"data": tiny.root, "run": trained.folder, "encoder": encoder, "field": field}
-    if name in ("film", "large_scene"):
+    if "{scene}" in PROGRAMS[name]:
         places["scene"] = scene_file.write(baked, tmp_path / "scene.r5dgs")
     given = [text.format(**places) for text in PROGRAMS[name]]
     target = tmp_path / "rows.json"
