@@ -11,7 +11,7 @@ import bpy
 from ...r5dgs_core import errors
 from ...r5dgs_core.formats import registry
 from ...r5dgs_core.scene import scene_file
-from ..scene import timeline
+from ..scene import loaded_scenes, presence_keys, timeline
 from ..ui import plural
 from ..ui.stepwise_operator import Outcome, Step, Steps
 from ..worker import jobs
@@ -33,7 +33,8 @@ def steps(
     """Write the visible objects of a loaded scene with their edits, in the world of the scene file.
 
     Args:
-        context: Context with the scene's frames; objects hidden in its view layer are left out.
+        context: Context with the scene's frames; objects hidden in its view layer are left out, except by keys of
+            their presence.
         collection: Loaded scene.
         path: Output file; the frame number is appended to its name if each frame is a file of its own.
         format: Output format.
@@ -45,13 +46,14 @@ def steps(
         The outcome, with a warning for each part of the scene that the format loses.
 
     Raises:
-        ConfigError: Nothing to export is visible at the current frame, a point cloud has lost its points, or the path
-            is the source of a loaded scene.
+        ConfigError: Nothing to export is visible or absent only for a time, a point cloud has lost its points, or the
+            path is the source of a loaded scene.
         SceneFileError: The scene's own file is missing, or a file cannot be written.
     """
     scene.refuse_sources(path)
     wanted, times = gaussians.chosen(context, which), timeline.of_collection(collection)
-    clouds = {one.object for one in gaussians.shown(context.evaluated_depsgraph_get(), wanted)}
+    with presence_keys.ignored(loaded_scenes.members(collection, "CLOUD")):  # what enters later is exported too
+        clouds = {one.object for one in gaussians.shown(context.evaluated_depsgraph_get(), wanted)}
     clouds &= set(collection.all_objects)
     if not clouds:
         raise gaussians.nothing_shown(wanted)

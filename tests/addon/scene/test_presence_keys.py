@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from r5dgs_core.formats import ply
+from r5dgs_core.playback import played_splats, scene_player
 from r5dgs_core.scene import scene_file
 from tests.support import motions, scenes
 
@@ -172,3 +174,26 @@ def test_a_saved_scene_has_the_times_of_a_retimed_object(blender, loaded, tmp_pa
     assert found[1, "body"] == found[1, "shadow"]
     (_, enters), (leaves, returns) = found[1, "body"]
     assert 0.22 < enters < 0.3 and 0.62 < leaves < 0.68 and 0.88 < returns < 0.92
+
+
+def test_exports_hold_what_is_absent_at_the_current_frame_but_not_what_users_hide(blender, scene, loaded, tmp_path):
+    motions.go_to(blender, loaded, 0.0)
+    blender.data.objects["red apple"].hide_set(True)
+    path = tmp_path / "new.r5dgs"
+    assert blender.ops.r5dgs.export_format(filepath=str(path), format="r5dgs") == {"FINISHED"}
+    written, apple = scene_file.read(path), {2}
+    assert absences(written) == absences(scene)
+    counts = ({item.id: item.count for item in one.objects if item.count} for one in (written, scene))
+    assert {object_id for object_id, _ in set.symmetric_difference(*(set(one.items()) for one in counts))} == apple
+    blender.data.objects["red apple"].hide_set(False)
+    assert_there(blender, loaded)
+
+
+def test_frames_hold_what_enters_after_the_current_one(blender, scene, loaded, tmp_path):
+    motions.go_to(blender, loaded, 0.0)
+    blender.context.scene.frame_start, blender.context.scene.frame_end = 1, 13  # up to 0.2
+    options = {"filepath": str(tmp_path / "a.ply"), "format": "ply", "frames": "RANGE", "frame_step": 12}
+    assert blender.ops.r5dgs.export_format(**options) == {"FINISHED"}
+    for frame, t in ((1, 0.0), (13, 0.2)):
+        wanted = len(played_splats.at(scene_player.Player(scene), t).means)
+        assert len(ply.read(tmp_path / f"a_{frame:04d}.ply").means) == wanted
