@@ -30,7 +30,8 @@ def edit(
 
     Args:
         scene: The original scene.
-        pieces: Its remaining Gaussians, possibly repeated. Rows in no piece are deleted.
+        pieces: Its remaining Gaussians, possibly repeated. Rows in no piece are deleted, and those that always are
+            absent.
         times: The observed times and later ones, at which the ``matrices`` of the pieces are given. [T]
         table: Names, aliases, captions and colours by object id; its row ranges are ignored. Objects that are missing
             in the table keep theirs.
@@ -46,6 +47,8 @@ def edit(
     for piece in pieces:
         if not 0 <= piece.start <= piece.start + piece.count <= len(scene.gaussians.means):
             raise ValueError(f"{piece.name}: its rows exceed the scene's {len(scene.gaussians.means)} Gaussians")
+    notes += [f"{piece.name}: left out, as it is hidden at all times" for piece in pieces if piece.is_never_there]
+    pieces = [piece for piece in pieces if not piece.is_never_there]
     clusters = edited_motion.move(scene, piece_clusters.clusters(scene, pieces, notes), times, notes)
     kept, arrays, untouched = edited_gaussians.gather(scene, clusters)
     objects = _objects(scene, table, arrays["object_ids"])

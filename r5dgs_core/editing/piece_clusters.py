@@ -53,6 +53,11 @@ class Piece:
     tint: np.ndarray | None = None
     absent: np.ndarray | None = None
 
+    @property
+    def is_never_there(self) -> bool:
+        """True if they are absent at all times."""
+        return self.absent is not None and bool(self.absent.all())
+
 
 @dataclass(frozen=True)
 class PieceMotion:

@@ -197,3 +197,12 @@ def test_frames_hold_what_enters_after_the_current_one(blender, scene, loaded, t
     for frame, t in ((1, 0.0), (13, 0.2)):
         wanted = len(played_splats.at(scene_player.Player(scene), t).means)
         assert len(ply.read(tmp_path / f"a_{frame:04d}.ply").means) == wanted
+
+
+def test_an_object_whose_keys_always_hide_it_is_left_out(blender, loaded, tmp_path):
+    for curve in motions.addon("compat").fcurves(blender.data.objects["mug"]):
+        while len(curve.keyframe_points) > 1:
+            curve.keyframe_points.remove(curve.keyframe_points[1])
+        curve.keyframe_points[0].co.y = 1
+    written = save(blender, tmp_path / "new.r5dgs")
+    assert "mug" not in {item.name for item in written.objects}

@@ -348,3 +348,12 @@ def test_times_of_absence_are_kept_or_follow_the_edit(move):
     later = [dataclasses.replace(one, absent=times > (0.65 if one.object_id == 2 else 9)) for one in pieces]
     found = {group.object_id: group.absent for group in edit(scene, later)[0].groups if group.role == "body"}
     assert found == {1: (), 2: ((pytest.approx(0.65), np.inf),), 3: ()}
+
+
+def test_what_is_absent_at_all_times_is_left_out_with_a_note():
+    scene = make_scene(n=120)
+    times, pieces = times_of(scene), pieces_of(scene)
+    hidden = [dataclasses.replace(one, absent=np.full(len(times), one.object_id == 2)) for one in pieces]
+    result, notes = edit(scene, hidden)
+    assert notes == ["object 2: left out, as it is hidden at all times"]
+    assert not (result.gaussians.object_ids == 2).any() and result.object(1).count == scene.object(1).count
