@@ -3,7 +3,7 @@
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import bpy
@@ -67,21 +67,25 @@ def steps(
     yield Step(edited.done, edited.done + len(targets), f"writing {targets[0].name}", slow=True)
     try:
         if format.why_unavailable() is None:
-            for number, target in enumerate(format.write(edited.scene, path, options), edited.done + 1):
-                yield Step(number, edited.done + len(targets), target.name)
+            written = 0
+            for written, target in enumerate(format.write(edited.scene, path, options), 1):
+                yield Step(edited.done + written, edited.done + len(targets), target.name)
         else:
-            yield from _by_worker(edited, path, format, options, len(targets))
+            written = yield from _by_worker(edited, path, format, options, len(targets))
     except OSError as error:
         raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
-    files = path.name if targets == [path] else plural.of(len(targets), "file")
+    files = path.name if targets == [path] else plural.of(written, "file")
     lost = [f"Lost in this format: {sentence}" for sentence in format.losses(edited.scene, options)]
     return Outcome(f"{files}: {format.label} of {plural.of(len(clouds), 'cloud')}", [*edited.notes, *lost])
 
 
 def _by_worker(
     edited: scene.EditedScene, path: Path, format: registry.Format, options: registry.Options, count: int
-) -> Iterator[Step]:
-    """Write a scene in the worker, whose Python may have the format's package. Stopping it stops the worker."""
+) -> Generator[Step, None, int]:
+    """Write a scene in the worker, whose Python may have the format's package. Returns the number of files.
+
+    Stopping it stops the worker.
+    """
     with tempfile.TemporaryDirectory() as folder:
         source = scene_file.write(edited.scene, Path(folder) / "scene.r5dgs", precision="exact")
         arguments = {"format": format.name, "times": list(options.times), "frames": options.frames}
@@ -91,7 +95,7 @@ def _by_worker(
             while not job.done:
                 yield Step(edited.done, edited.done + count, job.doing, slow=True)
                 time.sleep(_POLL_S)
-            job.answer()
+            return len(job.answer()[0]["files"])
         finally:
             if not job.done:
                 job.cancel()

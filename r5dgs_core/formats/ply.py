@@ -85,9 +85,8 @@ def write(
 
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
     """Write the Gaussians at each time, in the world of the scene file. Implements `registry.Format.write`."""
-    scene_nodes.check(scene, options.object_ids)
     player = Player(scene)
-    for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
+    for t, target in scene_nodes.files(scene, options, FORMAT.paths(path, options, scene)):
         splats = played_splats.at(player, t, options.object_ids)
         comments = _bands(scene, t, options.object_ids)
         yield write(splats, target, plain=options.plain, origin=scene.origin, comments=comments)
@@ -115,6 +114,7 @@ FORMAT = registry.Format(
     write=export,
     per_frame=True,
     has_columns=True,
+    losses=scene_nodes.lost_frames,
 )
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from .. import errors
-from ..scene import predictability, row_runs
-from ..scene.scene import Scene
+from ..scene import predictability, presence, row_runs
+from ..scene.scene import MotionGroup, Scene
 from .registry import Options
 
 
@@ -25,6 +26,49 @@ def check(scene: Scene, object_ids: Collection[int] | None) -> None:
     """Raise ConfigError if the selected objects (all if None) have no Gaussians."""
     if not any(item.count for item in scene.objects if object_ids is None or item.id in object_ids):
         raise errors.ConfigError(f"{scene.name}: expected Gaussians to export, found none in the selected objects")
+
+
+def files(scene: Scene, options: Options, paths: Sequence[Path]) -> list[tuple[float, Path]]:
+    """Return time and path of the files of single times, without those times at which all selected objects are absent.
+
+    Args:
+        scene: The scene.
+        options: Selected objects and times.
+        paths: File of each time.
+
+    Raises:
+        ConfigError: The selected objects have no Gaussians, or are absent at all of the times.
+    """
+    check(scene, options.object_ids)
+    there = _are_there(scene, options)
+    if any(there):
+        return [found for found, shown in zip(zip(options.times, paths, strict=True), there, strict=True) if shown]
+    first, last = min(options.times), max(options.times)
+    when = f"at t = {first:g}" if first == last else f"from t = {first:g} to {last:g}"
+    names = {item.id: item.name for item in scene.objects}
+    told = [f"{names[group.object_id]} {presence.text(group.absent)}" for group in _groups(scene, options.object_ids)]
+    known = "; ".join(list(dict.fromkeys(told))[:3])
+    raise errors.ConfigError(f"{scene.name}: expected Gaussians {when}, but all selected objects are absent: {known}")
+
+
+def lost_frames(scene: Scene, options: Options) -> list[str]:
+    """Sentence about frames at which all selected objects are absent and that `files` leaves out, or none."""
+    gone = [n for n, shown in zip(options.frames or (), _are_there(scene, options), strict=False) if not shown]
+    if not gone:
+        return []
+    which = f"frame {gone[0]} is" if len(gone) == 1 else f"{len(gone)} frames from {gone[0]} to {gone[-1]} are"
+    return [f"{which} not written, as all exported objects are absent then"]
+
+
+def _are_there(scene: Scene, options: Options) -> list[bool]:
+    """Return True for each time at which at least one selected object is there."""
+    groups = _groups(scene, options.object_ids)
+    return [not all(presence.is_absent(group.absent, t) for group in groups) for t in options.times]
+
+
+def _groups(scene: Scene, object_ids: Collection[int] | None) -> list[MotionGroup]:
+    """Motion groups of the Gaussians of the selected objects (all if None)."""
+    return [scene.groups[k] for k in np.unique(scene.gaussians.motion_ids[selected(scene, object_ids)])]
 
 
 def end(scene: Scene, options: Options) -> float:

@@ -24,12 +24,11 @@ REMEDY = "npm install -g @playcanvas/splat-transform@2.7.1"
 
 def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
     """Write the Gaussians at each time. Implements `registry.Format.write`."""
-    scene_nodes.check(scene, options.object_ids)
     player, program = Player(scene), shutil.which(PROGRAM)
     if program is None:
         raise errors.BackendError(str(FORMAT.why_unavailable()))
     axes = cameras.WORLD_TO_BLENDER["colmap"].T @ cameras.WORLD_TO_BLENDER[scene.world_convention]
-    for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
+    for t, target in scene_nodes.files(scene, options, FORMAT.paths(path, options, scene)):
         splats = turned_splats.turned(played_splats.at(player, t, options.object_ids), axes)
         with (
             registry.writing(target),
@@ -53,6 +52,7 @@ FORMAT = registry.Format(
     loses="motion between frames, objects, names, sky, cameras",
     write=export,
     per_frame=True,
+    losses=scene_nodes.lost_frames,
     program=PROGRAM,
     remedy=REMEDY,
 )

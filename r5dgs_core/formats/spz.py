@@ -28,10 +28,9 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
     """Write the Gaussians at each time. Implements `registry.Format.write`."""
     with extras.required("SPZ files", EXTRA):
         import gsply
-    scene_nodes.check(scene, options.object_ids)
     player = Player(scene)
     axes = cameras.WORLD_TO_BLENDER["opengl"].T @ cameras.WORLD_TO_BLENDER[scene.world_convention]
-    for t, target in zip(options.times, FORMAT.paths(path, options, scene), strict=True):
+    for t, target in scene_nodes.files(scene, options, FORMAT.paths(path, options, scene)):
         splats = turned_splats.turned(played_splats.at(player, t, options.object_ids), axes)
         content = gsply.GSData(
             means=splats.means,
@@ -53,12 +52,13 @@ def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path
 def losses(scene: Scene, options: registry.Options) -> list[str]:
     """Parts of this scene that files do not hold, as sentences, from at most `_TIMES` of the times."""
     player, (low, high) = Player(scene), _LOG_SCALES
-    wrong = sizes = np.zeros((), bool)
+    wrong, sizes = np.zeros((2, len(scene.gaussians.means)), bool)
     for t in sampling.spread(options.times, _TIMES):
+        rows = played_splats.rows_at(scene, t, options.object_ids)
         splats = played_splats.at(player, t, options.object_ids)
-        wrong = wrong | (np.abs(splats.sh[:, 0]) > _DC).any(-1) | (np.abs(splats.sh[:, 1:]) > _SH).any((1, 2))
-        sizes = sizes | ((splats.log_scales < low) | (splats.log_scales > high)).any(-1)
-    found = []
+        wrong[rows] |= (np.abs(splats.sh[:, 0]) > _DC).any(-1) | (np.abs(splats.sh[:, 1:]) > _SH).any((1, 2))
+        sizes[rows] |= ((splats.log_scales < low) | (splats.log_scales > high)).any(-1)
+    found = scene_nodes.lost_frames(scene, options)
     if wrong.any():
         found.append(f"{int(wrong.sum())} Gaussians have colours beyond the range of SPZ, which are clipped")
     if sizes.any():

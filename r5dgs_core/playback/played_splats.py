@@ -8,9 +8,18 @@ import numpy as np
 
 from ..color import tints
 from ..scene import presence, spherical_harmonics
+from ..scene.scene import Scene
 from ..scene.splats import Splats
 from . import affine_transform
 from .scene_player import Player
+
+
+def rows_at(scene: Scene, t: float, object_ids: Collection[int] | None = None) -> np.ndarray:
+    """Return the rows of the Gaussians of some objects, all if None, that are not absent at a time. [n]"""
+    own = scene.gaussians.object_ids
+    chosen = np.ones(len(own), bool) if object_ids is None else np.isin(own, list(object_ids))
+    gone = presence.absent_rows([group.absent for group in scene.groups], scene.gaussians.motion_ids, t)
+    return np.flatnonzero(chosen if gone is None else chosen & ~gone)
 
 
 def at(player: Player, t: float, object_ids: Collection[int] | None = None) -> Splats:
@@ -21,10 +30,7 @@ def at(player: Player, t: float, object_ids: Collection[int] | None = None) -> S
         t: Scene time, may exceed t_max.
         object_ids: Objects to include; None for all Gaussians.
     """
-    frame = player.frame(t)
-    chosen = np.ones(len(frame.means), bool) if object_ids is None else np.isin(frame.object_ids, list(object_ids))
-    gone = presence.absent_rows([group.absent for group in player.scene.groups], frame.motion_ids, t)
-    rows = np.flatnonzero(chosen if gone is None else chosen & ~gone)
+    frame, rows = player.frame(t), rows_at(player.scene, t, object_ids)
     bind = affine_transform.bind_state(player.scene, rows)
     sh = bind.sh
     if sh.shape[1] > 1:

@@ -108,6 +108,45 @@ def test_each_frame_is_a_file_and_clipped_colours_are_told(tmp_path, capsys):
     assert len(gsply.read_spz(tmp_path / "b.spz").means) == scene.object(1).count
 
 
+def late(tmp_path, n=120):
+    """A scene whose mug enters at 0.123, and its file."""
+    scene = scenes.with_absence(scenes.make_scene(n=n), (-np.inf, 0.123))
+    return scene, scene_file.write(scene, tmp_path / "late.r5dgs", precision="exact")
+
+
+@pytest.mark.parametrize("name", ["ply", "spz"])
+def test_frames_without_any_selected_object_are_not_written(tmp_path, capsys, name):
+    scene, source = late(tmp_path)
+    arguments = ["export", str(source), "--to", name, "--out", str(tmp_path / f"a.{name}"), "--objects", "mug"]
+    assert main.main([*arguments, "--frames", "1:12"]) == 0
+    assert "8 frames from 1 to 8 are not written" in capsys.readouterr().out
+    assert [p.name for p in sorted(tmp_path.glob(f"a*.{name}"))] == [f"a_{n:04d}.{name}" for n in range(9, 13)]
+    for target in tmp_path.glob(f"a*.{name}"):
+        found = gsply.read_spz(target) if name == "spz" else ply.read(target)
+        assert len(found.means) == scene.object(1).count
+
+
+@pytest.mark.parametrize("name", ["ply", "spz", "sog"])
+def test_an_absent_selection_is_an_error_that_names_the_time_of_its_entry(tmp_path, capsys, name, monkeypatch):
+    monkeypatch.setattr(sog.shutil, "which", lambda program: "found")
+    _, source = late(tmp_path)
+    given = ["export", source, "--to", name, "--out", tmp_path / f"a.{name}", "--objects", "mug"]
+    assert "Gaussians at t = 0, but all selected objects are absent: mug enters at 0.12" in complaint(
+        capsys, *given, "--time", 0
+    )
+    assert "Gaussians from t = 0 to 0.0333333" in complaint(capsys, *given, "--frames", "1:3")
+    assert not list(tmp_path.glob(f"a*.{name}"))
+
+
+def test_clipped_colours_are_counted_in_objects_that_enter(tmp_path):
+    scene, _ = late(tmp_path)
+    rows = np.flatnonzero(scene.gaussians.object_ids == 1)[:4]
+    sh = scene.gaussians.sh.copy()
+    sh[rows, 0] = 9
+    told = [spz.losses(scene.with_arrays(sh=sh), registry.Options(times)) for times in ((0.0,), (0.0, 0.5))]
+    assert told == [[], ["4 Gaussians have colours beyond the range of SPZ, which are clipped"]]
+
+
 def test_errors_leave_no_file(scene, tmp_path, capsys, monkeypatch):
     source = scene_file.write(scene, tmp_path / "a.r5dgs")
     out = tmp_path / "out"
