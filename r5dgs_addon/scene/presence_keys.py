@@ -48,9 +48,9 @@ def is_keyed(obj: bpy.types.Object) -> bool:
 
 
 def absent_at(obj: bpy.types.Object, frames: Sequence[float]) -> np.ndarray:
-    """Frames at which the keys of an object hide it in renders; none without keys. [T] bool"""
+    """Frames at which the keys of an object hide it in renders; none without keys or if users muted them. [T] bool"""
     curve = curve_of(obj, RENDER)
-    if curve is None:
+    if curve is None or (curve.mute and not obj.hide_render):  # `hide_in_renders` mutes and hides
         return np.zeros(len(frames), bool)
     return np.array([curve.evaluate(_own_frame(obj, frame)) > 0.5 for frame in frames], bool)
 

@@ -206,3 +206,15 @@ def test_an_object_whose_keys_always_hide_it_is_left_out(blender, loaded, tmp_pa
         curve.keyframe_points[0].co.y = 1
     written = save(blender, tmp_path / "new.r5dgs")
     assert "mug" not in {item.name for item in written.objects}
+
+
+def test_keys_that_the_user_mutes_are_not_saved_but_those_of_hidden_objects_are(blender, scene, loaded, tmp_path):
+    entry = next(one for one in loaded.r5dgs.table if one.object_id == 1)
+    motions.addon("scene.object_list").set_hidden_in_renders(entry, True)
+    assert absences(save(blender, tmp_path / "hidden.r5dgs")) == absences(scene)
+    motions.addon("scene.object_list").set_hidden_in_renders(entry, False)
+    mug = blender.data.objects["mug"]
+    for curve in motions.addon("compat").fcurves(mug):
+        curve.mute = True
+    mug.hide_viewport = mug.hide_render = False
+    assert {role for _, role in absences(save(blender, tmp_path / "muted.r5dgs"))} == {"shadow"}
