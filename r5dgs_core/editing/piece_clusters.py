@@ -29,7 +29,7 @@ class Piece:
         motion_id: Their motion group in the file.
         start: First row in the file.
         count: Number of rows.
-        mover: Key of the object that moves them; pieces with equal mover and motion group stay together.
+        mover: Key of the object that moves them; pieces with equal mover, group and absence stay together.
         matrices: Maps from the bind state of the file to its world, at the observed times and later ones. [T, 4, 4]
         pivot: Centre of rotation at t_max; None for the transformed pivot of the group. [3]
         parent: Linear part of the parent transform of their whole learned motion, or None. [3, 3]
@@ -58,6 +58,11 @@ class Piece:
         """True if they are absent at all times."""
         return self.absent is not None and bool(self.absent.all())
 
+    @property
+    def presence(self) -> list[bool] | None:
+        """Times at which they are not in the scene, comparable between pieces."""
+        return None if self.absent is None else self.absent.tolist()
+
 
 @dataclass(frozen=True)
 class PieceMotion:
@@ -85,7 +90,7 @@ class PieceMotion:
 
 @dataclass(frozen=True)
 class Cluster:
-    """Pieces with a common motion, which form a new motion group.
+    """Pieces with a common motion and absence, which form a new motion group.
 
     Attributes:
         pieces: Its members; empty for a group that was already empty.
@@ -123,12 +128,13 @@ def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cl
         if motion.bent > RIGID_TOLERANCE:
             notes.append(f"{piece.name}: its scale changes with time, which a scene file cannot hold")
         radius = reach(scene, piece, np.zeros(3))
-        if source is pinned and (_apart(motion, still, radius) <= piece.allowed).all():
+        keyed = piece.absent is not None and bool(piece.absent.any())  # group 0 is always there
+        if source is pinned and not keyed and (_apart(motion, still, radius) <= piece.allowed).all():
             found[0].pieces.append(piece)
             continue
         for cluster in found[1:]:
             first = cluster.pieces[0]
-            alike = cluster.source is source and first.mover == piece.mover
+            alike = cluster.source is source and first.mover == piece.mover and first.presence == piece.presence
             if alike and (_apart(motion, cluster.motion, radius) <= piece.allowed).all():
                 cluster.pieces.append(piece)
                 break

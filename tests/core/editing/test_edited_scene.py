@@ -9,7 +9,7 @@ from r5dgs_core.editing import edited_scene
 from r5dgs_core.editing.edited_scene import Piece
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.playback import scene_player
-from r5dgs_core.scene import row_runs, scene_file, slipped_rotations, validation
+from r5dgs_core.scene import presence, row_runs, scene_file, slipped_rotations, validation
 from r5dgs_core.scene.lookup_table import EmbeddingSource, EncoderCard, LookupTable
 from tests.support.scenes import make_scene, with_absence
 
@@ -357,3 +357,24 @@ def test_what_is_absent_at_all_times_is_left_out_with_a_note():
     result, notes = edit(scene, hidden)
     assert notes == ["object 2: left out, as it is hidden at all times"]
     assert not (result.gaussians.object_ids == 2).any() and result.object(1).count == scene.object(1).count
+
+
+def test_pieces_of_a_group_with_different_absence_get_groups_of_their_own():
+    scene = make_scene(n=120)
+    times, pieces = times_of(scene), []
+    for one in pieces_of(scene):
+        half = one.count // 2 if one.motion_id == 1 else one.count
+        pieces.append(dataclasses.replace(one, count=half, absent=times < (0.1 if one.motion_id == 0 else -9)))
+        if half < one.count:
+            rest = dataclasses.replace(one, start=one.start + half, count=one.count - half, absent=times > 0.61)
+            pieces.append(rest)
+    result, notes = edit(scene, pieces)
+    late = [group for group in result.groups if group.absent]
+    assert notes == [] and [group.object_id for group in late] == [-1, 0, 1]
+    for t in (0.05, 0.3, 0.7):
+        frame = scene_player.Player(result).frame(t)
+        hidden = int((frame.opacity_logits == presence.HIDDEN).sum())
+        still = int((scene.gaussians.motion_ids == 0).sum())
+        assert hidden == (still if t < 0.1 else rest.count if t > 0.6 else 0)
+        places = (sorted(one.means.tolist()) for one in (frame, scene_player.Player(scene).frame(t)))
+        np.testing.assert_allclose(*places, atol=2e-5)
