@@ -54,6 +54,7 @@ def of(scene: Scene) -> tuple[list[SceneBody], list[str]]:
     for hull in scene.hulls:
         group, name = scene.groups[hull.motion_id], names[hull.object_id]
         if presence.span(group.absent)[1] < np.inf:
+            lines.append(f"{name}: has left the scene before t_max")
             continue
         try:
             shape = solid.of(hull.vertices)

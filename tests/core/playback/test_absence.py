@@ -57,8 +57,10 @@ def test_what_has_left_touches_nothing():
     scene = make_scene(200, shadows=False)
     rows = [scene.gaussians.motion_ids == g for g in (1, 2)]
     hulls = tuple(Hull(k, k, scene.gaussians.means[mine].astype(float)) for k, mine in enumerate(rows, 1))
-    names = []
+    names, told = [], []
     for absent in ((-math.inf, 0.1), (0.7, math.inf)):
-        bodies, _ = scene_bodies.of(dataclasses.replace(with_absence(scene, absent), hulls=hulls))
+        bodies, lines = scene_bodies.of(dataclasses.replace(with_absence(scene, absent), hulls=hulls))
         names.append([body.name for body in bodies])
+        told.append(lines)
     assert names == [["mug", "red apple"], ["red apple"]]
+    assert told == [[], ["mug: has left the scene before t_max"]]
