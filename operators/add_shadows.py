@@ -3,6 +3,7 @@
 import bpy
 
 from ..r5dgs_addon.engine import mesh_merge, mesh_shadows, visible_clouds
+from ..r5dgs_addon.scene import presence_keys
 from ..r5dgs_addon.ui import plural
 from ..r5dgs_addon.worker import worker_operator
 
@@ -29,7 +30,9 @@ class R5DGS_OT_add_shadows(worker_operator.WaitsForWorker, bpy.types.Operator):
 
     def _finish(self, context, answer):
         pictures = [arrays for _, arrays in self._job.answers() if "depth" in arrays]
-        _, clouds = visible_clouds.instances(context.evaluated_depsgraph_get())
+        everything = [obj for obj in bpy.data.objects if obj.r5dgs.role == "CLOUD"]
+        with presence_keys.ignored(everything):  # objects that enter later cast shadows then
+            _, clouds = visible_clouds.instances(context.evaluated_depsgraph_get())
         proxies = mesh_shadows.add(context.scene, clouds, self._background, pictures)
         self.report({"INFO"}, f"{plural.of(len(proxies.objects), 'object')} added in '{proxies.name}'")
         return {"FINISHED"}

@@ -76,7 +76,7 @@ def add(
 
     Args:
         scene: Blender scene that is merged with meshes by Cycles.
-        clouds: Visible point clouds of the scene.
+        clouds: Visible point clouds of the scene, also those that are absent at the current frame.
         background: Result of `views`.
         pictures: Arrays ``depth`` and ``alpha`` of each view.
 

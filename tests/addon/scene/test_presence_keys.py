@@ -1,5 +1,8 @@
 """Objects that enter late or leave are hidden by keys while they are absent, whatever users do with them."""
 
+import importlib
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -133,15 +136,18 @@ def test_a_retimed_object_enters_when_its_motion_says(blender, loaded):
 
 
 def test_the_shadow_of_a_body_on_meshes_is_there_while_the_body_is(blender, loaded):
-    motions.go_to(blender, loaded, 0.2)
-    shadows = motions.addon("engine.mesh_shadows")
-    _, clouds = motions.addon("engine.visible_clouds").instances(blender.context.evaluated_depsgraph_get())
-    for cloud in shadows.bodies(clouds):
-        shadows._add_hull(blender.context.scene.collection, cloud)
+    blender.ops.r5dgs.merge_with_meshes()
+    motions.go_to(blender, loaded, 0.0)
+    operator = importlib.import_module("r5dgs.operators.add_shadows").R5DGS_OT_add_shadows
+    job = SimpleNamespace(answers=lambda: [])
+    given = SimpleNamespace(_job=job, _background=(), report=lambda *said: None)
+    assert operator._finish(given, blender.context, None) == {"FINISHED"}
     proxies = {obj.parent.name: obj for obj in blender.data.objects if obj.name.endswith("shadow proxy")}
     assert set(proxies) == {"mug", "red apple", "toy car"}
     for t, there in THERE.items():
         motions.go_to(blender, loaded, t)
+        scene = blender.context.scene
+        scene.r5dgs_render.meshes.frame_set(scene.frame_current, subframe=scene.frame_subframe)
         shown = {name for name, obj in proxies.items() if not (obj.hide_render or obj.hide_viewport)}
         assert shown == ({"mug", "red apple", "toy car"} if there else {"red apple", "toy car"})
 
