@@ -57,6 +57,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "tracks.plane_normal": (3,),
     "tracks.entered": (2,),
     "tracks.owners": ("G",),
+    "tracks.absent": ("B - 1", "S"),
     "field.times": ("S",),
     "field.casters": ("W",),
     "field.plane_normal": (3,),
@@ -76,10 +77,12 @@ _WHOLE_NUMBERS = {
     "field.bodies",
     "field.iteration",
 }
+_MASKS = (FROZEN, "tracks.absent")
+_OPTIONAL = ("tracks.entered", "tracks.owners", "tracks.absent")
 _REQUIRED = {  # by representation
     "tracks": (
         "light",
-        *(name for name in _SHAPES if name.startswith("tracks.") and name not in ("tracks.entered", "tracks.owners")),
+        *(name for name in _SHAPES if name.startswith("tracks.") and name not in _OPTIONAL),
     ),
     "field": ("light", *(name for name in _SHAPES if name.startswith("field."))),
     "still": ("still.centers", "still.time"),
@@ -128,10 +131,11 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
             expected = ", ".join(f"{x} = {lengths[x]}" if x in lengths else str(x) for x in map(str, shape))
             raise CheckpointError(f"'{name}': expected shape [{expected}], found {list(found)}")
         wrong = (name in _WHOLE_NUMBERS) != (tensor.dtype in _WHOLE) and name != "generator"
-        if wrong or (name == FROZEN and tensor.dtype != torch.bool):
+        if wrong or (name in _MASKS and tensor.dtype != torch.bool):
             raise CheckpointError(f"'{name}': expected another type of number than {tensor.dtype}")
-    if len(tensors["observed"]) != max(0, lengths["B"] - 1) and DISCOVERED_LABELS not in tensors:
-        raise CheckpointError(f"'observed': expected {lengths['B'] - 1} rows, found {len(tensors['observed'])}")
+    for name in ("observed", "tracks.absent") if DISCOVERED_LABELS not in tensors else ():
+        if name in tensors and len(tensors[name]) != max(0, lengths["B"] - 1):
+            raise CheckpointError(f"'{name}': expected {lengths['B'] - 1} rows, found {len(tensors[name])}")
 
 
 def _are(kinds: type | tuple[type, ...], length: int | None = None) -> Callable[[Any], bool]:

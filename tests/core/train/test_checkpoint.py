@@ -108,6 +108,22 @@ def test_a_missing_tensor_is_named(tmp_path, name):
         checkpoint.load(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("rows", "knots", "kind"), [(0, 3, torch.bool), (2, 3, torch.bool), (1, 2, torch.bool), (1, 3, torch.float32)]
+)
+def test_times_of_absence_that_fit_no_objects_are_named(tmp_path, rows, knots, kind):
+    for folder, absent in (
+        ("right", torch.zeros(1, 3, dtype=torch.bool)),
+        ("wrong", torch.zeros(rows, knots, dtype=kind)),
+    ):
+        (tmp_path / folder).mkdir()
+        state = dataclasses.replace(STATE, tensors={**STATE.tensors, "tracks.absent": absent})
+        checkpoint.save(tmp_path / folder, state)
+    assert "tracks.absent" in checkpoint.load(tmp_path / "right").tensors
+    with pytest.raises(CheckpointError, match=r"'tracks.absent': expected"):
+        checkpoint.load(tmp_path / "wrong")
+
+
 @pytest.mark.parametrize("moment", ["save", "fsync", "replace"])
 def test_the_old_checkpoint_survives_a_crash_while_the_new_one_is_written(tmp_path, monkeypatch, moment):
     checkpoint.save(tmp_path, STATE)
