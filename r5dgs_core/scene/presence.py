@@ -40,7 +40,7 @@ def is_absent(found: Sequence[Interval], t: float) -> bool:
     return any(first <= t < last for first, last in found)
 
 
-def span(found: Sequence[Interval]) -> Interval:
+def span(found: Sequence[Interval]) -> tuple[float, float]:
     """Return the time of a group's first entry and of its last exit, infinite if there is none."""
     edges = [edge for interval in found for edge in interval]
     return (
