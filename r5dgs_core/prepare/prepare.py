@@ -50,15 +50,7 @@ def prepare(request: Request, progress: Progress) -> Plan:
     file = request.calibration
     if unknown_cameras.missing(request.source, file):
         with folder_lock.hold(out):
-            file = unknown_cameras.reconstruct(
-                request.source,
-                out,
-                request.unknown,
-                request.up,
-                rate=request.rate,
-                again=request.overwrite,
-                progress=progress,
-            )
+            file = _reconstructed(request, out, progress)
     elif request.unknown != unknown_cameras.UnknownCameras():
         raise errors.UsageError(
             "--board, --lenses, --shared-lens, --moving and --distance apply to cameras without a calibration; leave "
@@ -80,11 +72,26 @@ def prepare(request: Request, progress: Progress) -> Plan:
     return plan
 
 
-def _begin(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, Any] | None:
-    """Return the record of a run with the identity, or None.
+def _reconstructed(request: Request, out: Path, progress: Progress) -> Path:
+    """Return the file of the reconstructed cameras; those of other recordings are reconstructed again."""
+    present = _present(out)
+    known = {} if present is None else present.get("identity", {}).get("recordings", {})
+    other = not unknown_cameras.fit(request.source, out, known)
+    if other and present is not None and not request.overwrite:
+        _check_replaceable(out, present, ["recordings"])
+    return unknown_cameras.reconstruct(
+        request.source,
+        out,
+        request.unknown,
+        request.up,
+        rate=request.rate,
+        again=request.overwrite or other,
+        progress=progress,
+    )
 
-    The data set of another run is removed if it is unfinished, or with ``overwrite``.
-    """
+
+def _present(out: Path) -> dict[str, Any] | None:
+    """Return the record of the data set in a folder, or None. Raises DatasetError if the folder has other files."""
     present = capture_file.read(out)
     if present is None:
         own = {folder_lock.LOCK_FILE, unknown_cameras.FILE, unknown_cameras.WORK}
@@ -93,15 +100,29 @@ def _begin(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, A
             raise errors.DatasetError(
                 f"{out}: expected an empty folder or a prepared data set, found {foreign[0]}; name another folder"
             )
-        return None
-    if present.get("identity") == wanted:
-        return present
-    if present.get("finished") and not overwrite:
-        changed = [key for key in wanted if present.get("identity", {}).get(key) != wanted[key]]
+    return present
+
+
+def _check_replaceable(out: Path, present: dict[str, Any], changed: list[str]) -> None:
+    """Raise DatasetError for a finished data set."""
+    if present.get("finished"):
         raise errors.DatasetError(
             f"{out}: was prepared from other input or settings ({', '.join(changed)}); name another folder with --out, "
             "or give --overwrite"
         )
+
+
+def _begin(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, Any] | None:
+    """Return the record of a run with the identity, or None.
+
+    The data set of another run is removed if it is unfinished, or with ``overwrite``.
+    """
+    present = _present(out)
+    if present is None or present.get("identity") == wanted:
+        return present
+    if not overwrite:
+        changed = [key for key in wanted if present.get("identity", {}).get(key) != wanted[key]]
+        _check_replaceable(out, present, changed)
     for name in _WRITTEN:
         path = out / name
         if path.is_dir():

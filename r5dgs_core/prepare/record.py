@@ -16,12 +16,10 @@ from ..capture.calibration.calibration import Calibration
 from ..data.layouts.camera_files import POINTS
 from ..data.splits import SPLITS
 from ..scene.cameras import OPENGL_TO_OPENCV
-from . import capture_file
+from . import capture_file, source_files
 from .cameras import Camera
 from .clock import GAP, Offset
 from .plan import Plan, Request
-
-_EDGE_BYTES = 1 << 16  # bytes at each end of a file that enter its fingerprint
 
 
 def identity(request: Request, opened: Sequence[Camera], calibration: Calibration) -> dict[str, Any]:
@@ -42,7 +40,7 @@ def identity(request: Request, opened: Sequence[Camera], calibration: Calibratio
         "horizon": request.hold_out.horizon,
         "scale": calibration.meters_per_unit,
     }
-    files = {camera.name: _fingerprint(camera.source.paths) for camera in opened}
+    files = {camera.name: source_files.fingerprint(camera.source.paths) for camera in opened}
     views = [
         (camera.name, view.lens, view.camera_to_world.tolist())
         for camera in opened
@@ -51,18 +49,6 @@ def identity(request: Request, opened: Sequence[Camera], calibration: Calibratio
     times = hashlib.sha256(b"".join(camera.source.times.tobytes() for camera in opened)).hexdigest()
     cameras = hashlib.sha256((calibration.format + repr(views)).encode()).hexdigest()
     return {**settings, "recordings": files, "calibration": cameras, "times": times}
-
-
-def _fingerprint(paths: Sequence[Path]) -> str:
-    """Hash of the names, sizes and ends of files."""
-    hasher = hashlib.sha256()
-    for path in paths:
-        size = path.stat().st_size
-        with path.open("rb") as stream:
-            head = stream.read(_EDGE_BYTES)
-            stream.seek(max(size - _EDGE_BYTES, 0))
-            hasher.update(f"{path.name} {size} ".encode() + head + stream.read(_EDGE_BYTES))
-    return hasher.hexdigest()
 
 
 def content(

@@ -11,7 +11,9 @@ Needs only the standard library.
 
 from __future__ import annotations
 
+import hashlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +25,7 @@ FRAME_SUFFIXES = (*file_kinds.IMAGES, *file_kinds.HEIC)
 # GoPro: GH020042 is chapter 2 of recording 42. Older cameras name its first chapters GOPR0042 and GP010042.
 _CHAPTER = re.compile(r"(?P<family>G[HXL])(?P<chapter>\d{2})(?P<number>\d{4})", re.IGNORECASE)
 _OLD_CHAPTER = re.compile(r"(?P<family>G)(?:OPR|P(?P<chapter>\d{2}))(?P<number>\d{4})", re.IGNORECASE)
+_EDGE_BYTES = 1 << 16  # bytes at each end of a file that enter its fingerprint
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,18 @@ def find(source: Path) -> list[CameraFiles]:
         )
     _check_names(found)
     return sorted(found, key=lambda camera: natural(camera.name))
+
+
+def fingerprint(paths: Sequence[Path]) -> str:
+    """Return a hash of the names, sizes and ends of files."""
+    hasher = hashlib.sha256()
+    for path in paths:
+        size = path.stat().st_size
+        with path.open("rb") as stream:
+            head = stream.read(_EDGE_BYTES)
+            stream.seek(max(size - _EDGE_BYTES, 0))
+            hasher.update(f"{path.name} {size} ".encode() + head + stream.read(_EDGE_BYTES))
+    return hasher.hexdigest()
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:

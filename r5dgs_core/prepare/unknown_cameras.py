@@ -15,7 +15,7 @@ from ..capture.calibration.lens import Lens
 from ..capture.reconstruction import board
 from ..capture.reconstruction import reconstruct as reconstruction
 from ..capture.reconstruction.request import Request
-from . import cameras, names
+from . import cameras, names, source_files
 from .camera_source import CameraSource
 
 FILE = r5dgs_json.FILES
@@ -47,6 +47,25 @@ def missing(source: Path, calibration: Path | None) -> bool:
     return calibration is None and folder.exists() and reading.find_calibration(folder) is None
 
 
+def fit(source: Path, out: Path, recordings: dict[str, str]) -> bool:
+    """Return True if the file of the cameras in ``out`` is missing, or made from the recordings of a source.
+
+    Args:
+        source: Folder of videos or frames, or one video.
+        out: Folder of the data set.
+        recordings: Fingerprints of the data set's recordings, for files of older releases, which have none.
+
+    Raises:
+        DatasetError: The source has no recordings, or the file is damaged.
+    """
+    path = out / FILE
+    return not path.is_file() or (r5dgs_json.read_recordings(path) or recordings) == _fingerprints(source)
+
+
+def _fingerprints(source: Path) -> dict[str, str]:
+    return {camera.name: source_files.fingerprint(camera.paths) for camera in source_files.find(Path(source))}
+
+
 def reconstruct(
     source: Path,
     out: Path,
@@ -74,6 +93,7 @@ def reconstruct(
     path = out / FILE
     if path.is_file() and not again:
         return path
+    recordings = _fingerprints(source)  # before the minutes in which the user may replace a file
     sources = cameras.open_sources(source, rate)
     moving = frozenset(known.moving) or frozenset(one.name for one in sources if len(sources) == 1)
     request = Request(
@@ -87,7 +107,7 @@ def reconstruct(
     text = "cameras from the board" if request.board else "cameras from image features; this can take minutes"
     progress({"event": "read", "text": text})
     found = reconstruction.reconstruct(sources, request, out / WORK)
-    r5dgs_json.write(path, found)
+    r5dgs_json.write(path, found, recordings)
     shutil.rmtree(out / WORK, ignore_errors=True)
     return path
 

@@ -1,11 +1,15 @@
 """Recordings without a calibration: cameras are reconstructed once and kept."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
 from r5dgs_core import errors
+from r5dgs_core.capture.calibration.calibration import CalibratedCamera, Calibration
+from r5dgs_core.capture.calibration.formats import r5dgs_json
+from r5dgs_core.capture.calibration.lens import Lens
 from r5dgs_core.cli import main
 from r5dgs_core.cli.commands import prepare as command
 from r5dgs_core.data import dataset, images
@@ -25,7 +29,7 @@ def recordings(tmp_path_factory):
 
 
 def prepared(source, out, **fields):
-    command.run_prepare(source, out, sync="none", rate=10.0, lines=120, **fields)
+    command.run_prepare(source, out, sync="none", rate=10.0, **{"lines": 120, **fields})
     return dataset.read(out)
 
 
@@ -52,6 +56,77 @@ def test_a_board_replaces_the_calibration(recordings, tmp_path, monkeypatch):
     assert again.digest == found.digest
     with pytest.raises(AssertionError, match="reconstructed twice"):
         prepared(recordings, tmp_path / "data", unknown=known, overwrite=True)
+
+
+@pytest.fixture()
+def counted(monkeypatch, tmp_path):
+    """Replace the reconstruction by cameras whose x is its number; returns a function that gives the number of runs."""
+    runs = []
+
+    def reconstruct(sources, *_):
+        runs.append(sources)
+        lens, pose = Lens("pinhole", 50.0, 50.0, 32.0, 24.0), np.eye(4)
+        pose[0, 3] = len(runs)
+        found = [CalibratedCamera(one.name, one.width, one.height, lens, pose) for one in sources]
+        return Calibration(tuple(found), None, "", tmp_path)
+
+    monkeypatch.setattr(unknown_cameras.reconstruction, "reconstruct", reconstruct)
+    return lambda: len(runs)
+
+
+def write_frames(folder, seed):
+    rng = np.random.default_rng(seed)
+    for path in [folder / f"cam{camera}" / f"{k:04d}.png" for camera in range(2) for k in range(3)]:
+        images.write_png(path, rng.integers(0, 256, (48, 64, 3), np.uint8))
+    return folder
+
+
+def position(found):
+    return found.train[0].camera.center[0]
+
+
+def test_cameras_of_other_recordings_are_reconstructed_again(tmp_path, counted):
+    """A user whose recording is damaged moves a camera, records again and repeats the command."""
+    source, out = write_frames(tmp_path / "frames", 0), tmp_path / "data"
+    damaged = source / "cam1" / "0001.png"
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    for _ in range(2):  # equal recordings keep their cameras
+        with pytest.raises(errors.DatasetError, match=r"cam1/0001\.png"):
+            prepared(source, out)
+        assert counted() == 1
+    assert position(prepared(write_frames(source, 1), out)) == pytest.approx(counted()) == 2
+    assert position(prepared(source, out)) == pytest.approx(counted()) == 2
+
+
+def test_cameras_of_a_finished_data_set_are_kept_unless_it_is_replaced(tmp_path, counted):
+    source, out = write_frames(tmp_path / "frames", 0), tmp_path / "data"
+    prepared(source, out)
+    kept = (out / unknown_cameras.FILE).read_bytes()
+    write_frames(source, 1)
+    with pytest.raises(errors.DatasetError, match=r"other input or settings \(recordings\)"):
+        prepared(source, out)
+    assert (out / unknown_cameras.FILE).read_bytes() == kept and counted() == 1
+    assert position(prepared(source, out, overwrite=True)) == pytest.approx(counted()) == 2
+
+
+def test_cameras_of_older_releases_belong_to_the_recordings_of_the_data_set(tmp_path, counted):
+    source, out = write_frames(tmp_path / "frames", 0), tmp_path / "data"
+    prepared(source, out)
+    r5dgs_json.write(out / unknown_cameras.FILE, r5dgs_json.read(out / unknown_cameras.FILE))
+    prepared(source, out)
+    assert counted() == 1  # known from the record
+    (tmp_path / "new").mkdir()
+    shutil.copy(out / unknown_cameras.FILE, tmp_path / "new")
+    prepared(source, tmp_path / "new")  # unknown, so not used
+    assert counted() == 2
+
+
+def test_a_folder_with_other_files_is_refused_before_cameras_are_reconstructed(tmp_path, counted):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "notes.txt").write_text("mine")
+    with pytest.raises(errors.DatasetError, match=r"found notes\.txt"):
+        prepared(write_frames(tmp_path / "frames", 0), tmp_path / "data")
+    assert counted() == 0
 
 
 @pytest.mark.slow

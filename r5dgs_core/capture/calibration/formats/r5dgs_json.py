@@ -2,13 +2,15 @@
 
 ``cameras`` lists name, size, lens (`Lens`, with the first pixel's centre at 0.5), ``camera_to_world`` with OpenCV axes,
 and the ``frames`` of a moving camera with path, time in seconds, lens and pose. ``points`` are those of the
-reconstruction, rows of x, y, z in the world and red, green, blue in [0, 1].
+reconstruction, rows of x, y, z in the world and red, green, blue in [0, 1]. ``recordings`` has a fingerprint of the
+recordings of each camera, by which `r5dgs prepare` notices that the cameras are those of other recordings.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +31,8 @@ def detect(path: Path) -> Path | None:
     return path if path.name == FILES and path.is_file() else None
 
 
-def write(path: Path, calibration: Calibration) -> None:
-    """Write cameras, and the points of the reconstruction."""
+def write(path: Path, calibration: Calibration, recordings: Mapping[str, str] | None = None) -> None:
+    """Write cameras, the points of the reconstruction, and fingerprints of the recordings by camera."""
     points: list[list[float]] = []
     if calibration.points is not None and calibration.colors is not None:
         points = np.round(np.concatenate([calibration.points, calibration.colors], axis=1), 6).tolist()
@@ -57,9 +59,21 @@ def write(path: Path, calibration: Calibration) -> None:
             for camera in calibration.cameras
         ],
         "points": points,
+        "recordings": dict(recordings or {}),
     }
     with atomic_files.replacing_by_name(path) as temporary:
         Path(temporary).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def read_recordings(path: Path) -> dict[str, str]:
+    """Return the fingerprints of the recordings by camera; empty if the file has none.
+
+    Raises:
+        DatasetError: The file is damaged.
+    """
+    content = strict_json.read(path, errors.DatasetError)
+    found = content.get("recordings") if isinstance(content, dict) else None
+    return found if isinstance(found, dict) else {}
 
 
 def read(path: Path) -> Calibration:
