@@ -6,7 +6,6 @@ it measures nothing again and writes only missing images, so that the result is 
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,14 +17,11 @@ from .. import errors, folder_lock
 from ..capture.calibration.calibration import Calibration
 from ..capture.reconstruction import gauge
 from ..data import images
-from ..data.layouts.camera_files import POINTS
-from . import cameras, capture_file, clocks, data_splits, frame_choice, image_size, record, unknown_cameras
+from . import cameras, capture_file, clocks, data_splits, earlier, frame_choice, image_size, record, unknown_cameras
 from .cameras import Camera
 from .frame_choice import Choice
-from .plan import IMAGES, Plan, Request
+from .plan import Plan, Request
 
-_WRITTEN = (IMAGES, "object_mask", "check", "transforms_train.json", "transforms_val.json", "transforms_test.json")
-_WRITTEN += ("objects.json", POINTS, capture_file.FILE)
 Progress = Callable[[dict[str, Any]], None]
 
 
@@ -63,22 +59,25 @@ def prepare(request: Request, progress: Progress) -> Plan:
         identity = record.identity(request, opened, calibration)
         known = _begin(out, identity, overwrite=request.overwrite)
         plan = _plan(request, opened, calibration, known, progress)
-        capture_file.write(out, record.content(plan, identity, finished=False))
+        finished = known is not None and known.get("finished") is True
+        if not finished:  # a finished one stays so, or a stop would permit to replace it without --overwrite
+            capture_file.write(out, record.content(plan, identity, finished=False))
         lost = _write_images(plan, out, progress)
         plan = _with_lost(plan, lost)
         record.write_points(plan, out)
         record.write_cameras(plan, out, lost)
-        capture_file.write(out, record.content(plan, identity, finished=True, lost=lost))
+        checks = {"checks": known["checks"]} if known is not None and "checks" in known else {}
+        capture_file.write(out, {**record.content(plan, identity, finished=True, lost=lost), **checks})
     return plan
 
 
 def _reconstructed(request: Request, out: Path, progress: Progress) -> Path:
     """Return the file of the reconstructed cameras; those of other recordings are reconstructed again."""
-    present = _present(out)
+    present = earlier.present(out)
     known = {} if present is None else present.get("identity", {}).get("recordings", {})
     other = not unknown_cameras.fit(request.source, out, known)
     if other and present is not None and not request.overwrite:
-        _check_replaceable(out, present, ["recordings"])
+        earlier.check_replaceable(out, present, ["recordings"])
     return unknown_cameras.reconstruct(
         request.source,
         out,
@@ -90,45 +89,18 @@ def _reconstructed(request: Request, out: Path, progress: Progress) -> Path:
     )
 
 
-def _present(out: Path) -> dict[str, Any] | None:
-    """Return the record of the data set in a folder, or None. Raises DatasetError if the folder has other files."""
-    present = capture_file.read(out)
-    if present is None:
-        own = {folder_lock.LOCK_FILE, unknown_cameras.FILE, unknown_cameras.WORK}
-        foreign = [path.name for path in out.iterdir() if path.name not in own]
-        if foreign:
-            raise errors.DatasetError(
-                f"{out}: expected an empty folder or a prepared data set, found {foreign[0]}; name another folder"
-            )
-    return present
-
-
-def _check_replaceable(out: Path, present: dict[str, Any], changed: list[str]) -> None:
-    """Raise DatasetError for a finished data set."""
-    if present.get("finished"):
-        raise errors.DatasetError(
-            f"{out}: was prepared from other input or settings ({', '.join(changed)}); name another folder with --out, "
-            "or give --overwrite"
-        )
-
-
 def _begin(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, Any] | None:
     """Return the record of a run with the identity, or None.
 
     The data set of another run is removed if it is unfinished, or with ``overwrite``.
     """
-    present = _present(out)
+    present = earlier.present(out)
     if present is None or present.get("identity") == wanted:
         return present
     if not overwrite:
         changed = [key for key in wanted if present.get("identity", {}).get(key) != wanted[key]]
-        _check_replaceable(out, present, changed)
-    for name in _WRITTEN:
-        path = out / name
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+        earlier.check_replaceable(out, present, changed)
+    earlier.remove(out)
     return None
 
 

@@ -76,7 +76,14 @@ def content(
         },
         "images": {"lines": plan.size.lines, "kind": "PNG" if plan.request.lossless else "JPEG 95"},
         "notes": list(plan.notes),
+        **({} if finished else {"image_files": _image_files(plan)}),
     }
+
+
+def _image_files(plan: Plan) -> list[str]:
+    """Paths of all images, by which files of others are told apart while the data set is unfinished."""
+    chosen = enumerate(plan.choice.indices)
+    return [plan.image_name(number, index) + plan.suffix for number, found in chosen for index in found.tolist()]
 
 
 def _camera(plan: Plan, number: int, lost: Mapping[str, list[int]]) -> dict[str, Any]:

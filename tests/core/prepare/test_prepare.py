@@ -87,63 +87,10 @@ def test_two_runs_are_equal_bit_for_bit(capture, tmp_path):
     assert len(list((tmp_path / "one").rglob("*.jpg"))) == 3 * COUNT
 
 
-def test_an_interrupted_run_continues_to_the_same_result(capture, tmp_path, monkeypatch):
-    prepared(capture, tmp_path / "whole", lines=36)
-    read = camera_source.CameraSource.read
-
-    def interrupted(self, wanted):
-        for count, item in enumerate(read(self, wanted)):
-            if self.name == "cam1" and count == 2:
-                raise KeyboardInterrupt
-            yield item
-
-    monkeypatch.setattr(camera_source.CameraSource, "read", interrupted)
-    with pytest.raises(errors.Interrupted, match="run the same command again to continue"):
-        prepared(capture, tmp_path / "parts", lines=36)
-    assert not (tmp_path / "parts" / "transforms_train.json").exists()
-    decoded = []
-
-    def counted(self, wanted):
-        decoded.extend(wanted)
-        return read(self, wanted)
-
-    monkeypatch.setattr(camera_source.CameraSource, "read", counted)
-    prepared(capture, tmp_path / "parts", lines=36)
-    assert len(decoded) == 3 * COUNT - COUNT - 2
-    assert content(tmp_path / "parts") == content(tmp_path / "whole")
-
-
 def test_nothing_outside_the_output_is_written(capture, tmp_path):
     before = content(capture)
     prepared(capture, tmp_path / "data", lines=36)
     assert content(capture) == before and {path.name for path in tmp_path.iterdir()} == {"data"}
-
-
-def test_other_settings_need_overwrite_and_replace_everything(capture, tmp_path):
-    out = tmp_path / "data"
-    prepared(capture, out, lines=36, hold_out={"every": 2})
-    assert (out / "transforms_val.json").exists()
-    with pytest.raises(errors.DatasetError, match=r"other input or settings \(size, hold_out_every\)"):
-        prepared(capture, out, lines=24)
-    found = prepared(capture, out, lines=24, overwrite=True)
-    assert found.train[0].camera.height == 24 and not found.val
-
-
-def test_an_unfinished_data_set_of_other_input_is_replaced(capture, tmp_path):
-    """A user who corrects a damaged recording repeats the same command."""
-    videos, out = tmp_path / "videos", tmp_path / "data"
-    shutil.copytree(capture, videos)
-    pixels = recordings.draw_tiny(RIG.cameras[2], RIG.lenses[2], 0.0)
-    (videos / "cam2.mp4").unlink()
-    for k in range(COUNT):
-        images.write_png(videos / "cam2" / f"{k:06d}.png", pixels)
-    whole = (videos / "cam2" / "000003.png").read_bytes()
-    (videos / "cam2" / "000003.png").write_bytes(whole[:100])
-    with pytest.raises(errors.DatasetError, match=r"cam2/000003.png"):
-        prepared(videos, out, lines=36, rate=10)
-    (videos / "cam2" / "000003.png").write_bytes(whole)
-    images.write_png(videos / "cam2" / "000006.png", pixels)
-    assert len(prepared(videos, out, lines=36, rate=10).train) == 3 * COUNT
 
 
 def test_the_next_command_follows_the_findings(capture, tmp_path, capsys):
@@ -153,13 +100,6 @@ def test_the_next_command_follows_the_findings(capture, tmp_path, capsys):
     assert last == f"written: {out}. Next: r5dgs train '{out}' --out RUN --scene SCENE.r5dgs"
     assert [line for line in before if line.startswith("D72 warning")]
     assert len([line for line in before if line.startswith(f"images {3 * COUNT} of")]) == 1
-
-
-def test_a_folder_with_other_files_is_not_touched(capture, tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(errors.DatasetError, match="expected an empty folder or a prepared data set, found notes.txt"):
-        prepared(capture, tmp_path)
-    assert content(tmp_path) == {(tmp_path / "notes.txt").relative_to(tmp_path): b"mine"}
 
 
 def test_a_folder_among_the_recordings_is_refused(capture):
