@@ -104,7 +104,7 @@ def read(video: VideoFile, wanted: Sequence[int]) -> Iterator[tuple[int, np.ndar
         stream.thread_type = "AUTO"
         container.seek(min(by_stamp), stream=stream, backward=True)
         for frame in _frames(container, stream):
-            index = None if frame.pts is None or frame.is_corrupt else by_stamp.get(frame.pts)
+            index = None if frame.pts is None else by_stamp.get(frame.pts)
             if index is not None:
                 yield index, _pixels(frame, video)
             if frame.pts is not None and frame.pts >= last:
@@ -112,7 +112,7 @@ def read(video: VideoFile, wanted: Sequence[int]) -> Iterator[tuple[int, np.ndar
 
 
 def _frames(container: Any, stream: Any) -> Iterator[Any]:
-    """Decode frames; after a damaged packet, go on with the next key frame. The caller reports missing frames."""
+    """Decode frames; after a damaged one, go on with the next key frame. The caller reports missing frames."""
     av = _library()
     packets, damaged = container.demux(stream), False
     while True:
@@ -128,7 +128,7 @@ def _frames(container: Any, stream: Any) -> Iterator[Any]:
             damaged = True
             continue
         for frame in decoded:
-            damaged = damaged and not frame.key_frame
+            damaged = frame.is_corrupt or damaged and not frame.key_frame
             if not damaged:
                 yield frame
 

@@ -141,6 +141,26 @@ def test_frames_after_damage_are_read_from_the_next_key_frame_on(tmp_path):
     assert all(bars(pixels) == index % 24 for index, pixels in found.items() if index % 24 < 22)
 
 
+@pytest.mark.parametrize("number", [4, 12])
+def test_frames_that_depend_on_a_damaged_one_are_left_out(tmp_path, number):
+    """The decoder returns a packet whose end is damaged as a corrupt frame, and later ones as if they were whole."""
+    options = {"crf": "12", "x264-params": "keyint=12:scenecut=0:bframes=0"}
+    rng = np.random.default_rng(0)
+    texture = rng.integers(0, 256, (64, 160, 3), np.uint8)
+    frames = [texture[:, k : k + 96] for k in range(36)]
+    path = recordings.write_video(tmp_path / "a.mp4", frames, np.arange(36) / 10, options=options)
+    whole = dict(video_file.read(video_file.probe(path), range(36)))
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+    assert [k for k, packet in enumerate(packets) if packet.is_keyframe] == [0, 12, 24]
+    data, packet = bytearray(path.read_bytes()), packets[number]
+    data[packet.pos + packet.size // 2 : packet.pos + packet.size] = bytes(packet.size - packet.size // 2)
+    path.write_bytes(bytes(data))
+    found = dict(video_file.read(video_file.probe(path), range(36)))
+    assert sorted(found) == [*range(number), *range(number // 12 * 12 + 12, 36)]
+    assert all((whole[index] == pixels).all() for index, pixels in found.items())
+
+
 @pytest.mark.parametrize("content", [b"", b"not a video", None])
 def test_a_damaged_file_is_refused(tmp_path, content):
     path = tmp_path / "a.mp4"
