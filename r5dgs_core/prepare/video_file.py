@@ -14,6 +14,8 @@ import numpy as np
 from .. import errors, extras
 from . import wide_color
 
+_LAST_FRAME = 0.5  # time that the last frame of a variable rate may be shown, s
+
 
 @dataclass(frozen=True)
 class VideoFile:
@@ -183,6 +185,8 @@ def _first_frame(container: Any, stream: Any, path: Path) -> Any:
 def _declared(duration: str, times: np.ndarray) -> int:
     """Return the number of frames by the duration in the tags of a Matroska file, 0 if unknown.
 
+    The tag NUMBER_OF_FRAMES is not used, because programs that cut videos keep that of the whole one.
+
     Args:
         duration: Duration, such as "00:00:01.500000000", or "".
         times: Times of the frames that the file has, s. [F]
@@ -191,8 +195,10 @@ def _declared(duration: str, times: np.ndarray) -> int:
     if found is None or len(times) < 2:
         return 0
     hours, minutes, seconds = map(float, found.groups())
-    step = float(np.median(np.diff(times)))
-    return len(times) + max(0, round((3600 * hours + 60 * minutes + seconds - times[-1]) / step) - 1)
+    steps, left = np.diff(times), 3600 * hours + 60 * minutes + seconds - times[-1]
+    if left <= max(_LAST_FRAME, 2 * steps.max()):
+        return len(times)
+    return len(times) + round(left / float(np.median(steps))) - 1
 
 
 def _stamps(container: Any, stream: Any, path: Path) -> tuple[np.ndarray, float]:

@@ -117,13 +117,24 @@ def test_a_video_that_lacks_its_end_is_used_up_to_there_and_named(tmp_path):
 
 def test_a_matroska_file_that_lacks_its_end_is_named(tmp_path):
     """It has no number of frames."""
-    frames = [np.random.default_rng(k).integers(0, 255, (*SIZE, 3), np.uint8) for k in range(30)]
-    path = recordings.write_video(tmp_path / "a.mkv", frames, np.arange(30) / 30)
+    frames = [np.random.default_rng(k).integers(0, 255, (*SIZE, 3), np.uint8) for k in range(60)]
+    path = recordings.write_video(tmp_path / "a.mkv", frames, np.arange(60) / 30)
     assert not opened(path).notes
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     source = opened(path)
-    assert 5 < len(source.times) < 30
-    assert f"the file ends early, with {len(source.times)} of 30 frames" in source.notes[0]
+    assert 5 < len(source.times) < 45
+    assert f"the file ends early, with {len(source.times)} of 60 frames" in source.notes[0]
+
+
+def test_a_long_last_frame_is_no_early_end(tmp_path):
+    """Recordings of a variable rate show their last frame for some intervals."""
+    path = recordings.write_video(tmp_path / "a.mkv", recordings.gray_frames(20), np.arange(20) / 30)
+    data = path.read_bytes()
+    duration = b"00:00:00.666000000"
+    assert duration in data
+    path.write_bytes(data.replace(duration, b"00:00:01.033000000"))
+    assert video_file.probe(path).declared == 20
+    assert not opened(path).notes
 
 
 def test_frames_after_damage_are_read_from_the_next_key_frame_on(tmp_path):
