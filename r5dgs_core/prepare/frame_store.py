@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import tempfile
+import weakref
 from collections.abc import Sequence
 
 import numpy as np
 
 
 class FrameStore(Sequence[np.ndarray]):
-    """Arrays of one shape and type, appended one by one; the file is removed with the store."""
+    """Arrays of one shape and type, appended one by one; the file is closed and removed with the store."""
 
     def __init__(self):
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the store
+        weakref.finalize(self, self._file.close)
         self._count = 0
         self._shape: tuple[int, ...] = ()
         self._dtype = np.dtype(np.uint8)

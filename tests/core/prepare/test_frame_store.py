@@ -1,6 +1,8 @@
 """Stored frames are those that were appended, and their number does not affect memory."""
 
+import gc
 import tracemalloc
+import warnings
 from collections.abc import Iterable
 
 import numpy as np
@@ -38,6 +40,19 @@ def test_frames_of_another_size_or_type_are_refused():
     for other in (np.zeros((5, 4), np.uint8), np.zeros((4, 5), np.int16)):
         with pytest.raises(ValueError, match="expected"):
             store.append(other)
+
+
+def test_the_file_is_closed_with_the_store():
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        store = stored([np.zeros((4, 5), np.uint8)])
+        file = store._file
+        del store
+        gc.collect()
+        assert file.closed
+        del file
+        gc.collect()
+    assert not [one for one in found if one.category is ResourceWarning]
 
 
 def test_the_usual_difference_is_the_median_for_any_number_of_bands(monkeypatch):
