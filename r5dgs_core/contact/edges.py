@@ -179,7 +179,8 @@ def _trimmed(
     across = points[close] @ out
     order = np.argsort(across)
     signs = np.repeat([1, -_PROOF], [len(carried), len(empty)])[close][order]
-    border = max(across[order][np.argmax(np.cumsum(signs))], (start - place) @ out)  # beyond it, a quarter is empty
+    # Beyond the border, at least a quarter of the points are empty.
+    border = max(across[order][np.argmax(np.cumsum(signs))], (start - place) @ out)
     reach = (corners - place) @ out - border
     cut = [corners[reach <= 0]]
     for a, b in itertools.pairwise([*range(len(corners)), 0]):

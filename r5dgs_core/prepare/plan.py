@@ -68,6 +68,7 @@ class Plan:
         timeline: Scene times and splits.
         size: Height of the images.
         notes: Remarks for the user.
+        lost: Indices of frames that cannot be decoded, by camera; empty before the images are written.
     """
 
     request: Request
@@ -78,6 +79,7 @@ class Plan:
     timeline: Timeline
     size: image_size.Size
     notes: tuple[str, ...]
+    lost: dict[str, list[int]] = field(default_factory=dict)
 
     def image_name(self, camera: int, index: int) -> str:
         """Return the path of an image in the data set, without suffix."""

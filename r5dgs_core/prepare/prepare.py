@@ -22,6 +22,7 @@ from .cameras import Camera
 from .frame_choice import Choice
 from .plan import Plan, Request
 
+_LISTED = 5  # cameras that a message names
 Progress = Callable[[dict[str, Any]], None]
 
 
@@ -138,7 +139,7 @@ def _length_notes(names: list[str], choice: Choice) -> list[str]:
     for unused, word in ((begins.max() - begins, "begins later"), (ends - ends.min(), "ends earlier")):
         cut = np.flatnonzero(unused > max(2 * choice.source_interval, 0.1))
         if len(cut):
-            cameras = ", ".join(names[k] for k in cut)
+            cameras = _listed([names[k] for k in cut])
             notes.append(f"{cameras}: up to {unused.max():.2f} s are not used, because {names[unused.argmin()]} {word}")
     return notes
 
@@ -147,11 +148,17 @@ def _unused_notes(opened: list[Camera], calibration: Calibration) -> list[str]:
     """A remark about calibrated cameras that have no recording, if there are any."""
     used = {camera.calibrated.name for camera in opened}
     unused = [camera.name for camera in calibration.cameras if camera.name not in used]
-    return [f"{', '.join(unused)}: calibrated, but without a recording"] if unused else []
+    return [f"{_listed(unused)}: calibrated, but without a recording"] if unused else []
+
+
+def _listed(names: list[str]) -> str:
+    """Return the first names, and the number of the others."""
+    others = len(names) - _LISTED
+    return ", ".join(names[:_LISTED]) + (f" and {others} more" if others > 0 else "")
 
 
 def _with_lost(plan: Plan, lost: dict[str, list[int]]) -> Plan:
-    """Return the plan with a remark about each camera whose frames cannot be decoded."""
+    """Return the plan with the frames that cannot be decoded, and a remark about each camera that has some."""
     cameras = []
     for camera, indices in zip(plan.cameras, plan.choice.indices, strict=True):
         if gone := lost[camera.name]:
@@ -161,7 +168,7 @@ def _with_lost(plan: Plan, lost: dict[str, list[int]]) -> Plan:
             notes = (*camera.source.notes, f"{note}; copy the recording again")
             camera = replace(camera, source=replace(camera.source, notes=notes))
         cameras.append(camera)
-    return replace(plan, cameras=tuple(cameras))
+    return replace(plan, cameras=tuple(cameras), lost=lost)
 
 
 def _write_images(plan: Plan, out: Path, progress: Progress) -> dict[str, list[int]]:

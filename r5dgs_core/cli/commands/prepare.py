@@ -249,8 +249,9 @@ def summary(plan: Plan) -> list[str]:
         if offset.sigma is not None and len(plan.cameras) > 1:
             clock = f", clock {1e3 * offset.seconds:+.1f} ms"
             clock += f" (± {1e3 * offset.sigma:.1f} ms, from {offset.method})" if offset.sigma else ""
+        used = len(plan.choice.indices[number]) - len(plan.lost.get(source.name, []))
         lines.append(
-            f"{source.name}: {len(plan.choice.indices[number])} of {len(source.times)} frames, "
+            f"{source.name}: {used} of {len(source.times)} frames, "
             f"{source.width}x{source.height} at {1 / source.interval:.4g} per second{clock}"
         )
         lines += [f"  {note}" for note in source.notes]

@@ -256,7 +256,9 @@ def test_frames_that_cannot_be_decoded_are_left_out_and_listed(capture, tmp_path
     note = f"1 of {COUNT} frames cannot be decoded and are left out, the first is frame 2; copy the recording again"
     assert record["cameras"][1]["notes"] == [note]
     plan = command.run_prepare(capture, tmp_path / "data", sync="none", lines=36)
-    assert f"  {note}" in command.summary(plan)
+    lines = command.summary(plan)
+    assert f"  {note}" in lines
+    assert lines[1].startswith(f"cam1: {COUNT - 1} of {COUNT} frames")
 
 
 def test_calibrated_cameras_without_a_recording_are_named(capture, tmp_path):
@@ -264,6 +266,12 @@ def test_calibrated_cameras_without_a_recording_are_named(capture, tmp_path):
     (tmp_path / "videos" / "cam1.mp4").unlink()
     plan = command.run_prepare(tmp_path / "videos", tmp_path / "data", sync="none", lines=36)
     assert "cam1: calibrated, but without a recording" in command.summary(plan)
+
+
+def test_messages_name_at_most_five_cameras():
+    names = [f"cam{k}" for k in range(7)]
+    assert prepare._listed(names) == "cam0, cam1, cam2, cam3, cam4 and 2 more"
+    assert prepare._listed(names[:5]) == "cam0, cam1, cam2, cam3, cam4"
 
 
 def test_the_estimate_counts_no_more_pixels_than_training_keeps():
