@@ -28,9 +28,8 @@ from typing import Any
 
 import numpy as np
 
-from . import timing
+from . import own_process, timing
 from .playback import scaled_scene
-from .scaling import in_process
 
 PRECISIONS = ("compact", "quantised")
 Row = dict[str, Any]
@@ -65,8 +64,8 @@ def least(draw: Callable[[int], object], count: int) -> Row:
     return {"first_s": seconds[0], "s": min(seconds[1:]), "mb": timing.status_mb("VmHWM")}
 
 
-def write(path: Path, target: Path, precision: str, answers: Any) -> None:
-    """Put the cost of writing a scene into a queue."""
+def write(path: Path, target: Path, precision: str) -> Row:
+    """Return the cost of writing a scene."""
     from r5dgs_core.scene import scene_file
 
     scene = scene_file.read(path)
@@ -74,21 +73,21 @@ def write(path: Path, target: Path, precision: str, answers: Any) -> None:
     start = time.process_time()
     scene_file.write(scene, target, precision=precision)
     seconds = time.process_time() - start
-    answers.put({"s": seconds, "mb": timing.status_mb("VmHWM"), "file_mb": target.stat().st_size / 1e6})
+    return {"s": seconds, "mb": timing.status_mb("VmHWM"), "file_mb": target.stat().st_size / 1e6}
 
 
-def read(path: Path, answers: Any) -> None:
-    """Put the cost of reading a scene into a queue."""
+def read(path: Path) -> Row:
+    """Return the cost of reading a scene."""
     from r5dgs_core.scene import scene_file
 
     timing.reset_peak_mb()
     start = time.process_time()
     scene_file.read(path)
-    answers.put({"s": time.process_time() - start, "mb": timing.status_mb("VmHWM")})
+    return {"s": time.process_time() - start, "mb": timing.status_mb("VmHWM")}
 
 
-def compare(path: Path, other: Path, answers: Any) -> None:
-    """Put the PSNR of the pictures of a file against those of another into a queue."""
+def compare(path: Path, other: Path) -> Row:
+    """Return the PSNR of the pictures of a file against those of another."""
     from r5dgs_core.playback import scene_player
     from r5dgs_core.render import scene_renderer
     from r5dgs_core.scene import scene_file
@@ -100,11 +99,11 @@ def compare(path: Path, other: Path, answers: Any) -> None:
         camera = player.scene.cameras[0]
         pictures.append([np.clip(scene_renderer.render(player, camera, float(t)).color, 0, 1) for t in times])
     errors = [np.mean((a - b) ** 2, dtype=np.float64) for a, b in zip(*pictures, strict=True)]
-    answers.put({"psnr": float(-10 * np.log10(np.mean(errors)))})
+    return {"psnr": float(-10 * np.log10(np.mean(errors)))}
 
 
-def film(path: Path, frames: int, answers: Any) -> None:
-    """Put the cost of a picture of ``r5dgs render`` along an orbit into a queue."""
+def film(path: Path, frames: int) -> Row:
+    """Return the cost of a picture of ``r5dgs render`` along an orbit."""
     from r5dgs_core.film import frame_renderer, schedule
     from r5dgs_core.film.settings import Settings
     from r5dgs_core.scene import scene_file
@@ -115,11 +114,11 @@ def film(path: Path, frames: int, answers: Any) -> None:
     settings = Settings(path.with_suffix(".mp4"), ("orbit",), size=size, fps=24.0, seconds=(frames + 1) / 24)
     shots = schedule.make(scene, settings).shots
     renderer = frame_renderer.FrameRenderer(scene, samples=1)
-    answers.put(least(lambda k: renderer.picture(shots[k].camera, shots[k].t), frames))
+    return least(lambda k: renderer.picture(shots[k].camera, shots[k].t), frames)
 
 
-def worker(path: Path, frames: int, still: bool, answers: Any) -> None:
-    """Put the cost of a picture of the worker into a queue."""
+def worker(path: Path, frames: int, still: bool) -> Row:
+    """Return the cost of a picture of the worker."""
     from r5dgs_core.motion import rotations
     from r5dgs_core.playback import scene_player
     from r5dgs_core.scene import scene_file
@@ -145,11 +144,11 @@ def worker(path: Path, frames: int, still: bool, answers: Any) -> None:
         view = {"width": camera.width, "height": camera.height, "intrinsics": camera.intrinsics.tolist()}
         own.answer({"command": "render", "camera": view | {"T_cam_world": pose.tolist()}, "instances": instances})
 
-    answers.put(least(draw, frames))
+    return least(draw, frames)
 
 
-def f12(path: Path, frames: int, answers: Any) -> None:
-    """Put the cost of a final render in Blender into a queue."""
+def f12(path: Path, frames: int) -> Row:
+    """Return the cost of a final render in Blender."""
     # A parent that has imported bpy passes on the folder of Blender's modules, whose bpy cannot be imported first.
     sys.path[:] = [folder for folder in sys.path if Path(folder).parts[-2:] != ("scripts", "modules")]
     import bpy
@@ -177,7 +176,7 @@ def f12(path: Path, frames: int, answers: Any) -> None:
     jobs = importlib.import_module(f"{package}.r5dgs_addon.worker.jobs")
     status = Path(f"/proc/{jobs._worker.pid}/status").read_text()
     mb = int(status.split("VmHWM:")[1].split()[0]) / 1e3
-    answers.put({"first_s": seconds[0], "s": min(seconds[1:]), "mb": mb, "blender_mb": timing.status_mb("VmHWM")})
+    return {"first_s": seconds[0], "s": min(seconds[1:]), "mb": mb, "blender_mb": timing.status_mb("VmHWM")}
 
 
 def main() -> None:
@@ -192,15 +191,15 @@ def main() -> None:
     width, height = (int(part) for part in args.size.split("x"))
     rows: dict[str, Row] = {}
 
-    def add(name: str, work: Callable[..., None], *arguments: object) -> None:
-        rows[name] = in_process(work, *arguments)
+    def add(name: str, work: Callable[..., Row], *arguments: object) -> None:
+        rows[name] = own_process.run(work, *arguments)
         print(f"{name:20}", {key: round(value, 3) for key, value in rows[name].items()}, flush=True)
         if args.json:
             args.json.write_text(json.dumps(rows, indent=1) + "\n")
 
     with tempfile.TemporaryDirectory() as name:
         exact = Path(name, "exact.r5dgs")
-        in_process(make_file, args.scene, args.gaussians, (width, height), exact)
+        own_process.run(make_file, args.scene, args.gaussians, (width, height), exact)
         for precision in PRECISIONS:
             add(f"write, {precision}", write, exact, Path(name, f"{precision}.r5dgs"), precision)
             add(f"read, {precision}", read, Path(name, f"{precision}.r5dgs"))
@@ -214,12 +213,11 @@ def main() -> None:
             add("F12", f12, compact, args.frames)
 
 
-def make_file(source: str, count: int, size: tuple[int, int], path: Path, answers: Any) -> None:
+def make_file(source: str, count: int, size: tuple[int, int], path: Path) -> None:
     """Write the scene to measure, in full precision."""
     from r5dgs_core.scene import scene_file
 
     scene_file.write(made(source, count, size), path, precision="exact")
-    answers.put(None)
 
 
 if __name__ == "__main__":

@@ -11,17 +11,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import resource
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from . import own_process
 
 RATE = 30.0
 
@@ -78,12 +77,6 @@ def measure(source: Path, out: Path, lines: int) -> dict[str, Any]:
     }
 
 
-def in_own_process(function: Callable[..., Any], *given: Any) -> Any:
-    """Return the result of a function in a new process; raises its exception, or BrokenProcessPool if it is killed."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(function, *given).result()
-
-
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -98,11 +91,11 @@ def main() -> None:
         parser.error(f"--frames: expected multiples of {least}, the smallest number")
     with tempfile.TemporaryDirectory() as folder:
         written = Path(folder) / "written"
-        in_own_process(write_videos, written, args.cameras, least, *args.size)
+        own_process.run(write_videos, written, args.cameras, least, *args.size)
         for frames in args.frames:
             source, out = Path(folder) / f"videos_{frames}", Path(folder) / f"data_{frames}"
             repeat(written, source, frames // least, least / RATE)
-            found = in_own_process(measure, source, out, args.lines)
+            found = own_process.run(measure, source, out, args.lines)
             rows.append({"cameras": args.cameras, "frames": frames, **found})
             row = rows[-1]
             print(

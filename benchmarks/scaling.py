@@ -18,15 +18,13 @@ import importlib.util
 import io
 import json
 import math
-import multiprocessing
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from . import timing
+from . import own_process, timing
 from .training import memory
 
 
@@ -121,8 +119,8 @@ def train(data: Path, folder: Path, case: Case, phases: Phases) -> Path:
     return done.folder
 
 
-def measure(data: Path, folder: Path, case: Case, answers: Any) -> None:
-    """Put the row of a case and its number of Gaussians into a queue."""
+def measure(data: Path, folder: Path, case: Case) -> tuple[Row, int]:
+    """Return the row of a case and its number of Gaussians."""
     from r5dgs_core.bake import bake
     from r5dgs_core.cli.commands import associate
     from r5dgs_core.data import dataset as datasets
@@ -160,11 +158,11 @@ def measure(data: Path, folder: Path, case: Case, answers: Any) -> None:
         t = 1.2 * scene.t_max * number / FRAMES
         scene_renderer.render_frame(scene, player.frame(t), scene.cameras[0])
     phases.end("frame", FRAMES)
-    answers.put((phases.row, len(scene.gaussians.means)))
+    return phases.row, len(scene.gaussians.means)
 
 
-def measure_blender(path: Path, answers: Any) -> None:
-    """Put the costs of loading and playing a scene in Blender into a queue."""
+def measure_blender(path: Path) -> Row:
+    """Return the costs of loading and playing a scene in Blender."""
     import bpy
 
     from tests.blender import check_playback, run
@@ -176,19 +174,7 @@ def measure_blender(path: Path, answers: Any) -> None:
     for frame in range(FRAMES):
         bpy.context.scene.frame_set(frame)
     phases.end("Blender frame", FRAMES)
-    answers.put(phases.row)
-
-
-def in_process(work: Callable[..., None], *arguments: object) -> Any:
-    """Return what a function puts into a queue in a process of its own."""
-    spawn = multiprocessing.get_context("spawn")
-    answers = spawn.SimpleQueue()
-    child = spawn.Process(target=work, args=(*arguments, answers))
-    child.start()
-    child.join()
-    if child.exitcode:
-        raise SystemExit(f"{work.__name__}: failed with exit code {child.exitcode}")
-    return answers.get()
+    return phases.row
 
 
 def exponent(rows: list[tuple[int, Row]], phase: str) -> float | None:
@@ -230,9 +216,9 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as name:
                 folder = Path(name)
                 memory.make_dataset(folder / "data", case.lines, case.cameras, case.times, case.objects)
-                row, gaussians = in_process(measure, folder / "data", folder, case)
+                row, gaussians = own_process.run(measure, folder / "data", folder, case)
                 if importlib.util.find_spec("bpy") is not None:
-                    row |= in_process(measure_blender, folder / "scene.r5dgs")
+                    row |= own_process.run(measure_blender, folder / "scene.r5dgs")
             rows.append((gaussians if axis == "gaussians" else size_of(case, axis), row))
             print(axis, rows[-1][0], {phase: round(seconds, 3) for phase, (seconds, _) in row.items()}, flush=True)
         print("\n" + table(axis, rows) + "\n", flush=True)

@@ -25,8 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import timing
-from ..scaling import in_process
+from .. import own_process, timing
 
 PINHOLE = 1  # COLMAP's id of the lens
 
@@ -86,14 +85,13 @@ def write(data: Path, folder: Path, points: np.ndarray, colors: np.ndarray) -> N
         (folder / "sparse" / "0" / f"{name}.bin").write_bytes(content)
 
 
-def make(data: Path, scene: Path, count: int, noise: float, folder: Path, answers: Any) -> None:
+def make(data: Path, scene: Path, count: int, noise: float, folder: Path) -> None:
     """Write the data set of a number of points."""
     write(data, folder, *surface_points(data, scene, count, noise, np.random.default_rng(0)))
-    answers.put(None)
 
 
-def measure(colmap: Path, data: Path, overrides: list[str], answers: Any) -> None:
-    """Train, and put the measured figures into a queue."""
+def measure(colmap: Path, data: Path, overrides: list[str]) -> dict[str, Any]:
+    """Train, and return the measured figures."""
     from scipy.spatial import KDTree
 
     from r5dgs_core.config import config
@@ -121,7 +119,7 @@ def measure(colmap: Path, data: Path, overrides: list[str], answers: Any) -> Non
     row |= {"at_most": most, "at_end": len(run.gaussians), "step_s": statistics.median(seconds)}
     row |= {"steps_s": sum(seconds), "mb": timing.status_mb("VmHWM")}
     run.dataset = datasets.read(data)
-    answers.put({**row, "val_psnr": view_psnr.HeldOutPsnr(run, 100).measure()})
+    return {**row, "val_psnr": view_psnr.HeldOutPsnr(run, 100).measure()}
 
 
 def main() -> None:
@@ -138,8 +136,8 @@ def main() -> None:
     for count in args.points:
         with tempfile.TemporaryDirectory() as name:
             colmap = Path(name, "colmap")
-            in_process(make, args.data, args.scene, count, args.noise, colmap)
-            rows.append(in_process(measure, colmap, args.data, args.set))
+            own_process.run(make, args.data, args.scene, count, args.noise, colmap)
+            rows.append(own_process.run(measure, colmap, args.data, args.set))
         print({key: round(value, 4) for key, value in rows[-1].items()}, flush=True)
         if args.json:
             args.json.write_text(json.dumps(rows, indent=1) + "\n")

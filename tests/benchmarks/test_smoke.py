@@ -115,9 +115,9 @@ def test_a_benchmark_prints_a_table_and_writes_finite_figures(
         assert found and all(map(math.isfinite, found))
 
 
-def test_a_failing_or_killed_process_ends_the_benchmark_of_prepare(monkeypatch):
+def test_a_failing_or_killed_process_ends_the_benchmark(monkeypatch):
     with benchmark_modules.importing(monkeypatch) as load:
-        run_in_process = load("prepare").in_own_process
+        run_in_process = load("own_process").run
         assert run_in_process(abs, -3) == 3
         with pytest.raises(ZeroDivisionError):
             run_in_process(divmod, 1, 0)
