@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import timing
-from ..scaling import in_process
+from .. import own_process, timing
 
 
 def averages(size: int, smaller: int) -> np.ndarray:
@@ -54,8 +53,8 @@ def resize(data: Path, lines: int, folder: Path) -> Path:
     return folder
 
 
-def train(data: Path, folder: Path, overrides: list[str], answers: Any) -> None:
-    """Train and bake a scene; put its cost into a queue."""
+def train(data: Path, folder: Path, overrides: list[str]) -> dict[str, float]:
+    """Train and bake a scene; return its cost."""
     from r5dgs_core.bake import bake
     from r5dgs_core.config import config
     from r5dgs_core.train import run, warm_up
@@ -66,7 +65,7 @@ def train(data: Path, folder: Path, overrides: list[str], answers: Any) -> None:
     done = run.train(data, folder, config.load(None, overrides), progress=_report)
     row = {"seconds": time.process_time() - began, "mb": timing.status_mb("VmHWM")}
     scene = bake.run_bake(done.folder, folder / "scene.r5dgs")
-    answers.put({**row, "gaussians": len(scene.gaussians.means)})
+    return {**row, "gaussians": len(scene.gaussians.means)}
 
 
 def _report(event: dict[str, Any]) -> None:
@@ -75,15 +74,16 @@ def _report(event: dict[str, Any]) -> None:
         print(event, flush=True)
 
 
-def measure(path: Path, data: Path, smallest: Path, splits: list[str], answers: Any) -> None:
-    """Put the mean PSNR by split, of all pixels and of the objects, at the own and the smallest size into a queue."""
+def measure(path: Path, data: Path, smallest: Path, splits: list[str]) -> dict[str, float]:
+    """Return the mean PSNR by split, of all pixels and of the objects, at the own and the smallest size."""
     from r5dgs_core.data import dataset as datasets
     from r5dgs_core.evaluation import evaluate, metrics
     from r5dgs_core.playback import scene_player
     from r5dgs_core.scene import scene_file
 
     scene, own, small = scene_file.read(path), datasets.read(data), datasets.read(smallest)
-    move, row = scene_player.Player(scene).frame, {}
+    move = scene_player.Player(scene).frame
+    row: dict[str, float] = {}
     for split in splits:
         found: dict[str, list[float]] = {}
         for large_view, view in zip(own.views(split), small.views(split), strict=True):
@@ -95,7 +95,7 @@ def measure(path: Path, data: Path, smallest: Path, splits: list[str], answers: 
                 found.setdefault(f"{size}psnr", []).append(metrics.psnr(picture, truth))
                 found.setdefault(f"{size}objects", []).append(metrics.psnr(picture, truth, mask > 0))
         row |= {f"{split} {key}": float(np.nanmean(values)) for key, values in found.items()}
-    answers.put(row)
+    return row
 
 
 def main() -> None:
@@ -119,8 +119,8 @@ def main() -> None:
                 resize(args.data, lines, data)
         for lines in sorted(args.trained or sizes):
             data, run = sizes[lines], Path(tempfile.mkdtemp(prefix=f"run_{lines}_", dir=folder), "run")
-            rows[lines] = in_process(train, data, run, args.set)
-            found = in_process(measure, run / "scene.r5dgs", data, next(iter(sizes.values())), args.evaluated)
+            rows[lines] = own_process.run(train, data, run, args.set)
+            found = own_process.run(measure, run / "scene.r5dgs", data, next(iter(sizes.values())), args.evaluated)
             rows[lines] |= found
             print(lines, {key: round(value, 2) for key, value in rows[lines].items()}, flush=True)
             if args.json:

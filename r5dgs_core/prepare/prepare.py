@@ -17,7 +17,17 @@ from .. import errors, folder_lock
 from ..capture.calibration.calibration import Calibration
 from ..capture.reconstruction import gauge
 from ..data import images
-from . import cameras, capture_file, clocks, data_splits, earlier, frame_choice, image_size, record, unknown_cameras
+from . import (
+    cameras,
+    capture_file,
+    clocks,
+    data_splits,
+    existing_dataset,
+    frame_choice,
+    image_size,
+    record,
+    unknown_cameras,
+)
 from .cameras import Camera
 from .frame_choice import Choice
 from .plan import Plan, Request
@@ -74,11 +84,11 @@ def prepare(request: Request, progress: Progress) -> Plan:
 
 def _reconstructed(request: Request, out: Path, progress: Progress) -> Path:
     """Return the file of the reconstructed cameras; those of other recordings are reconstructed again."""
-    present = earlier.present(out)
+    present = existing_dataset.present(out)
     known = {} if present is None else present.get("identity", {}).get("recordings", {})
     other = not unknown_cameras.fit(request.source, out, known)
     if other and present is not None and not request.overwrite:
-        earlier.check_replaceable(out, present, ["recordings"])
+        existing_dataset.check_replaceable(out, present, ["recordings"])
     return unknown_cameras.reconstruct(
         request.source,
         out,
@@ -95,13 +105,13 @@ def _begin(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, A
 
     The data set of another run is removed if it is unfinished, or with ``overwrite``.
     """
-    present = earlier.present(out)
+    present = existing_dataset.present(out)
     if present is None or present.get("identity") == wanted:
         return present
     if not overwrite:
         changed = [key for key in wanted if present.get("identity", {}).get(key) != wanted[key]]
-        earlier.check_replaceable(out, present, changed)
-    earlier.remove(out)
+        existing_dataset.check_replaceable(out, present, changed)
+    existing_dataset.remove(out)
     return None
 
 
