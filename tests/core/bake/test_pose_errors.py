@@ -38,7 +38,7 @@ def measured(monkeypatch, scene, data, noise=0.02, shown=None):
         ids = scene_renderer.render_frame(shown, player.frame(view.t), view.camera).ids
         return 0 * ids if abs(view.t - scene.tracks.times[HIDDEN]) < 1e-6 else ids
 
-    monkeypatch.setattr(datasets, "load_image", image)
+    monkeypatch.setattr(datasets, "load_given_image", image)
     monkeypatch.setattr(datasets, "load_mask", mask)
     bodies = [group.id for group in scene.groups if group.role == "body"]
     return pose_errors.measure(scene, data, config.Config(), bodies, True).errors
