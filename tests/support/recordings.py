@@ -20,6 +20,8 @@ from r5dgs_core.scene.cameras import Camera
 from tests.support import tiny_datasets
 
 BASE = 90000  # time stamps per second
+TINY_WIDTH, TINY_HEIGHT, TINY_FRAMES = 96, 72, 6  # images of each camera of `record_tiny`
+COEFFICIENTS = (-0.12, 0.03, 0.002, -0.001, 0.0)  # of its lenses
 SOUND_RATE = 48000
 
 
@@ -206,3 +208,13 @@ def record(
     if calibration:
         write_calibration(folder / "calibration.toml", rig)
     return folder
+
+
+def tiny_rig() -> Rig:
+    """Return the rig of `record_tiny`."""
+    return make_rig(3, TINY_WIDTH, TINY_HEIGHT, COEFFICIENTS)
+
+
+def record_tiny(folder: Path) -> Path:
+    """Write three short videos of the tiny scene through distorted lenses, and their calibration; return the folder."""
+    return record(folder, tiny_rig(), [np.arange(TINY_FRAMES) / 10] * 3, draw_tiny)

@@ -3,33 +3,16 @@
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.cli.commands import prepare as command
-from r5dgs_core.data import dataset, images
+from r5dgs_core.data import images
 from r5dgs_core.prepare import camera_source
 from tests.support import recordings
+from tests.support.prepared_data import content, prepared
 
-COUNT = 6
-RIG = recordings.make_rig(3, 96, 72, (-0.12, 0.03, 0.002, -0.001, 0.0))
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    """Three short videos of the tiny scene through distorted lenses, with their calibration."""
-    folder = tmp_path_factory.mktemp("capture") / "videos"
-    return recordings.record(folder, RIG, [np.arange(COUNT) / 10] * 3, recordings.draw_tiny)
-
-
-def prepared(source, out, **fields):
-    command.run_prepare(source, out, sync="none", **fields)
-    return dataset.read(out)
-
-
-def content(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+COUNT, RIG = recordings.TINY_FRAMES, recordings.tiny_rig()
 
 
 def test_an_interrupted_run_continues_to_the_same_result(capture, tmp_path, monkeypatch):

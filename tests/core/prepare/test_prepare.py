@@ -18,27 +18,15 @@ from r5dgs_core.config.sections.training import DataSection
 from r5dgs_core.data import dataset, images, masks
 from r5dgs_core.prepare import camera_source, image_size, prepare, rectify
 from tests.support import recordings
+from tests.support.prepared_data import content, prepared
 
-COEFFICIENTS = (-0.12, 0.03, 0.002, -0.001, 0.0)
-COUNT = 6
-WIDTH, HEIGHT = 96, 72
-RIG = recordings.make_rig(3, WIDTH, HEIGHT, COEFFICIENTS)
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    """Three short videos of the tiny scene through distorted lenses, with their calibration."""
-    folder = tmp_path_factory.mktemp("capture") / "videos"
-    return recordings.record(folder, RIG, [np.arange(COUNT) / 10] * 3, recordings.draw_tiny)
-
-
-def prepared(source, out, **fields):
-    command.run_prepare(source, out, sync="none", **fields)
-    return dataset.read(out)
-
-
-def content(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+WIDTH, HEIGHT, COEFFICIENTS, COUNT = (
+    recordings.TINY_WIDTH,
+    recordings.TINY_HEIGHT,
+    recordings.COEFFICIENTS,
+    recordings.TINY_FRAMES,
+)
+RIG = recordings.tiny_rig()
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +39,7 @@ def data(capture, tmp_path_factory):
 def test_images_are_those_of_pinhole_cameras_at_their_times(data):
     found = dataset.read(data)
     assert len(found.train) == 3 * COUNT and found.t_max == pytest.approx(0.8)
-    rig = recordings.make_rig(3, WIDTH, HEIGHT, COEFFICIENTS)
+    rig = recordings.tiny_rig()
     for view in found.train[:: COUNT + 1]:
         number = rig.names.index(view.camera.name)
         np.testing.assert_allclose(view.camera.T_cam_world, rig.cameras[number].T_cam_world, atol=1e-6)
@@ -118,7 +106,7 @@ def test_masks_of_the_frames_are_undistorted_like_them(capture, tmp_path):
     (folder / "objects.json").write_text(json.dumps({"3": "box"}))
     found = prepared(capture, tmp_path / "data", masks=str(folder), hold_out={"every": 3})
     assert found.object_names == {3: "box"} and len(found.val) == 3
-    rig = recordings.make_rig(3, WIDTH, HEIGHT, COEFFICIENTS)
+    rig = recordings.tiny_rig()
     pinhole = undistort.undistortion(rig.lenses[0], (WIDTH, HEIGHT))
     square = np.zeros((HEIGHT, WIDTH), np.float32)
     square[20:50, 30:70] = 1
