@@ -26,6 +26,7 @@ from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images
 from r5dgs_core.data.dataset import Dataset
 from r5dgs_core.evaluation import evaluate
+from r5dgs_core.motion import rotations
 from r5dgs_core.render import warm_up
 from r5dgs_core.scene import camera_correction, cameras
 from r5dgs_core.scene.cameras import Camera
@@ -77,8 +78,7 @@ class Similarity:
     def of(cls, true: list[Camera], found: list[Camera]) -> Similarity:
         """Return the map of cameras to the same cameras in another world."""
         product = sum(f.T_cam_world[:3, :3].T @ t.T_cam_world[:3, :3] for t, f in zip(true, found, strict=True))
-        u, _, v = np.linalg.svd(product)
-        turn = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+        turn = rotations.nearest_rotmats(np.asarray(product))
         a, b = np.stack([c.center for c in true]) @ turn.T, np.stack([c.center for c in found])
         arms = a - a.mean(0)
         scale = float((arms * (b - b.mean(0))).sum() / (arms**2).sum())

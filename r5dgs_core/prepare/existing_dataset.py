@@ -26,7 +26,7 @@ def present(out: Path) -> dict[str, Any] | None:
     """Return the record of the data set in a folder, or None.
 
     Raises:
-        DatasetError: The folder has other files, or the record is damaged.
+        DatasetError: There are files but no record, or the record is damaged.
     """
     found = capture_file.read(out)
     if found is None:
@@ -62,7 +62,7 @@ def check_replaceable(out: Path, record: dict[str, Any], changed: Iterable[str])
 
 
 def _foreign(out: Path, record: dict[str, Any]) -> str | None:
-    """Return the name of a file of others in the places that are replaced, or None."""
+    """Return the name of a file in the replaced places that prepare did not write, or None."""
     for name in _LATER:
         if (out / name).exists():
             return name

@@ -26,7 +26,8 @@ def intervals(times: np.ndarray, absent: np.ndarray) -> tuple[Interval, ...]:
 
     Args:
         times: Increasing times. [S]
-        absent: True if the group is absent at a time; a group that always is counts as always there. [S] bool
+        absent: True if the group is absent at a time. A group that is absent at all times counts as always there. [S]
+            bool
     """
     if absent.all():
         return ()
@@ -50,7 +51,7 @@ def span(found: Sequence[Interval]) -> tuple[float, float]:
 
 
 def text(found: Sequence[Interval]) -> str:
-    """Return the times at which a group enters, is absent and leaves in words; "" if it always is there."""
+    """Return the times at which a group enters, is absent and leaves in words; "" if it is always there."""
     enters, leaves = span(found)
     words = [f"enters at {enters:.2f}"] if enters > -math.inf else []
     words += [f"absent from {a:.2f} to {b:.2f}" for a, b in found if math.isfinite(a) and math.isfinite(b)]
@@ -91,6 +92,5 @@ def _interval(row: Row, pair: object) -> Interval:
 def are_sound(found: Sequence[Interval]) -> bool:
     """Return True if intervals are not empty, in order, and apart, and not all times are absent."""
     edges = [edge for interval in found for edge in interval]
-    inner = edges[1:-1] if edges else []
     ordered = all(a < b for a, b in zip(edges, edges[1:], strict=False))
-    return ordered and all(map(math.isfinite, inner)) and edges != [-math.inf, math.inf]
+    return ordered and all(map(math.isfinite, edges[1:-1])) and edges != [-math.inf, math.inf]

@@ -35,9 +35,13 @@ class HeldOutPsnr:
     def __init__(self, trainer: Trainer, count: int):
         self._trainer = trainer
         self._views = [
-            (view.name, trainer.normalization.camera(view.camera), view.t, _in_8_bits(image))
+            (
+                view.name,
+                trainer.normalization.camera(view.camera),
+                view.t,
+                _in_8_bits(datasets.load_image(view, trainer.behind)),
+            )
             for view in spread(trainer.dataset.val, count)
-            for image in (datasets.load_image(view, trainer.behind),)
         ]
 
     def __len__(self) -> int:
