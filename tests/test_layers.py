@@ -74,7 +74,7 @@ ALLOWED = {
     "film": {"motion", "scene", "data", "color", "formats", "raster", "playback", "render"},
     "language": {"scene", "data", "search", "playback", "render"},
     "train": {"motion", "motion_fit", "scene", "data", "raster", "config", "model", "render", "shapes"},
-    "masks": {"data", "language"},
+    "masks": {"motion", "scene", "data", "language"},
     "worker": {"scene", "raster", "playback", "formats", "editing", "protocol", "render", "language", "contact"},
     "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train", "shapes", "contact"},
     "prepare": {"color", "motion", "scene", "data", "capture", "masks"},

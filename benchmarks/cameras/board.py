@@ -1,16 +1,16 @@
 """A real capture: a ChArUco board that a person carries through a room, from the videos to its poses.
 
-    python -m benchmarks.cameras board FOLDER [--masks corners|none] [--without-camera NAME] [--lines 360]
+    python -m benchmarks.cameras board FOLDER [--masks corners|features|none] [--without-camera NAME] [--lines 360]
         [--set KEY=VALUE] [--keep FOLDER] [--json FILE]
 
 FOLDER is a session of caliscope with videos, ``camera_array.toml`` and the board's corners
 (``mprib/caliscope``, ``tests/sessions/post_optimization``). The videos are prepared with every eighth moment held out.
 With ``--masks corners``, the masks are the board's rectangle, from its corners in the world; views in which fewer than
 four corners were found are unknown there. The true poses of the board are those of its corners. One constant rigid
-offset between the trained group and the board is fitted over the clip, and nothing else. With ``--masks none``, the
-groups that are found are compared with the masks from the corners. The corners in the world were triangulated from
-those in the images; where they do not agree, the cameras did not record at the same moment, and the true poses are
-wrong. Results: docs/results/captures.md.
+offset between the trained group and the board is fitted over the clip, and nothing else. With ``--masks features`` and
+``--masks none``, the groups that are found are compared with the masks from the corners. The corners in the world were
+triangulated from those in the images; where they do not agree, the cameras did not record at the same moment, and the
+true poses are wrong. Results: docs/results/captures.md.
 """
 
 from __future__ import annotations
@@ -143,14 +143,14 @@ def _rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def prepared(folder: Path, out: Path, with_masks: bool, without: str | None, lines: int) -> Plan:
-    """Prepare the videos, with masks from the corners if wanted, and add the true poses."""
+def prepared(folder: Path, out: Path, kind: str, without: str | None, lines: int) -> Plan:
+    """Prepare the videos with masks of a kind, and add the true poses."""
     source, calibration = folder / RECORDING, folder / "camera_array.toml"
     hold_out: dict[str, Any] = {"every": 8, "cameras": () if without is None else (without,)}
     fields = {"calibration": calibration, "lines": lines, "hold_out": hold_out}
-    plan = prepare.run_prepare(source, out, **fields)
+    plan = prepare.run_prepare(source, out, masks="features" if kind == "features" else "none", **fields)
     board = Board(folder)
-    if with_masks:
+    if kind == "corners":
         with tempfile.TemporaryDirectory() as room:
             for number, camera in enumerate(plan.cameras):
                 for row in range(len(board.moments)):
@@ -198,7 +198,7 @@ def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--masks", choices=("corners", "none"), default="corners")
+    parser.add_argument("--masks", choices=("corners", "features", "none"), default="corners")
     parser.add_argument("--without-camera", metavar="NAME")
     parser.add_argument("--lines", type=int, default=360)
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
@@ -208,11 +208,11 @@ def main() -> None:
     warm_up.warm_up()
     with tempfile.TemporaryDirectory() as folder:
         room = args.keep or Path(folder)
-        with_masks, truth = args.masks == "corners", room / "data"
-        plan = prepared(args.folder, room / "data", with_masks, args.without_camera, args.lines)
-        if not with_masks:
+        truth = room / "data"
+        plan = prepared(args.folder, truth, args.masks, args.without_camera, args.lines)
+        if args.masks != "corners":
             truth = room / "masked"
-            prepared(args.folder, truth, True, args.without_camera, args.lines)
+            prepared(args.folder, truth, "corners", args.without_camera, args.lines)
         began = time.process_time()
         trained = run.train(room / "data", room / "run", config.load(None, args.set), overwrite=True)
         seconds = time.process_time() - began

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from ..motion import rotations
+from ..scene import cameras
 from .clock import Offset, solve_pairs
 from .motion_tracks import MotionTrack
 
@@ -100,7 +100,7 @@ def _pairs(tracks: Tracks, T_cam_world: Sequence[np.ndarray]) -> list[_Pair]:
     """Return the pairs of cameras that show one object long enough."""
     pairs = []
     for a, b in itertools.combinations(range(len(tracks)), 2):
-        matrix = essential(T_cam_world[a], T_cam_world[b])
+        matrix = cameras.essential(T_cam_world[a], T_cam_world[b])
         for key in sorted(tracks[a].keys() & tracks[b].keys()):
             one, other = tracks[a][key], tracks[b][key]
             if min(len(one.times), len(other.times)) >= LEAST_TIMES:
@@ -254,10 +254,3 @@ def _distances(pair: _Pair, trials: np.ndarray, step: float) -> np.ndarray:
         there = value / np.maximum(np.linalg.norm(back[:, :2], axis=1), 1e-12) / one.pixel
         result[k, good] = 0.5 * (here + there)
     return result
-
-
-def essential(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the essential matrix with x_other^T E x_one = 0 of world-to-camera transforms [4, 4]. [3, 3]"""
-    relative = other @ np.linalg.inv(one)
-    t = relative[:3, 3] / max(float(np.linalg.norm(relative[:3, 3])), 1e-12)
-    return rotations.skew(t) @ relative[:3, :3]

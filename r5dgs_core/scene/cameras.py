@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..motion import rotations
+
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 # Rotation from a data set's world axes to Blender's (right-handed, Z up), applied once, on the root empty.
 WORLD_TO_BLENDER = {
@@ -214,6 +216,19 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     k = camera.intrinsics
     pixels = np.stack([k[0, 0] * uv[..., 0] + k[0, 1] * uv[..., 1] + k[0, 2], k[1, 1] * uv[..., 1] + k[1, 2]], axis=-1)
     return pixels, z
+
+
+def essential(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the essential matrix with x_other^T E x_one = 0 of world-to-camera transforms [4, 4]. [3, 3]"""
+    relative = other @ np.linalg.inv(one)
+    t = relative[:3, 3] / max(float(np.linalg.norm(relative[:3, 3])), 1e-12)
+    return rotations.skew(t) @ relative[:3, :3]
+
+
+def fundamental(one: Camera, other: Camera) -> np.ndarray:
+    """Return the fundamental matrix, which maps pixels (x, y, 1) of one camera to epipolar lines of another. [3, 3]"""
+    between = essential(one.T_cam_world, other.T_cam_world)
+    return np.linalg.inv(other.intrinsics).T @ between @ np.linalg.inv(one.intrinsics)
 
 
 def pixel_rays(camera: Camera) -> np.ndarray:

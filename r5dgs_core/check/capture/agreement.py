@@ -14,7 +14,7 @@ from ...data import masks
 from ...data.dataset import Dataset
 from ...data.views import View
 from ...findings import Collector
-from ...prepare import motion_offsets
+from ...scene import cameras
 from ...terminal import printable
 from . import pictures
 from .pictures import Album
@@ -126,9 +126,7 @@ def _draw_pair(a: Sighting, b: Sighting, object_id: int) -> Figure:
 
 def epipolar_line(a: Sighting, b: Sighting) -> np.ndarray:
     """Return the line a u + b v + c = 0 in the second image on which the first centre lies. [3]"""
-    one, other = a.view.camera, b.view.camera
-    ray = np.linalg.inv(one.intrinsics) @ np.append(a.center, 1.0)
-    return np.linalg.inv(other.intrinsics).T @ motion_offsets.essential(one.T_cam_world, other.T_cam_world) @ ray
+    return cameras.fundamental(a.view.camera, b.view.camera) @ np.append(a.center, 1.0)
 
 
 def distance(a: Sighting, b: Sighting) -> float:

@@ -20,12 +20,15 @@ if TYPE_CHECKING:
 
 NAME = "masks"
 SHORT = "make or check the masks of the training images"
-LONG = "Make object masks with SAM2 or SAM3, convert masks of another program, or check the masks of a data set."
+LONG = (
+    "Make object masks with image features, SAM2 or SAM3, convert masks of another program, or check the masks of a\n"
+    "data set."
+)
 EXAMPLE = "DATA --backend sam2 --model SAM2_FOLDER"
 PAGE = "user/masks.md"
 
-BACKENDS = ("precomputed", "blender", "sam2", "sam3")
-MODELS = ("sam2", "sam3")  # backends that run networks
+BACKENDS = ("precomputed", "blender", "features", "sam2", "sam3")
+MAKERS = ("features", "sam2", "sam3")  # backends that make masks from the images
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +36,7 @@ log = logging.getLogger(__name__)
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     p.add_argument("data", type=Path, help="data set folder")
-    made = "source of the masks: precomputed (a folder; default), blender (a captured data set), sam2 or sam3"
+    made = "source of the masks: precomputed (a folder; default), blender (a captured data set), features, sam2 or sam3"
     p.add_argument("--backend", default="precomputed", metavar="NAME", help=made)
     source = "folder of the masks (precomputed), or captured data set (blender)"
     p.add_argument("--from", dest="source", type=Path, metavar="FOLDER", help=source)
@@ -132,7 +135,7 @@ def run_masks(data: Path, *, progress_kind: str = "none", **fields: Any) -> Mask
     dataset = datasets.read(data, view_masks.NO_MASKS, min_registered=0.0)
     folder = dataset.root / datasets.MASKS if given.out is None else Path(given.out)
     maker = _maker(dataset, given)
-    in_place = given.backend not in MODELS and maker.folder.resolve() == folder.resolve()
+    in_place = given.backend not in MAKERS and maker.folder.resolve() == folder.resolve()
     if in_place:
         _check_unknown(given.unknown, folder)
     with make(progress_kind) as progress:
@@ -161,6 +164,10 @@ def _maker(dataset: Dataset, given: Options) -> Any:
         assert given.model is not None
         log.info("the weights of SAM3 are under %s; read it", LICENCE)
         return sam3_masks.Sam3Masks(Sam3(given.model, given.device or "cpu"), phrases(given.words))
+    if given.backend == "features":
+        from ...masks import feature_masks
+
+        return feature_masks.FeatureMasks(dataset.train)
     from ...data import dataset as datasets
     from ...masks import mask_folders
 
@@ -237,8 +244,10 @@ def _check(given: Options) -> None:
         misplaced = {"--from": given.source, "--unknown": given.unknown, **tuned}
     else:
         misplaced = {"--model": given.model, "--device": given.device, "--words": given.words, **tuned}
-        if given.backend == "blender":
+        if given.backend in ("blender", "features"):
             misplaced["--unknown"] = given.unknown
+        if given.backend == "features":
+            misplaced["--from"] = given.source
     for option, value in misplaced.items():
         if value is not None:
             raise errors.UsageError(f"{option}: does not apply to --backend {given.backend}")

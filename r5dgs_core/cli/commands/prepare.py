@@ -24,7 +24,7 @@ LONG = (
 EXAMPLE = "VIDEOS --calibration calibration.toml --out DATA"
 PAGE = "user/your_data.md"
 SYNC = ("auto", "audio", "motion", "none")
-_NO_FOLDER = ("none", "sam2", "sam3")  # values of --masks that name no folder
+_NO_FOLDER = ("none", "features", "sam2", "sam3")  # values of --masks that name no folder
 NOT_RECORDED = ("D53",)  # findings about the machine, not about the capture
 
 
@@ -48,8 +48,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     offset = "known offset of a camera's clock in milliseconds, which is added to its times; may be repeated"
     p.add_argument("--offset", action="append", default=[], metavar="CAMERA=MS", help=offset)
     _add_hold_out(p)
-    masks = "masks: a folder with a mask per frame (CAMERA/FRAME.png), sam2, sam3 or none (default)"
-    p.add_argument("--masks", default="none", metavar="FOLDER|sam2|sam3|none", help=masks)
+    masks = "masks: a folder with a mask per frame (CAMERA/FRAME.png), features, sam2, sam3 or none (default)"
+    p.add_argument("--masks", default="none", metavar="FOLDER|features|sam2|sam3|none", help=masks)
     p.add_argument("--model", type=Path, metavar="DIR", help="folder of the weights of sam2 or sam3")
     words = 'objects that sam3 searches for, one phrase per object, such as "mug, red apple"'
     p.add_argument("--words", metavar="WORDS", help=words)
@@ -143,7 +143,7 @@ def run_prepare(
         window: Fields of `prepare.frame_choice.Window`.
         hold_out: Fields of `prepare.data_splits.HoldOut`.
         unknown: Fields of `prepare.unknown_cameras.UnknownCameras`.
-        masks: Folder of masks of the frames, "sam2", "sam3" or "none".
+        masks: Folder of masks of the frames, "features", "sam2", "sam3" or "none".
         model: Folder of the weights; for SAM2, that of the user's settings if None.
         words: Phrases that SAM3 searches for, separated by commas.
         progress_kind: Form of progress output (`progress.make`).
@@ -207,7 +207,7 @@ def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: st
 
     if masks == "none":
         return
-    if masks in masks_command.MODELS:
+    if masks in masks_command.MAKERS:
         overwrite = plan.request.overwrite
         masks_command.run_masks(
             plan.request.out, backend=masks, overwrite=overwrite, progress_kind=progress_kind, **given

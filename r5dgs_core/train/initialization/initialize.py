@@ -32,7 +32,7 @@ from . import (
 
 log = logging.getLogger(__name__)
 
-MASKS = "Remedy: object_mask/train/IMAGE.png files"
+MASKS = "Remedy: masks, such as those of 'r5dgs masks DATA --backend features' (docs/user/masks.md)"
 MIN_CAMERAS = 3  # minimum number of cameras to place a scene from the images of one time
 SEEN_AT_ALL = 1e-3  # score of a time at which the object has a position, but no view shows all of it
 

@@ -1,0 +1,78 @@
+"""Rigid bodies among matched points."""
+
+import numpy as np
+import pytest
+
+from r5dgs_core.masks import feature_bodies as bodies
+from r5dgs_core.masks.feature_points import Points
+from r5dgs_core.motion import rotations
+from r5dgs_core.scene.cameras import Camera, project
+from tests.support.room import look_at
+
+LENS = np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]])
+CAMERAS = [
+    Camera(640, 480, LENS, np.linalg.inv(look_at((x, 0.3, -4.0), (0.0, 0.0, 0.0))), f"cam{k}")
+    for k, x in enumerate((-1.0, 0.0, 1.2))
+]
+
+
+def seen(places, names, rng):
+    """Points of one time, with a descriptor per name that hardly changes, and noise of 0.3 pixels."""
+    pixels = np.stack([project(camera, places)[0] for camera in CAMERAS], 1)
+    descriptors = np.stack([np.random.default_rng(int(name)).normal(size=128) for name in names])
+    descriptors = descriptors + rng.normal(scale=0.1, size=descriptors.shape)
+    descriptors = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)
+    return Points(
+        CAMERAS, places, pixels + rng.normal(scale=0.3, size=pixels.shape), np.arange(len(names)), descriptors
+    )
+
+
+def turned(places, k, axis, speed):
+    """Points that rotate about an axis and move along it."""
+    quat = rotations.rotvecs_to_quats(np.array(axis) * 0.25 * k)
+    return rotations.rotate(quat[None], places) + np.array(axis) * speed * k
+
+
+@pytest.fixture
+def moments():
+    """Eight times of a static room and two bodies; every fourth point is missing, another set each time."""
+    rng = np.random.default_rng(5)
+    room, one, other = (rng.uniform(-1, 1, (n, 3)) * size for n, size in ((80, 1.5), (50, 0.4), (30, 0.3)))
+    found = []
+    for k in range(8):
+        places = np.concatenate([room, turned(one, k, (0, 1, 0), 0.08) - [0.5, 0, 0], turned(other, k, (1, 0, 0), 0.1)])
+        kept = rng.random(len(places)) > 0.25
+        found.append((seen(places[kept], np.flatnonzero(kept), rng), np.flatnonzero(kept)))
+    return found
+
+
+def test_each_body_has_its_points_and_poses(moments):
+    times = [points for points, _ in moments]
+    found = bodies.find(times, np.random.default_rng(0))
+    assert len(found) == 2
+    for body, first, count in zip(found, (80, 130), (50, 30), strict=True):
+        assert sorted(body.poses) == list(range(8))
+        names = set().union(*({int(moments[k][1][row]) for row in rows} for k, rows in body.rows.items()))
+        assert names <= set(range(first, first + count)) and len(names) > 0.8 * count
+        start = min(body.poses, key=lambda k: np.abs(body.poses[k] - np.eye(3, 4)).max())
+        for k, pose in body.poses.items():
+            shared = [
+                name for name in range(first, first + count) if name in moments[k][1] and name in moments[start][1]
+            ]
+            before, after = (times[i].places[np.searchsorted(moments[i][1], shared)] for i in (start, k))
+            assert np.abs(bodies.applied(pose, before) - after).max() < 0.02
+            np.testing.assert_allclose(bodies.undone(pose, bodies.applied(pose, before)), before)
+
+
+def test_nothing_is_found_in_a_static_room_with_wrong_matches_at_one_time(moments):
+    rng = np.random.default_rng(1)
+    room = rng.uniform(-1, 1, (60, 3))
+    times = [seen(room + (k == 3) * np.array([0.4, 0, 0]), np.arange(60), rng) for k in range(8)]
+    assert bodies.find(times, np.random.default_rng(0)) == []
+
+
+def test_a_body_must_be_registered_at_enough_times(moments):
+    times = [points for points, _ in moments]
+    rng = np.random.default_rng(2)
+    empty = [seen(rng.uniform(-1, 1, (30, 3)), rng.integers(1000, 9999, 30), rng) for _ in range(40)]
+    assert bodies.find(times + empty, np.random.default_rng(0)) == []
