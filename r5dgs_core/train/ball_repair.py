@@ -3,8 +3,9 @@
 A ball shows its rotation by its texture alone, and only a part of it at a time. While times enter, its track can turn
 at a wrong rate together with a texture that is learned with it. So balls are found by their outlines, and rotations at
 which one texture explains all images (`ball_texture`) replace the track if they explain them clearly better than it
-does. If they differ much, the Gaussians of the ball are placed anew, in the colours of that texture, because those that
-were learned with wrong rotations are smeared. Other bodies, and balls whose tracks are right, keep their bits.
+does. If most of them differ much, the Gaussians of the ball are placed anew, in the colours of that texture, because
+those that were learned with wrong rotations are smeared. Other bodies, and balls whose tracks are right, keep their
+bits.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ STEEPEST = 0.3  # smallest cosine of the angle between the surface and the ray t
 CLEARLY = 0.93  # largest error of new rotations, relative to that of the track
 TEXTURED = 0.2  # largest error of them, relative to that of shade without texture
 APART = np.radians(1.0)  # smallest change of a rotation near the end of a run
-FAR = np.radians(8.0)  # change of a rotation that training would not undo, and from which Gaussians are placed anew
+FAR = np.radians(8.0)  # change of a rotation that training would not undo; of most of them, if Gaussians are smeared
 OPACITY = 0.9  # of Gaussians that are placed anew
 WIDE, FLAT = 0.5, 0.2  # their standard deviations along the surface and across it, in distances of neighbours
 
@@ -171,7 +172,7 @@ def _write(trainer: Trainer, tracks: Tracks, body: int, ball: Ball, found: Align
     quats = ball_texture.in_frame_of(found.quats, old)
     center = to_host(tracks.centers)[body].astype(np.float64)
     own = _offset(tracks, body, ball)
-    if rotations.angle_between(quats, old).max() > FAR:
+    if np.median(rotations.angle_between(quats, old)) > FAR:
         own = np.zeros(3)
         _place(trainer, tracks, body, ball, found, quats)
     tracks.base_quats[body] = torch.from_numpy(quats).to(tracks.base_quats)

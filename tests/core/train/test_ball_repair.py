@@ -59,6 +59,25 @@ def test_a_repair_changes_the_ball_alone(trainer):
             assert torch.equal(after[name], tensor), name
 
 
+def turn(trainer, knot, degrees):
+    """Turn the ball at one time."""
+    spin = rotations.rotvecs_to_quats(np.radians(degrees) * np.array([0.6, 0.8, 0]))
+    new = quats(trainer)
+    new[knot] = rotations.multiply(spin, new[knot])
+    trainer.motion.tracks.base_quats[BALL] = torch.from_numpy(new).float()
+    with torch.no_grad():
+        trainer.motion.tracks.params["rotvecs"][BALL] = 0.0
+
+
+@pytest.mark.parametrize(("harm", "placed"), [((turn, 2, 25.0), False), ((drift, 9.0), True)])
+def test_gaussians_are_placed_anew_if_most_rotations_were_wrong(trainer, harm, placed):
+    harm[0](trainer, *harm[1:])
+    rows = trainer.gaussians.motion_ids == BALL
+    before = trainer.gaussians.means.detach()[rows].clone()
+    assert ball_repair.repair(trainer) == 1
+    assert torch.equal(trainer.gaussians.means.detach()[rows], before) != placed
+
+
 def test_a_ball_keeps_its_path_at_times_without_outlines(trainer):
     tracks = trainer.motion.tracks
     centers = np.zeros((len(trainer.times), 3))
