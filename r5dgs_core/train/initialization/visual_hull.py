@@ -37,6 +37,10 @@ class Outline:
     cells: np.ndarray
     filled: np.ndarray
 
+    def share(self, points: np.ndarray) -> float:
+        """Return the share of the mask's cells that some points fill. [P] bool"""
+        return float(np.isin(self.filled, self.cells[points]).mean())
+
 
 def carve(
     views: Sequence[TrainView],
@@ -127,36 +131,47 @@ def _chosen(
         The selected points [P] bool, and indices of the views whose votes against points do not count.
     """
 
-    def select(hiding: Sequence[int]) -> np.ndarray:
-        against, total = outside.copy(), seen.copy()
-        against[hiding], total[hiding] = False, inside[hiding]
-        good = np.zeros(inside.shape[1], bool)
-        for limit in LIMITS:
-            known = total.sum(0)
-            good = (inside.sum(0) >= np.maximum(1, 0.5 * known)) & (against.sum(0) <= limit * known)
-            if good.sum() >= enough:
-                break
-        return good
-
-    def filled(good: np.ndarray) -> float:
-        shares = [
-            np.isin(x.filled, x.cells[good]).mean() for x in outlines if x is not None and len(x.filled) >= MIN_CELLS
-        ]
-        return float(min(shares, default=1.0))
-
+    votes, against, total = inside.sum(0), outside.sum(0), seen.sum(0)
+    compared = [x for x in outlines if x is not None and len(x.filled) >= MIN_CELLS]
+    left = [number for number, x in enumerate(outlines) if x is not None]
     hiding: list[int] = []
-    best = select(hiding)
-    share = filled(best)
-    showing = [number for number, x in enumerate(outlines) if x is not None]
-    while share < FILLED and len(showing) - len(hiding) > MIN_VIEWS:
-        trials = {number: select([*hiding, number]) for number in showing if number not in hiding}
-        shares = {number: filled(good) for number, good in trials.items()}
-        number = max(shares, key=shares.__getitem__)
-        if shares[number] < share + HELPS:
+    best = _select(votes, against, total, enough)
+    while True:
+        shares = [x.share(best) for x in compared]
+        if min(shares, default=1.0) >= FILLED or len(left) <= MIN_VIEWS:
+            return best, hiding
+        # The worst masks come first, because they reject most views at once.
+        compared = [compared[k] for k in np.argsort(shares, kind="stable")]
+        needed, found = min(shares) + HELPS, None
+        for number in left:
+            good = _select(votes, against - outside[number], total - seen[number] + inside[number], enough)
+            reached = 1.0
+            for x in compared:
+                reached = min(reached, x.share(good))
+                if reached < needed:
+                    break
+            if reached >= needed and (found is None or reached > needed):
+                needed, found, best = reached, number, good
+        if found is None:
+            return best, hiding
+        hiding.append(found)
+        left.remove(found)
+        against, total = against - outside[found], total - seen[found] + inside[found]
+
+
+def _select(votes: np.ndarray, against: np.ndarray, total: np.ndarray, enough: int) -> np.ndarray:
+    """Return the points with few votes against them [P] bool; the limit is relaxed until they suffice.
+
+    Args:
+        votes, against, total: Number of votes for and against each point, and of views that count. [P]
+        enough: Number of points that suffices.
+    """
+    good = np.zeros(len(votes), bool)
+    for limit in LIMITS:
+        good = (votes >= np.maximum(1, 0.5 * total)) & (against <= limit * total)
+        if good.sum() >= enough:
             break
-        hiding.append(number)
-        best, share = trials[number], shares[number]
-    return best, hiding
+    return good
 
 
 def pixel_indices(view: TrainView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -106,3 +106,59 @@ def test_something_without_an_id_before_the_object_does_not_cut_it_in_other_view
         return columns.max() - columns.min()
 
     assert reached(screened) >= 0.9 * reached(seen)
+
+
+def votes_of(seed, views=12, count=200):
+    """Votes of views on points of a disc, of which something hides a part in some views, and the views' masks."""
+    rng = np.random.default_rng(seed)
+    points = 0.7 * rng.normal(size=(count, 2))
+    filling = np.linalg.norm(points, axis=1) < 1
+    inside, outside = np.zeros((2, views, count), bool)
+    outlines = []
+    for number in range(views):
+        hidden = (rng.random() < 0.5) & (points[:, 0] > rng.uniform(-0.5, 0.8))
+        inside[number], outside[number] = filling & ~hidden, (~filling | hidden) & (rng.random(count) > 0.03)
+        cells = np.floor((points + 9) * rng.uniform(2, 6)).astype(int) @ [1, 1000]
+        outlines.append(visual_hull.Outline(cells, np.unique(cells[filling])))
+    outlines[rng.integers(views)] = None
+    return inside, outside, inside | outside | (rng.random((views, count)) < 0.9), outlines
+
+
+def left_out(inside, outside, seen, outlines, enough):
+    """The points and the views to leave out, by trying every view and comparing all masks each time."""
+
+    def select(hiding):
+        against, total = outside.copy(), seen.copy()
+        against[hiding], total[hiding] = False, inside[hiding]
+        good = visual_hull._select(inside.sum(0), against.sum(0), total.sum(0), enough)
+        shown = [x for x in outlines if x is not None and len(x.filled) >= visual_hull.MIN_CELLS]
+        return min((x.share(good) for x in shown), default=1.0), good
+
+    hiding, (share, good) = [], select([])
+    showing = [number for number, x in enumerate(outlines) if x is not None]
+    while share < visual_hull.FILLED and len(showing) - len(hiding) > visual_hull.MIN_VIEWS:
+        trials = {number: select([*hiding, number]) for number in showing if number not in hiding}
+        best = max(trials, key=lambda number: trials[number][0])
+        if trials[best][0] < share + visual_hull.HELPS:
+            break
+        hiding.append(best)
+        share, good = trials[best]
+    return good, hiding
+
+
+def test_views_are_left_out_as_if_all_were_tried():
+    counts = []
+    for seed in range(40):
+        votes = votes_of(seed)
+        found, expected = visual_hull._chosen(*votes, 20), left_out(*votes, 20)
+        np.testing.assert_array_equal(found[0], expected[0])
+        assert found[1] == expected[1]
+        counts.append(len(found[1]))
+    assert counts.count(0) > 5 and max(counts) > 1
+
+
+def test_the_number_of_comparisons_with_masks_grows_with_the_views(monkeypatch):
+    compared, share = [], visual_hull.Outline.share
+    monkeypatch.setattr(visual_hull.Outline, "share", lambda *given: compared.append(0) or share(*given))
+    visual_hull._chosen(*votes_of(0, views=150), 20)
+    assert 150 < len(compared) < 5 * 150
