@@ -208,8 +208,10 @@ def _passing(
     paths = [scene_bodies.predicted(body, tau) for body in bodies]
     moving = [number for number, body in enumerate(bodies) if body.moves]
     found: dict[int, float] = {}
+    places, reach = np.array([path[1] for path in paths]), np.array([_radius(body) for body in bodies])
     for number in moving:
-        others = (n for n in range(len(bodies)) if n != number)
+        apart = np.linalg.norm(places - places[number], axis=2).min(axis=1)
+        others = (n for n in np.flatnonzero(apart <= reach + reach[number]).tolist() if n != number)
         depths = [_overlap(bodies[number], paths[number], bodies[n], paths[n]) for n in others]
         found[number] = max(depths, default=0.0)
     # A law of bounces has its own floor, from the impacts that were seen.
@@ -278,6 +280,11 @@ def _overlap(body: SceneBody, path: se3.Pose, other: SceneBody, others_path: se3
         faces = normals @ turns[time].T, -others_normals @ others_turns[time].T
         depths[time] = min(depths[time], depth(time, np.concatenate([_DIRECTIONS, *faces])))
     return float((depths - max(depths[0], 0.0)).max())
+
+
+def _radius(body: SceneBody) -> float:
+    """Radius of the ball about a body's centre that contains it."""
+    return float(np.linalg.norm(body.solid.vertices - body.solid.center, axis=1).max())
 
 
 def _reach(body: SceneBody, towards: np.ndarray) -> np.ndarray:

@@ -199,3 +199,18 @@ def test_a_flat_hull_is_named_and_left_out():
     hull = dataclasses.replace(scene.hulls[0], vertices=scene.hulls[0].vertices * [1, 1, 0])
     found = scene_future.predict(dataclasses.replace(scene, hulls=(hull,)))
     assert found.lines == ("box 1: has no contacts: the points of a hull lie in a plane",)
+
+
+def test_shapes_of_bodies_that_are_never_close_are_not_compared(monkeypatch):
+    compared, overlap = [], scene_future._overlap
+
+    def counted(body, path, other, others_path):
+        compared.append((body.name, other.name))
+        return overlap(body, path, other, others_path)
+
+    monkeypatch.setattr(scene_future, "_overlap", counted)
+    model, center = contact_scenes.falling()
+    far = contact_scenes.resting(20.0)
+    below = (MotionModel(radius=0.5 * SIZE), center - [0, 0, 0.5 * center[2]])
+    scene_future.predict(contact_scenes.scene((model, center), far, below), FEW)
+    assert compared == [("box 1", "box 3")]
