@@ -39,6 +39,7 @@ PATCHES = 8  # patches per body: its octants
 WHOLE = 500_000  # pixels of an image above which only the part that a group may reach is drawn
 REACH = 3.4  # standard deviations at which an opaque Gaussian is fainter than the rasterizer draws
 MARGIN = 2.0  # pixels added to the reach, for the low-pass filter and rounding
+KEPT = 2_000_000  # Gaussians in the frames of the trained motion that are kept in memory
 STEP = 0.02  # change of the poses for finite differences of the images, rad or radii
 
 
@@ -95,17 +96,19 @@ class ImageEvidence:
 
     def remember(self) -> None:
         """Compare the pictures of the trained motion with the images; to be called when these have changed."""
-        player = scene_player.Player(self._scene)
-        self._errors = [self._error(self._frame(player, row), row) for row in range(len(self._views))]
+        self._player = scene_player.Player(self._scene)
+        self._frames: dict[int, scene_player.Frame] = {}
+        self._errors = [self._error(self._trained(row), row) for row in range(len(self._views))]
         self.psnr = _mean_psnr(self._errors)
 
     def loss(self, poses: np.ndarray) -> float:
         """Return the decrease of the mean PSNR on the sampled views, dB, if the groups take other poses [G, S, 7]."""
         moving = self._moving(self._scene.tracks.poses, poses)
-        players = [scene_player.Player(scene) for scene in (self._scene, self._with(poses))]
+        player = scene_player.Player(self._with(poses))
         errors = []
         for row, error in enumerate(self._errors):
-            frames = [self._frame(player, row) for player in players]
+            trained = self._trained(row)
+            frames = [trained, player.frame_after(trained)]
             window = self._window(row, frames, moving)
             if window == self._whole(row):
                 errors.append(self._error(frames[1], row))
@@ -138,9 +141,10 @@ class ImageEvidence:
         scores, information = np.zeros((2, int(self._clusters.max()) + 1, PATCHES + 1))
         pixels, changed = 0, 0.0
         for row in rows:
-            own = [self._frame(player, row) for player in (here, plus, minus, simpler)]
+            trained = self._trained(row)
+            own = [player.frame_after(trained) for player in (here, plus, minus, simpler)]
             window = self._window(row, own, moving)
-            factor = simpler.frame(self._views[row].t).shading_factor
+            factor = own[3].shading_factor
             lit = own[:3] if factor is None else [dataclasses.replace(f, shading_factor=factor) for f in own[:3]]
             picture, patches = self._draw(dataclasses.replace(lit[0], object_ids=octants), row, window)
             slope = (self._draw(lit[1], row, window)[0] - self._draw(lit[2], row, window)[0]).astype(np.float64)
@@ -177,6 +181,15 @@ class ImageEvidence:
     def _moving(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Return a mask of the Gaussians whose groups change. Poses [G, S, 7]; [N] bool"""
         return (before != after).any(axis=(1, 2))[self._scene.gaussians.motion_ids]
+
+    def _trained(self, row: int) -> scene_player.Frame:
+        """Return the frame of a view with the trained motion, relative to its camera."""
+        found = self._frames.get(row)
+        if found is None:
+            found = self._frame(self._player, row)
+            if (len(self._frames) + 1) * len(found.means) <= KEPT:
+                self._frames[row] = found
+        return found
 
     def _frame(self, player: scene_player.Player, row: int) -> scene_player.Frame:
         """Return the frame of a view, relative to its camera."""
@@ -289,16 +302,6 @@ def gather(scene: Scene, context: Context) -> ImageEvidence | None:
         return None
 
 
-def make_renderer(scene: Scene) -> Callable[[datasets.View], np.ndarray]:
-    """Return a function that renders the scene at a view. [H, W, 3]"""
-    player = scene_player.Player(scene)
-
-    def draw(view: datasets.View) -> np.ndarray:
-        return scene_renderer.render(player, view.camera, view.t).color
-
-    return draw
-
-
 def sample(views: Sequence[datasets.View]) -> list[datasets.View]:
     """Return views spread evenly over the times of each camera, as many as `PIXELS` allows."""
     size = float(np.median([view.camera.width * view.camera.height for view in views]))
@@ -338,4 +341,5 @@ def _clusters(views: Sequence[datasets.View]) -> np.ndarray:
 def _between(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
     """Interpolate (or extrapolate) between poses; ``share`` is 0 at ``before`` and 1 at ``after``. [G, S, 7]"""
     quats = rotations.interpolate(before[..., :4], after[..., :4], share)
-    return np.concatenate([quats, before[..., 4:] + share * (after[..., 4:] - before[..., 4:])], axis=-1)
+    poses = np.concatenate([quats, before[..., 4:] + share * (after[..., 4:] - before[..., 4:])], axis=-1)
+    return np.where((before != after).any(axis=(1, 2), keepdims=True), poses, before)

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
+from ..data.dataset import View
 from ..errors import DatasetError
-from ..playback import residuals
+from ..playback import residuals, scene_player
+from ..render import scene_renderer
 from ..scene import slipped_rotations
+from ..scene.scene import Scene
 from ..train import checkpoint_content, train_views, view_psnr
 from ..train.identity import label_cleanup
-from . import image_evidence
 from .draft import Context, Draft
 
 
@@ -54,13 +59,22 @@ def _on_training_views(draft: Draft, context: Context) -> dict[str, Any]:
     dataset, tensors = context.dataset, context.tensors
     behind = train_views.behind(dataset, context.config)
     try:
-        baked = view_psnr.training_psnr(dataset, behind, image_evidence.make_renderer(draft.scene), context.explained)
+        baked = view_psnr.training_psnr(dataset, behind, _renderer(draft.scene), context.explained)
         if checkpoint_content.TRAIN_PSNR in tensors:
             before = float(tensors[checkpoint_content.TRAIN_PSNR])
         else:
-            before = view_psnr.training_psnr(
-                dataset, behind, image_evidence.make_renderer(draft.trained or draft.scene), context.explained
-            )
+            trained = _renderer(draft.trained or draft.scene)
+            before = view_psnr.training_psnr(dataset, behind, trained, context.explained)
     except DatasetError:  # `simplify_motion` has logged it
         return {}
     return {"training_views": {"checkpoint_psnr": before, "baked_psnr": baked}}
+
+
+def _renderer(scene: Scene) -> Callable[[View], np.ndarray]:
+    """Return a function that renders the scene at a view. [H, W, 3]"""
+    player = scene_player.Player(scene)
+
+    def draw(view: View) -> np.ndarray:
+        return scene_renderer.render(player, view.camera, view.t).color
+
+    return draw

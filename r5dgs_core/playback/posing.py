@@ -24,30 +24,43 @@ class Poser:
     def __init__(self, scene: Scene):
         self._scene = scene
         self._runs = runs(scene.gaussians.motion_ids)
+        self._run_groups = np.array([g for _, _, g in self._runs], np.int64)
         self.pivots = np.array([group.pivot for group in scene.groups], np.float64).reshape(-1, 3)
         self._rest = diffuse_shading.rest_factors(scene)
         self._arms: np.ndarray | None = None
         self._still: tuple[np.ndarray, np.ndarray] | None = None
 
-    def means(self, group_quats: np.ndarray, group_displacements: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    def means(
+        self,
+        group_quats: np.ndarray,
+        group_displacements: np.ndarray,
+        origin: np.ndarray,
+        others: np.ndarray | None = None,
+        groups: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Centres with each group in a pose, relative to an origin.
 
         Args:
             group_quats: Rotation of each group about its pivot, unit wxyz. [G, 4]
             group_displacements: Displacement of each pivot, world. [G, 3]
             origin: Point of the world. [3]
+            others: Centres to keep of the groups outside of ``groups``; None to compute all. [N, 3] float32
+            groups: Mask of the groups to compute. [G]
 
         Returns:
             A new array. Gaussians of groups that did not move equal the bind state exactly if the origin is zero.
             [N, 3] float32
         """
-        result = self._resting(origin).copy()
+        resting = self._resting(origin)
+        result = (resting if others is None else others).copy()
         moved = (group_quats[:, 1:] != 0).any(-1) | (group_displacements != 0).any(-1)
-        if moved.any():
+        if moved.any() or others is not None:
             maps, arms = self.maps(group_quats, group_displacements, origin), self.arms
-            for start, stop, g in self._runs:
+            for start, stop, g in self._runs_of(groups):
                 if moved[g]:
                     result[start:stop] = arms[start:stop] @ maps[g]
+                elif others is not None:
+                    result[start:stop] = resting[start:stop]
         return result
 
     def maps(self, group_quats: np.ndarray, group_displacements: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -77,27 +90,49 @@ class Poser:
                 result[start:stop] = moves
         return result
 
-    def quats(self, group_quats: np.ndarray) -> np.ndarray:
-        """Gaussian rotations with each group rotated; the scene's own array if none is. [G, 4] -> [N, 4] float32"""
+    def quats(
+        self, group_quats: np.ndarray, others: np.ndarray | None = None, groups: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Gaussian rotations with each group rotated; the scene's own array if none is.
+
+        Args:
+            group_quats: Rotation of each group, unit wxyz. [G, 4]
+            others: Rotations to keep of the groups outside of ``groups``; None to compute all. [N, 4] float32
+            groups: Mask of the groups to compute. [G]
+        """
+        own = self._scene.gaussians.quats
         turned = (group_quats[:, 1:] != 0).any(-1)
         if not turned.any():
-            return self._scene.gaussians.quats
-        result = self._scene.gaussians.quats.copy()
-        for start, stop, g in self._runs:
+            return own
+        result = (own if others is None else others).copy()
+        matrices = _products(group_quats)
+        for start, stop, g in self._runs_of(groups):
             if turned[g]:
-                turn_quats(self._scene.gaussians.quats[start:stop], group_quats[g], result[start:stop])
+                np.matmul(own[start:stop], matrices[g], out=result[start:stop])
+            elif others is not None:
+                result[start:stop] = own[start:stop]
         return result
 
-    def shading(self, group_quats: np.ndarray) -> np.ndarray | None:
-        """Colour factor of each Gaussian with each group rotated, or None without shading. [G, 4] -> [N] float32"""
+    def shading(
+        self, group_quats: np.ndarray, others: np.ndarray | None = None, groups: np.ndarray | None = None
+    ) -> np.ndarray | None:
+        """Colour factor of each Gaussian with each group rotated, or None without shading.
+
+        Args:
+            group_quats: Rotation of each group, unit wxyz. [G, 4]
+            others: Factors to keep of the groups outside of ``groups``; None to compute all. [N] float32
+            groups: Mask of the groups to compute. [G]
+        """
         if self._scene.shading is None:
             return None
         vectors, light = self._scene.shading.vectors, self._scene.shading.light
-        result = self._rest.clip(min=0)
+        result = self._rest.clip(min=0) if others is None else others.copy()
         change = (rotations.rotate(rotations.conjugate(group_quats), light) - light).astype(np.float32)
-        for start, stop, g in self._runs:
+        for start, stop, g in self._runs_of(groups):
             if change[g].any():
                 result[start:stop] = diffuse_shading.factors(self._rest[start:stop], vectors[start:stop], change[g])
+            elif others is not None:
+                result[start:stop] = self._rest[start:stop].clip(min=0)
         return result
 
     def relight(self, factors: np.ndarray | None, rows: np.ndarray, turns: np.ndarray) -> None:
@@ -123,6 +158,12 @@ class Poser:
                 self._scene.gaussians.means, self.pivots[self._scene.gaussians.motion_ids], out=self._arms[:, :3]
             )
         return self._arms
+
+    def _runs_of(self, groups: np.ndarray | None) -> list[tuple[int, int, int]]:
+        """Return the runs of rows of the groups in a mask [G], of all groups if it is None."""
+        if groups is None:
+            return self._runs
+        return [self._runs[k] for k in np.flatnonzero(groups[self._run_groups])]
 
     def _resting(self, origin: np.ndarray) -> np.ndarray:
         if not origin.any():
@@ -154,5 +195,10 @@ def turn_quats(quats: np.ndarray, turn: np.ndarray, result: np.ndarray) -> None:
         turn: Unit wxyz. [4] float64
         result: Output, not ``quats``. [N, 4] float32
     """
-    # Linear in q: row k of the matrix is the product with the k-th unit quaternion.
-    np.matmul(quats, rotations.multiply(turn, np.eye(4)).astype(np.float32), out=result)
+    np.matmul(quats, _products(turn), out=result)
+
+
+def _products(turns: np.ndarray) -> np.ndarray:
+    """Matrices from q to the products ``turn q``, for right multiplication. [..., 4] -> [..., 4, 4] float32"""
+    # Linear in q: row k of a matrix is the product with the k-th unit quaternion.
+    return rotations.multiply(turns[..., None, :], np.eye(4)).astype(np.float32)

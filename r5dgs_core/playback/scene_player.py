@@ -18,6 +18,7 @@ t_max. Past it:
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 
@@ -158,6 +159,25 @@ class Player:
         elif self._own is not None:
             self._apply_own_motion(moved, t - scene.t_max, center)
         return self._frame(t, moved, quats, displacements, center)
+
+    def frame_after(self, other: Frame) -> Frame:
+        """The frame at the time and origin of another frame, faster than by `frame` if few groups have other poses.
+
+        Args:
+            other: Frame in this mode of a scene that differs from this one in its tracks alone.
+        """
+        if other.t > self.scene.t_max or self.scene.residuals is not None:
+            return self.frame(other.t, other.origin)
+        quats, displacements = self.group_poses(other.t)
+        groups = (quats != other.group_quats).any(-1) | (displacements != other.group_displacements).any(-1)
+        return dataclasses.replace(
+            other,
+            means=self._poser.means(quats, displacements, other.origin, other.means, groups),
+            quats=self._poser.quats(quats, other.quats, groups),
+            shading_factor=self._poser.shading(quats, other.shading_factor, groups),
+            group_quats=quats,
+            group_displacements=displacements,
+        )
 
     def _opacity_logits(self, t: float) -> np.ndarray:
         """Opacity logits at a time: those of the scene, and `presence.HIDDEN` for groups that are absent. [N]"""

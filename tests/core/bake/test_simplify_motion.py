@@ -233,3 +233,23 @@ def test_in_large_images_only_the_part_that_the_body_reaches_is_drawn(given, mon
     assert drawn[1] < 0.5 * drawn[0]
     assert dataclasses.astuple(in_part) == pytest.approx(dataclasses.astuple(support), rel=1e-4)
     assert loss_in_part == pytest.approx(loss, rel=1e-3) and loss > 0.1
+
+
+@pytest.mark.parametrize("given", ["slide"], indirect=True)
+def test_a_change_of_one_body_poses_no_other_gaussians_again(given, monkeypatch):
+    _, truth, data = given
+    noisy = with_noise(truth, 0.02, 0.02).tracks.poses
+    frame, posed, found = scene_player.Player.frame, [], []
+
+    def counted(*given):
+        posed.append(0)
+        return frame(*given)
+
+    for kept in (10**9, 0):
+        monkeypatch.setattr(image_evidence, "KEPT", kept)
+        evidence = evidence_of(truth, data)
+        with monkeypatch.context() as patch:
+            patch.setattr(scene_player.Player, "frame", counted)
+            found.append((evidence.support(BRICK, truth.tracks.poses, noisy, 0.1), evidence.loss(noisy)))
+        assert len(posed) == (0 if kept else 2 * len(evidence._views))
+    assert found[0] == found[1]

@@ -238,3 +238,61 @@ def test_unknown_modes_and_times_are_refused(scene):
         scene_player.Player(scene).frame(1.0, origin=np.array([0.0, np.nan, 0.0]))
     with pytest.raises(ValueError, match="finite"):
         scene_player.Player(scene).frame(float("nan"))
+
+
+def _with_other_poses(scene, *, turned=(), moved=(), resting=()):
+    poses = scene.tracks.poses.copy()
+    for g in turned:
+        poses[g, :, :4] = rotations.multiply(rotations.rotvecs_to_quats(np.array([0.1, -0.2, 0.3])), poses[g, :, :4])
+    for g in moved:
+        poses[g, :, 4:] += [0.1, 0.2, -0.3]
+    for g in resting:
+        poses[g] = [1, 0, 0, 0, 0, 0, 0]
+    return scene.with_arrays(track_poses=poses)
+
+
+@pytest.mark.parametrize("t", [0.2 * T_MAX, T_MAX, 1.3 * T_MAX])
+@pytest.mark.parametrize("shading", [True, False])
+@pytest.mark.parametrize("origin", [None, np.array([0.3, -2.0, 1.0])])
+@pytest.mark.parametrize(
+    "changes", [{}, {"turned": (1,), "moved": (3,)}, {"resting": (1, 2)}, {"resting": (0, 1, 2, 3, 4, 5, 6)}]
+)
+def test_a_frame_after_another_is_the_frame_to_the_bit(t, shading, origin, changes):
+    scene = make_scene(objects=5, shading=shading)  # group 6 follows group 1
+    if t < T_MAX:
+        scene = _with_other_poses(scene, turned=(4,))
+    for before, after in [(scene, _with_other_poses(scene, **changes)), (_with_other_poses(scene, **changes), scene)]:
+        other = scene_player.Player(before).frame(t, origin)
+        kept = {name: None if x is None else np.copy(x) for name, x in vars(other).items()}
+        expected, found = (
+            scene_player.Player(after).frame(t, origin),
+            scene_player.Player(after).frame_after(other),
+        )
+        for name, value in vars(expected).items():
+            np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
+            np.testing.assert_array_equal(getattr(other, name), kept[name], err_msg=name)
+
+
+def test_a_frame_after_another_has_the_residuals_of_its_scene():
+    plain = make_scene(90)
+    rng, shape = np.random.default_rng(1), (30, len(plain.tracks.times), 3)
+    scene = plain.with_arrays(
+        residual_rows=np.arange(0, 90, 3, dtype=np.int32),
+        residual_offsets=rng.normal(size=shape).astype(np.float32),
+        residual_quats=rotations.rotvecs_to_quats(rng.normal(size=shape)).astype(np.float32),
+        residual_log_scales=rng.normal(size=shape).astype(np.float32),
+    )
+    after = _with_other_poses(scene, turned=(1,))
+    found = scene_player.Player(after).frame_after(scene_player.Player(scene).frame(0.3 * T_MAX))
+    expected = scene_player.Player(after).frame(0.3 * T_MAX)
+    np.testing.assert_array_equal(found.means, expected.means)
+    np.testing.assert_array_equal(found.quats, expected.quats)
+
+
+def test_a_frame_after_another_moves_only_the_groups_that_differ():
+    scene = make_scene(objects=5, shadows=False)
+    other, after = scene_player.Player(scene).frame(0.2 * T_MAX), _with_other_poses(scene, turned=(2,))
+    marked = dataclasses.replace(other, means=np.full_like(other.means, 9), quats=np.full_like(other.quats, 9))
+    found = scene_player.Player(after).frame_after(marked)
+    same = scene.gaussians.motion_ids != 2
+    assert ((found.means == 9).all(1) == same).all() and ((found.quats == 9).all(1) == same).all()
