@@ -97,17 +97,31 @@ def _apart(a: np.ndarray, a_cov: np.ndarray, b: np.ndarray, b_cov: np.ndarray) -
     return float((a - b) @ np.linalg.solve(a_cov + b_cov, a - b))
 
 
+def _all_apart(accelerations: np.ndarray, covariances: np.ndarray) -> np.ndarray:
+    """Return `_apart` of all pairs of accelerations [B, 3] with their covariances [B, 3, 3]. [B, B]"""
+    rows = []
+    for a, covariance in zip(accelerations, covariances, strict=True):
+        off = accelerations - a
+        rows.append((off * np.linalg.solve(covariances + covariance, off[..., None])[..., 0]).sum(-1))
+    return np.stack(rows)
+
+
 def _largest_agreeing(found: dict[int, tuple[np.ndarray, np.ndarray]]) -> list[int]:
     """Large set of bodies that agree in pairs, grown greedily from each body; among equally large, the tightest."""
+    if not found:
+        return []
+    apart = _all_apart(*(np.stack(part) for part in zip(*found.values(), strict=True)))
+    agree = apart < AGREE
     best: tuple[int, float, list[int]] = (0, 0.0, [])
-    for seed in found:
-        distances = {i: _apart(*found[seed], *found[i]) for i in found if i != seed}
-        chosen, total = [seed], 0.0
-        for i in sorted(distances, key=lambda i: distances[i]):
-            if all(_apart(*found[i], *found[j]) < AGREE for j in chosen):
-                chosen, total = [*chosen, i], total + distances[i]
+    for seed in range(len(found)):
+        chosen, total, fits = [seed], 0.0, agree[seed].copy()
+        for i in np.argsort(apart[seed], kind="stable").tolist():
+            if i != seed and fits[i]:
+                chosen.append(i)
+                total += float(apart[seed, i])
+                fits &= agree[i]
         best = max(best, (len(chosen), -total, chosen), key=lambda entry: entry[:2])
-    return sorted(best[2])
+    return sorted(list(found)[i] for i in best[2])
 
 
 def _refit(

@@ -149,3 +149,36 @@ def test_the_mean_acceleration_is_that_of_generalized_least_squares(basis):
     np.testing.assert_allclose(mean, basis @ np.linalg.lstsq(whitened, values, rcond=None)[0], atol=1e-10)
     inverse = np.linalg.pinv(whitened)
     np.testing.assert_allclose(covariance, basis @ inverse @ inverse.T @ basis.T, atol=1e-10)
+
+
+def test_each_pair_of_bodies_is_compared_once_in_each_direction(monkeypatch):
+    rng = np.random.default_rng(0)
+    found = {i: (0.3 * rng.normal(size=3), np.eye(3)) for i in range(40)}
+    solved, solve = [], np.linalg.solve
+
+    def counted(matrices, values):
+        solved.append(np.prod(np.shape(matrices)[:-2], dtype=int))
+        return solve(matrices, values)
+
+    monkeypatch.setattr(np.linalg, "solve", counted)
+    assert shared_gravity._largest_agreeing(found) == list(range(40))
+    assert sum(solved) == 40**2
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_agreeing_set_is_grown_from_the_nearest_body_of_each(seed):
+    rng = np.random.default_rng(seed)
+    found = {i: (2 * rng.normal(size=3), np.diag(rng.uniform(0.2, 1, 3))) for i in rng.permutation(20)[:12].tolist()}
+
+    def agree(i, j):
+        return shared_gravity._apart(*found[i], *found[j]) < shared_gravity.AGREE
+
+    sets = []
+    for first in found:
+        distances = {i: shared_gravity._apart(*found[first], *found[i]) for i in found if i != first}
+        chosen = [first]
+        for i in sorted(distances, key=distances.__getitem__):
+            chosen += [i] if all(agree(i, j) for j in chosen) else []
+        sets.append((len(chosen), -sum(distances[i] for i in chosen[1:]), sorted(chosen)))
+    assert shared_gravity._largest_agreeing(found) == max(sets, key=lambda entry: entry[:2])[2]
+    assert 1 < max(sets)[0] < 12
