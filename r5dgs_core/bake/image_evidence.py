@@ -37,6 +37,7 @@ MIN_VIEWS, MAX_VIEWS = 20, 40  # limits of the number of sampled views
 CLUSTERS = 8  # smallest number of clusters; with fewer cameras, their views are split in time
 PATCHES = 8  # patches per body: its octants
 WHOLE = 500_000  # pixels of an image above which only the part that a group may reach is drawn
+FEW = 20  # bodies above which a change of one is drawn only there in images of any size
 REACH = 3.4  # standard deviations at which an opaque Gaussian is fainter than the rasterizer draws
 MARGIN = 2.0  # pixels added to the reach, for the low-pass filter and rounding
 KEPT = 2_000_000  # Gaussians in the frames of the trained motion that are kept in memory
@@ -92,6 +93,8 @@ class ImageEvidence:
             self._truths.append(datasets.in_scene_colors(view, given))
             self._explained.append(explained(view, given))
         self._clusters = _clusters(views)
+        moves = (scene.tracks.poses[..., 1:] != 0).any(axis=(1, 2))
+        self._bodies = sum(group.role == "body" and bool(moves[group.id]) for group in scene.groups)
         self.remember()
 
     def remember(self) -> None:
@@ -109,7 +112,7 @@ class ImageEvidence:
         for row, error in enumerate(self._errors):
             trained = self._trained(row)
             frames = [trained, player.frame_after(trained)]
-            window = self._window(row, frames, moving)
+            window = self._window(row, frames, moving, WHOLE)
             if window == self._whole(row):
                 errors.append(self._error(frames[1], row))
             else:
@@ -143,7 +146,7 @@ class ImageEvidence:
         for row in rows:
             trained = self._trained(row)
             own = [player.frame_after(trained) for player in (here, plus, minus, simpler)]
-            window = self._window(row, own, moving)
+            window = self._window(row, own, moving, WHOLE if self._bodies <= FEW else 0)
             factor = own[3].shading_factor
             lit = own[:3] if factor is None else [dataclasses.replace(f, shading_factor=factor) for f in own[:3]]
             picture, patches = self._draw(dataclasses.replace(lit[0], object_ids=octants), row, window)
@@ -184,11 +187,9 @@ class ImageEvidence:
 
     def _trained(self, row: int) -> scene_player.Frame:
         """Return the frame of a view with the trained motion, relative to its camera."""
-        found = self._frames.get(row)
-        if found is None:
-            found = self._frame(self._player, row)
-            if (len(self._frames) + 1) * len(found.means) <= KEPT:
-                self._frames[row] = found
+        found = self._frames.get(row) or self._frame(self._player, row)
+        if (len(self._frames) + 1) * len(found.means) <= KEPT:
+            self._frames[row] = found
         return found
 
     def _frame(self, player: scene_player.Player, row: int) -> scene_player.Frame:
@@ -200,16 +201,19 @@ class ImageEvidence:
         camera = self._views[row].camera
         return slice(0, camera.height), slice(0, camera.width)
 
-    def _window(self, row: int, frames: Sequence[scene_player.Frame], moving: np.ndarray) -> tuple[slice, slice]:
+    def _window(
+        self, row: int, frames: Sequence[scene_player.Frame], moving: np.ndarray, small: int
+    ) -> tuple[slice, slice]:
         """Return rows and columns of a view outside of which some Gaussians do not show; of small images, all.
 
         Args:
             row: Index of the view.
             frames: Frames in which they may be drawn.
             moving: Mask of the Gaussians. [N]
+            small: Number of pixels of the largest small image.
         """
         camera, whole = self._views[row].camera, self._whole(row)
-        if camera.width * camera.height <= WHOLE:
+        if camera.width * camera.height <= small:
             return whole
         low, high = np.full(2, np.inf), np.full(2, -np.inf)
         for frame in frames:

@@ -236,6 +236,25 @@ def test_in_large_images_only_the_part_that_the_body_reaches_is_drawn(given, mon
 
 
 @pytest.mark.parametrize("given", ["slide"], indirect=True)
+def test_with_many_bodies_a_change_of_one_is_drawn_only_there_in_small_images_too(given, monkeypatch):
+    _, truth, data = given
+    evidence, noisy = evidence_of(truth, data), with_noise(truth, 0.02, 0.02).tracks.poses
+    drawn, draw, found = [], scene_renderer.render_frame, []
+
+    def counted(scene, frame, camera, **options):
+        drawn[-1] += camera.width * camera.height
+        return draw(scene, frame, camera, **options)
+
+    monkeypatch.setattr(scene_renderer, "render_frame", counted)
+    for few in (image_evidence.FEW, 1):
+        monkeypatch.setattr(image_evidence, "FEW", few)
+        drawn.append(0)
+        found.append(dataclasses.astuple(evidence.support(BRICK, truth.tracks.poses, noisy, 0.1)))
+    assert drawn[1] < 0.5 * drawn[0]
+    assert found[1] == pytest.approx(found[0], rel=1e-4)
+
+
+@pytest.mark.parametrize("given", ["slide"], indirect=True)
 def test_a_change_of_one_body_poses_no_other_gaussians_again(given, monkeypatch):
     _, truth, data = given
     noisy = with_noise(truth, 0.02, 0.02).tracks.poses
