@@ -114,13 +114,9 @@ def _usual(evidence: TrackletOverlaps, mutual: np.ndarray) -> np.ndarray:
     found = evidence.common[rows, columns] / np.maximum(evidence.union[rows, columns], 1e-9)
     everywhere = _median(found, weight)
     table = np.full((len(views), len(views)), everywhere)
-    pair = at[rows] * len(views) + at[columns]
-    order = np.argsort(pair, kind="stable")
-    for chunk in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1):
-        here = _median(found[chunk], weight[chunk])
-        table[at[rows[chunk[0]]], at[columns[chunk[0]]]] = (here * len(chunk) + everywhere * PRIOR) / (
-            len(chunk) + PRIOR
-        )
+    pair, members = np.unique(at[rows] * len(views) + at[columns], return_inverse=True)
+    counts = np.bincount(members)
+    table.flat[pair] = (_medians(found, weight, members) * counts + everywhere * PRIOR) / (counts + PRIOR)
     return table[at[:, None], at[None, :]]
 
 
@@ -204,6 +200,12 @@ def _absorb(evidence: TrackletOverlaps, labels: np.ndarray) -> np.ndarray:
 
 
 def _median(values: np.ndarray, weights: np.ndarray) -> float:
-    order = np.argsort(values)
-    below = np.cumsum(weights[order])
-    return float(values[order[np.searchsorted(below, below[-1] / 2)]])
+    return float(_medians(values, weights, np.zeros(len(values), int))[0])
+
+
+def _medians(values: np.ndarray, weights: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Return the weighted median of each group. [P], [P], [P] int from 0 to K - 1 -> [K]"""
+    order = np.lexsort((values, groups))
+    below, last = np.cumsum(weights[order]), np.cumsum(np.bincount(groups)) - 1
+    before = np.concatenate([[0.0], below[last[:-1]]])
+    return values[order[np.searchsorted(below, 0.5 * (before + below[last]))]]

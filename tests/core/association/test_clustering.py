@@ -54,3 +54,24 @@ def test_shared_ids_decide_if_geometry_does_not():
 
 def test_no_runs_are_no_objects():
     assert clustering.cluster(evidence([], [], 0.5)).tolist() == []
+
+
+def test_medians_of_groups_are_the_values_at_half_their_weight():
+    rng = np.random.default_rng(0)
+    values, weights = rng.choice(rng.random(40), 200), rng.integers(1, 6, 200).astype(float)
+    groups = np.concatenate([np.arange(9), rng.integers(0, 9, 191)])
+    found = clustering._medians(values, weights, groups)
+    for group, median in enumerate(found):
+        here = groups == group
+        half = 0.5 * weights[here].sum()
+        assert median in values[here]
+        assert weights[here & (values < median)].sum() < half <= weights[here & (values <= median)].sum()
+
+
+def test_medians_of_all_pairs_of_views_are_taken_at_once(monkeypatch):
+    sorts, lexsort = [], np.lexsort
+    monkeypatch.setattr(np, "lexsort", lambda keys: sorts.append(len(keys[0])) or lexsort(keys))
+    views = 30
+    many = evidence([0, 1] * views, np.repeat(np.arange(views), 2).tolist(), 0.5)
+    assert len(np.unique(clustering.cluster(many))) == 2
+    assert max(sorts) > views**2 and len(sorts) < 5
