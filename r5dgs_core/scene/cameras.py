@@ -231,10 +231,10 @@ def fundamental(one: Camera, other: Camera) -> np.ndarray:
     return np.linalg.inv(other.intrinsics).T @ between @ np.linalg.inv(one.intrinsics)
 
 
-def pixel_rays(camera: Camera) -> np.ndarray:
-    """Unit world directions through all pixel centres. [H, W, 3]"""
+def pixel_rays(camera: Camera, rows: slice = slice(None)) -> np.ndarray:
+    """Unit world directions through the centres of all pixels, or of those in some rows. [H, W, 3]"""
     k = camera.intrinsics
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height)[rows] + 0.5)
     v = (y - k[1, 2]) / k[1, 1]
     u = (x - k[0, 2] - k[0, 1] * v) / k[0, 0]
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ camera.T_cam_world[:3, :3]

@@ -15,6 +15,7 @@ from ..scene.cameras import Camera
 from .initialization import sky
 
 BASES_BYTES = 1 << 29  # limit of the cache of harmonics per camera; it is cleared when full
+ROWS = 32  # of an image whose harmonics are computed at once, for the processor's cache
 
 
 class Background:
@@ -52,13 +53,21 @@ class Background:
         coefficients, shape = self.params["background"], (camera.height, camera.width, 3)
         key = (*shape, camera.T_cam_world[:3, :3].tobytes(), camera.intrinsics.tobytes(), len(coefficients))
         if key not in self._bases:
-            rays = torch.from_numpy(cameras.pixel_rays(camera).reshape(-1, 3).astype(np.float32))
-            basis = spherical_harmonics.basis(rays, spherical_harmonics.degree_of(len(coefficients)))
-            basis = basis.to(coefficients.device)
+            basis = _harmonics(camera, len(coefficients)).to(coefficients.device)
             if sum(b.nbytes for b in self._bases.values()) + basis.nbytes > BASES_BYTES:
                 self._bases.clear()
             self._bases[key] = basis
         return self._bases[key]
+
+
+def _harmonics(camera: Camera, count: int) -> Tensor:
+    """Return the first harmonics of a camera's pixels. [H W, count]"""
+    result = torch.empty((camera.height, camera.width, count))
+    for start in range(0, camera.height, ROWS):
+        rays = cameras.pixel_rays(camera, slice(start, start + ROWS)).astype(np.float32)
+        part = spherical_harmonics.basis(torch.from_numpy(rays), spherical_harmonics.degree_of(count))
+        result[start : start + ROWS] = part
+    return result.reshape(-1, count)
 
 
 def fixed(color: np.ndarray) -> Background:

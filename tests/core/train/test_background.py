@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import torch
 
+from r5dgs_core.scene import cameras, spherical_harmonics
 from r5dgs_core.train import background
 from tests.support import scenes
 
@@ -19,3 +20,21 @@ def test_images_of_other_sizes_show_their_own_part_of_the_sky():
         assert torch.equal(shown, background.learned(coefficients).image(cut))
     whole, part = sky.image(camera), sky.image(dataclasses.replace(camera, width=5, height=3))
     torch.testing.assert_close(part, whole[:3, :5])
+
+
+def test_harmonics_are_computed_in_parts_that_fit_into_a_cache(monkeypatch):
+    camera = scenes.orbit_camera(0.3, 7, 75)
+    skewed = camera.intrinsics + [[0.3, 0.02, 0.1], [0, 0.7, 0.37], [0, 0, 0]]
+    camera = dataclasses.replace(camera, intrinsics=skewed)
+    rays = cameras.pixel_rays(camera).astype(np.float32)
+    computed, pixel_rays = [], cameras.pixel_rays
+
+    def counted(*given):
+        found = pixel_rays(*given)
+        computed.append(len(found))
+        return found
+
+    monkeypatch.setattr(cameras, "pixel_rays", counted)
+    found = background.learned(np.zeros((1, 3)), degree=3).basis(camera)
+    assert torch.equal(found, spherical_harmonics.basis(torch.from_numpy(rays), 3).reshape(-1, 16))
+    assert sum(computed) == 75 and max(computed) == background.ROWS
