@@ -1,6 +1,6 @@
 """From videos to a scene: wrong cameras against exact ones.
 
-    python -m benchmarks.cameras dirty [--scenes NAME ...] [--seeds N] [--size 160] [--cameras 8] [--frames 25]
+    python -m benchmarks.cameras dirty [--scenes NAME ...] [--seeds N] [--size 256] [--cameras 8] [--frames 25]
         [--rows NAME ...] [--set KEY=VALUE] [--data FOLDER] [--json FILE]
 
 Writes the recordings of `rendered_recordings`, prepares each with `r5dgs prepare`, and trains it:
@@ -107,7 +107,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", choices=rendered_scenes.SCENES, default=["sliders", "balls"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--size", type=int, default=160)
+    parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--cameras", type=int, default=8)
     parser.add_argument("--frames", type=int, default=25)
     parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS))

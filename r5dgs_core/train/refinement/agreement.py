@@ -109,7 +109,7 @@ def examine(
         sizes = []
         for sides in cuts:
             first, second = (np.stack([side[k].solve(which, RIDGE) for side in sides]) for k in (0, 1))
-            sizes.append(_agreed(part, poses, first, second, points, spacing))
+            sizes.append(agreed(part, [pose.camera for pose in poses], first, second, points, spacing))
         every = [side for sides in cuts for side in sides]
         gain = 10 * math.log10(_error(every, without) / _error(every, which))
         found[part] = Evidence(min(sizes) if gain > 0 or part == POSES else 0.0, gain)
@@ -124,8 +124,8 @@ def _error(sides: Sequence[Sides], which: np.ndarray) -> float:
     return total
 
 
-def _agreed(
-    part: str, poses: Sequence[Examined], first: np.ndarray, second: np.ndarray, points: np.ndarray, spacing: float
+def agreed(
+    part: str, poses: Sequence[Camera], first: np.ndarray, second: np.ndarray, points: np.ndarray, spacing: float
 ) -> float:
     """Return the size of a part in which two fits [R, COUNT] agree, rms over the poses."""
     a, b = (_in_units(part, poses, change, points, spacing) for change in (first, second))
@@ -133,16 +133,15 @@ def _agreed(
 
 
 def _in_units(
-    part: str, poses: Sequence[Examined], changes: np.ndarray, points: np.ndarray, spacing: float
+    part: str, poses: Sequence[Camera], changes: np.ndarray, points: np.ndarray, spacing: float
 ) -> np.ndarray:
     """Return what corrections of a part change, in the units of `Evidence`, without what no image determines."""
     if part == POSES:
-        cameras = [pose.camera for pose in poses]
-        units = np.stack([gauge.pixel_units(camera, points) for camera in cameras])
-        fixed = gauge.Gauge(cameras, units).fix(changes[:, POSE])
+        units = np.stack([gauge.pixel_units(camera, points) for camera in poses])
+        fixed = gauge.Gauge(poses, units).fix(changes[:, POSE])
         return np.linalg.solve(units, fixed[..., None])[..., 0]
     if part == "focal_lengths":
-        values = changes[:, FOCAL] * np.array([[0.5 * pose.camera.width] for pose in poses])
+        values = changes[:, FOCAL] * np.array([[0.5 * camera.width] for camera in poses])
     elif part == "time_offsets":
         values = changes[:, TIME] / spacing
     else:

@@ -24,8 +24,8 @@ from ..train_views import TrainView
 from . import gauge, gradients
 from .rig import Rig
 
-POSES = "camera_poses"
-PARTS = (POSES, "focal_lengths", "time_offsets", "camera_colours")  # rows of the needs table
+POSES, CLOCKS = "camera_poses", "time_offsets"
+PARTS = (POSES, "focal_lengths", CLOCKS, "camera_colours")  # rows of the needs table
 BETAS, EPS = (0.9, 0.99), 1e-12
 REACH = 8.0  # maximum total change of a parameter over the run, in its units
 LOWEST, HIGHEST = 0.02, 0.15  # limits of a parameter's first step, units
@@ -81,11 +81,13 @@ class Refinement:
         gains: Largest gain of each part on pixels to which it was not fitted, dB, in the order of `PARTS`; nan if it
             was not examined; None before the decision. [4]
         sizes: Largest size of each part on which the pictures agree (`agreement.Evidence`), likewise. [4]
+        settled: Parts that were adjusted to patches of the images (`patch_trial`), which training does not change.
     """
 
     def __init__(self, rig: Rig, spacing: float, steps: int):
         self.rig = rig
         self.parts: frozenset[str] = frozenset()
+        self.settled: frozenset[str] = frozenset()
         self.gains: np.ndarray | None = None
         self.sizes = np.full(len(PARTS), math.nan)
         self._spacing, self._steps, self._begin = spacing, steps, 0
@@ -110,6 +112,17 @@ class Refinement:
         found = np.array([evidence.get(part, (math.nan, math.nan)) for part in PARTS])
         self.sizes = np.fmax(self.sizes, found[:, 0])
         self.gains = found[:, 1] if self.gains is None else np.fmax(self.gains, found[:, 1])
+
+    def change(self, changes: Mapping[str, np.ndarray], *, final: bool) -> None:
+        """Change the poses or clocks of all cameras, each with one lens.
+
+        Args:
+            changes: Change of the poses [R, 6] or the clocks [R] by part.
+            final: True to keep them from training.
+        """
+        self._poses.values += changes.get(POSES, 0.0)
+        self._time.values[self.rig.lens_of_pose, 0] += changes.get(CLOCKS, 0.0)
+        self.settled |= changes.keys() if final else set()
 
     def begin(
         self, parts: Sequence[str], points: np.ndarray, iteration: int, changes: Mapping[int, np.ndarray]
@@ -214,7 +227,7 @@ class Refinement:
         shift = self._poses.values[int(self.rig.pose_of[index]), 3:]
         by_pose, by_focal = gradients.camera_gradient(view, splats, shift)
         by_time, h = 0.0, TIME_STEP * self._spacing
-        if "time_offsets" in self.parts:
+        if CLOCKS in self.parts - self.settled:
             by_time = gradients.time_gradient(splats, pose(view.t - h), pose(view.t + h)) / (2 * h)
         by_color = np.full((3, 2), math.nan)
         if leaf is not None and leaf.grad is not None:
@@ -234,15 +247,16 @@ class Refinement:
             return
         row, lens = int(self.rig.pose_of[index]), int(self.rig.lens_of[index])
         by_pose, by_focal, by_time, by_color = measured[:6], measured[6], measured[7], measured[8:].reshape(3, 2)
-        if "camera_poses" in self.parts:
+        trained = self.parts - self.settled
+        if POSES in trained:
             step = self._poses.change(row, self._units[row].T @ by_pose, self._rate(self._poses, iteration))
             self._poses.values[row] += self._units[row] @ step
             self._smooth(row)
-        if "focal_lengths" in self.parts:
+        if "focal_lengths" in trained:
             unit = 2 / width
             step = self._focal.change(lens, np.array([by_focal * unit]), self._rate(self._focal, iteration))
             self._focal.values[lens] += unit * step
-        if "time_offsets" in self.parts:
+        if CLOCKS in trained:
             unit = TIME_UNIT * self._spacing
             step = self._time.change(lens, np.array([by_time * unit]), self._rate(self._time, iteration))
             self._time.values[lens] += unit * step
@@ -265,7 +279,7 @@ class Refinement:
 
     def _fix(self) -> None:
         """Remove changes that no image determines: a similarity of the world, and the means of the other parts."""
-        if self._gauge is not None and "camera_poses" in self.parts:
+        if self._gauge is not None and POSES in self.parts:
             self._poses.values = self._gauge.fix(self._poses.values)
         for rows in (self._focal, self._time, self._color):
             rows.values -= rows.values.mean(0)
@@ -278,6 +292,7 @@ class Refinement:
             "gains": self.gains,
             "sizes": self.sizes,
             "on": np.array([part in self.parts for part in PARTS]),
+            "settled": np.array([part in self.settled for part in PARTS]),
             "begin": np.array(self._begin),
         }
         if self.active:
@@ -292,6 +307,7 @@ class Refinement:
         named = {n.removeprefix(PREFIX): t.numpy().copy() for n, t in tensors.items() if n.startswith(PREFIX)}
         self.parts, self.gains, self._gauge = frozenset(), named.get("gains"), None
         self.sizes = named.get("sizes", np.full(len(PARTS), math.nan))
+        self.settled = frozenset(part for part, on in zip(PARTS, named.get("settled", ()), strict=False) if on)
         if self.gains is not None:
             self._begin = int(named["begin"])
             self.parts = frozenset(part for part, on in zip(PARTS, named["on"], strict=True) if on)

@@ -22,9 +22,9 @@ from ...scene.sampling import spacing, spread
 from .. import train_views
 from ..normalization import TARGET_DISTANCE
 from ..trainer import Trainer
-from . import agreement, gauge
+from . import agreement, gauge, patch_trial
 from .agreement import Evidence, Examined
-from .refinement import PARTS
+from .refinement import CLOCKS, PARTS, POSES
 
 log = logging.getLogger(__name__)
 
@@ -55,10 +55,15 @@ def after_step(trainer: Trainer) -> None:
     examinations, iteration = steps(trainer.config), trainer.iteration
     if iteration in examinations:
         decide(trainer, _possible(trainer))
-    elif examinations and trainer.refinement.active and examinations[0] < iteration < examinations[-1]:
+    elif examinations and _follows(trainer) and examinations[0] < iteration < examinations[-1]:
         begin, full = trainer.config.curriculum.steps(trainer.config.train.iterations)
         if (iteration - begin) % max(1, (full - begin) // FOLLOW_UPS) == 0:
             decide(trainer, [part for part in _possible(trainer) if part in trainer.refinement.parts])
+
+
+def _follows(trainer: Trainer) -> bool:
+    """True if refined parts are examined more often: not after poses are settled."""
+    return trainer.refinement.active and not trainer.refinement.settled
 
 
 def least_size(part: str, config: Config) -> float:
@@ -81,11 +86,20 @@ def decide(trainer: Trainer, possible: Sequence[str]) -> None:
     refinement.learn({part: (one.size, one.gain) for part, one in evidence.items()})
     forced = {part for part in possible if getattr(config.needs, part) == "on"}
     helpful = {part for part, one in evidence.items() if one.size > least_size(part, config)}
+    wanted, patched = POSES in possible and POSES in forced | helpful | refinement.parts, None
+    if wanted and not refinement.settled and trainer.iteration in steps(config):
+        patched = patch_trial.adjust(trainer, some)
+        if patched is not None:
+            refinement.change(patched.changes, final=patched.final)
+            helpful = helpful - {CLOCKS} | patched.changes.keys()
     taken = [part for part in PARTS if part in forced | helpful | refinement.parts]
     log.info("cameras, step %d: %s; refined: %s", trainer.iteration, _text(evidence), ", ".join(taken) or "nothing")
     if not taken:
         return
-    which = agreement.indices([part for part in taken if part in possible])
+    fitted = [part for part in taken if part in possible]
+    if patched is not None or refinement.settled:
+        fitted = [part for part in fitted if part == "camera_colours"]
+    which = agreement.indices(fitted)
     changes = {row: camera_fit.added(found).solve(which, agreement.RIDGE) for row, found in tiles.items()}
     refinement.begin(taken, points, trainer.iteration, changes)
 

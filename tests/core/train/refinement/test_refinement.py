@@ -12,7 +12,7 @@ from r5dgs_core.raster import rasterize_splats
 from r5dgs_core.scene import cameras
 from r5dgs_core.scene.camera_correction import Correction
 from r5dgs_core.train import checkpoint_content, run, train_views
-from r5dgs_core.train.refinement import gradients, refined_dataset, rig, trial
+from r5dgs_core.train.refinement import gauge, gradients, patch_trial, refined_dataset, rig, trial
 from r5dgs_core.train.refinement.refinement import PARTS, Refinement
 from r5dgs_core.train.representations.fused_posing import PosedSplats
 from r5dgs_core.train.trainer import Trainer
@@ -171,6 +171,50 @@ def test_parts_that_were_not_examined_do_not_stop_a_checkpoint(tiny):
     other = Refinement(held.rig, 0.1, 100)
     other.restore(tensors)
     np.testing.assert_array_equal(other.sizes, held.sizes)
+
+
+def test_training_does_not_change_settled_parts(tiny):
+    held = Refinement(rig.of(datasets.read(tiny.root).train), 0.1, 100)
+    rng = np.random.default_rng(0)
+    held.learn({part: (1.0, 1.0) for part in PARTS})
+    held.change({"camera_poses": rng.normal(0, 0.01, (held.rig.poses, 6))}, final=True)
+    held.begin(["camera_poses", "time_offsets"], rng.normal(size=(50, 3)), 0, {})
+    other = Refinement(held.rig, 0.1, 100)
+    other.restore(held.tensors())
+    for one in (held, other):
+        before = [one.correction(row) for row in range(one.rig.poses)]
+        for index in range(len(one.rig.pose_of)):
+            sign = (-1.0) ** one.rig.lens_of[index]
+            one.apply(index, 32, np.append(np.full(8, sign), np.full(6, np.nan)), 1)
+        after = [one.correction(row) for row in range(one.rig.poses)]
+        assert any(a.rotvec.any() for a in after) and any(a.time != b.time for a, b in zip(after, before, strict=True))
+        np.testing.assert_allclose([a.rotvec for a in after], [b.rotvec for b in before], atol=1e-12)
+        np.testing.assert_allclose([a.shift for a in after], [b.shift for b in before], atol=1e-12)
+
+
+@pytest.mark.parametrize("final", [True, False])
+def test_an_adjustment_to_patches_replaces_training_once_it_is_final(tiny, monkeypatch, final):
+    first, second = trial.steps(tiny_datasets.settings(*tiny_datasets.EXAMINED, *STEPS))[:2]
+    change, calls = {}, []
+
+    def adjust(trainer, points):
+        calls.append(trainer.iteration)
+        change.setdefault("camera_poses", np.random.default_rng(0).normal(0, 0.01, (trainer.refinement.rig.poses, 6)))
+        return patch_trial.Found(change if len(calls) == 1 else {"camera_poses": 0.0 * change["camera_poses"]}, final)
+
+    monkeypatch.setattr(patch_trial, "adjust", adjust)
+    rest = (f"needs.{part}=off" for part in PARTS[1:])
+    trainer = train(datasets.read(tiny.root), "needs.camera_poses=on", *rest, stop=second + 1)
+    held = trainer.refinement
+    assert calls == ([first] if final else [first, second])
+    kept = gauge.Gauge(held.rig.cameras, held.tensors()["refine.units"].numpy()).fix(change["camera_poses"])
+    found = np.array([[*held.correction(row).rotvec, *held.correction(row).shift] for row in range(held.rig.poses)])
+    assert np.allclose(found, kept, atol=1e-9) == final
+
+
+def test_pictures_that_share_too_little_adjust_nothing(tiny):
+    trainer = train(datasets.read(tiny.root), *(f"needs.{part}=off" for part in PARTS[:3]), stop=5)
+    assert patch_trial.adjust(trainer, trainer.gaussians.means.detach().numpy()) is None
 
 
 @pytest.mark.slow
