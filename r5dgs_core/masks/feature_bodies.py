@@ -19,16 +19,17 @@ from ..scene import cameras
 from .feature_points import Points, matches
 
 FITS = 3.0  # maximum distance from its pixels of a point that moves with a body, pixels
-MOVED = 6.0  # minimum distance from its pixels of a point that moves, if it stayed in place, pixels
+MIN_MOTION = 6.0  # minimum distance from its pixels of a point that moves, if it stayed in place, pixels
 HYPOTHESES = 400  # of three matches
 REFITS = 5
-FEWEST = 12  # moving points of the start of a body
-REGISTERED = 8  # points that register a time
+MIN_START = 12  # moving points of the start of a body
+MIN_REGISTERED = 8  # points that register a time
 AGREED = 0.4  # share of the matched points that must agree on the pose of a time
 GAPS = (1, 2, 4, 8)  # between the two times of the start
 NEAREST = 6  # registered times to which another one is matched
-LONG_ENOUGH = 0.25  # share of the times that must be registered
+MIN_SHARE = 0.25  # share of the times that must be registered
 MAX_BODIES = 8
+TRIALS = 32  # starts of bodies, most of which may be too short
 
 
 @dataclass
@@ -52,12 +53,12 @@ def find(times: Sequence[Points], rng: np.random.Generator) -> list[Body]:
     """Find the rigid bodies that move among the points of several times, the largest first."""
     search = _Search(times, rng)
     found: list[Body] = []
-    for _ in range(MAX_BODIES):
+    for _ in range(TRIALS):
         body = search.start()
-        if body is None:
+        if body is None or len(found) == MAX_BODIES:
             break
         search.grow(body)
-        if len(body.poses) >= LONG_ENOUGH * len(times) and search.moves(body):
+        if len(body.poses) >= MIN_SHARE * len(times) and search.moves(body):
             found.append(body)
     return found
 
@@ -82,7 +83,7 @@ class _Search:
 
     def start(self) -> Body | None:
         """Return the largest set of points with one motion between two times, or None if it is too small."""
-        best, most = None, FEWEST - 1
+        best, most = None, MIN_START - 1
         for gap in GAPS:
             for i in range(len(self._times) - gap):
                 a, b = self._moving(i, i + gap)
@@ -114,7 +115,7 @@ class _Search:
             self._extend(body, k)
 
     def moves(self, body: Body) -> bool:
-        """True if a body has several poses; a body of wrong matches in a static pattern leaves its place once only."""
+        """True if each pose differs from two others; wrong matches in a static pattern move at one time only."""
         places = body.places(self._times)
         center, reach = places.mean(0), np.linalg.norm(places - places.mean(0), axis=1).mean()
         corners = center + reach * np.concatenate([np.eye(3), -np.eye(3)])
@@ -122,7 +123,7 @@ class _Search:
         others = []
         for one in moved.values():
             off = [np.median(_distances(self._times[k], one, other)) for k, other in moved.items()]
-            others.append(np.sum(np.array(off) > MOVED))
+            others.append(np.sum(np.array(off) > MIN_MOTION))
         return min(others) >= 2
 
     def _extend(self, body: Body, k: int) -> None:
@@ -135,17 +136,17 @@ class _Search:
             places.append(undone(body.poses[r], self._times[r].places[a[mine]]))
             rows.append(b[mine])
         place, row = np.concatenate(places), np.concatenate(rows)
-        if len(row) < REGISTERED:
+        if len(row) < MIN_REGISTERED:
             return
         pose, fits = self._registered(place, k, row)
-        if len(np.unique(row[fits])) < REGISTERED or fits.mean() < AGREED:
+        if len(np.unique(row[fits])) < MIN_REGISTERED or fits.mean() < AGREED:
             return
         body.poses[k] = pose
         self._add(body, k, row[fits])
         for r in known:
             a, b = self._moving(r, k)
             moved = applied(pose, undone(body.poses[r], self._times[r].places[a]))
-            joins = self._times[k].errors(moved, b) < FITS
+            joins = self._times[k].reprojection_errors(moved, b) < FITS
             self._add(body, r, a[joins])
             self._add(body, k, b[joins])
 
@@ -159,7 +160,7 @@ class _Search:
         a, b = self._matched(i, j)
         free = ~self._taken[i][a] & ~self._taken[j][b]
         a, b = a[free], b[free]
-        moved = self._times[j].errors(self._times[i].places[a], b) > MOVED
+        moved = self._times[j].reprojection_errors(self._times[i].places[a], b) > MIN_MOTION
         return a[moved], b[moved]
 
     def _matched(self, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
@@ -185,13 +186,13 @@ class _Search:
         points = self._times[k]
         targets = points.places[rows]
         drawn = np.argsort(self._rng.random((HYPOTHESES, len(rows))), 1)[:, :3]
-        fits = points.errors(applied(_fitted(places[drawn], targets[drawn]), places), rows) < FITS
+        fits = points.reprojection_errors(applied(_fitted(places[drawn], targets[drawn]), places), rows) < FITS
         follows, pose = fits[int(fits.sum(1).argmax())], np.eye(3, 4)
         for _ in range(REFITS):
             if follows.sum() < 3:
                 break
             pose = _fitted(places[follows], targets[follows])
-            follows = points.errors(applied(pose, places), rows) < FITS
+            follows = points.reprojection_errors(applied(pose, places), rows) < FITS
         return pose, follows
 
 

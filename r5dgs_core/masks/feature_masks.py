@@ -1,13 +1,15 @@
 """Masks of the rigid bodies that move, from image features.
 
 The bodies are found at some of the times (`feature_bodies.py`). Their points are drawn at all times, with interpolated
-poses, and gaps between them are closed. Before its first and after its last pose, a body counts as absent.
+poses, and gaps between them are closed. Masks are unknown at times without a pose nearby. Long before its first pose
+and long after its last one, a body counts as absent.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from scipy.spatial import KDTree
 
 from .. import errors
 from ..data import dataset as datasets
-from ..data import mask_notes
+from ..data import mask_notes, masks
 from ..data.views import View
 from ..motion import rotations
 from ..scene import cameras
@@ -31,11 +33,13 @@ from .videos import Video
 VERSION = 1  # of the method; masks of another version are not continued
 SEED = 0
 SEARCH = 0.8  # share of the search in the progress of the first video
+EXTRACTION = 0.7  # share of the features in the progress of the search
 MAX_TIMES, MAX_CAMERAS = 64, 8  # that are searched
 DENSE = 0.2  # minimum number of neighbours of a point relative to the median; stray points have few
 NEIGHBOURHOOD = 0.05  # their maximum distance, relative to the size of the body
 CLOSED = 0.12  # radius of closed gaps, relative to the size of the body
-BEYOND = 2.0  # searched times for which a body keeps its pose before its first and after its last one
+BEYOND = 2.0  # searched times before its first pose and after its last one at which a body may be present
+NEAR = 1.01  # largest distance from a pose, in searched times, at which a pose is interpolated
 MAX_SIDE = 512  # pixels of the masks that are drawn, before they are enlarged
 
 
@@ -52,7 +56,7 @@ class _Track:
         times: Times of its poses. [K]
         quats: Rotations. [K, 4]
         centers: Positions of the mean. [K, 3]
-        margin: Time before and after the poses during which it keeps the nearest pose.
+        step: Time between two searched times. A pose is guessed further than this from all poses.
     """
 
     places: np.ndarray
@@ -60,12 +64,19 @@ class _Track:
     times: np.ndarray
     quats: np.ndarray
     centers: np.ndarray
-    margin: float
+    step: float
 
-    def at(self, t: float) -> np.ndarray | None:
-        """Return the positions of the points at a time, or None far from all poses. [P, 3]"""
-        if not self.times[0] - self.margin <= t <= self.times[-1] + self.margin:
-            return None
+    def is_present(self, t: float) -> bool:
+        """True unless a time is long before the first pose or long after the last one."""
+        margin = BEYOND * self.step
+        return self.times[0] - margin <= t <= self.times[-1] + margin
+
+    def is_guessed(self, t: float) -> bool:
+        """True if the body is present but no pose is near."""
+        return self.is_present(t) and float(np.abs(self.times - t).min()) > NEAR * self.step
+
+    def at(self, t: float) -> np.ndarray:
+        """Return the positions of the points at a time. [P, 3]"""
         t = float(np.clip(t, self.times[0], self.times[-1]))
         k = int(np.clip(np.searchsorted(self.times, t) - 1, 0, max(len(self.times) - 2, 0)))
         share = (t - self.times[k]) / (self.times[k + 1] - self.times[k])
@@ -83,13 +94,14 @@ class FeatureMasks:
         BackendError: OpenCV is not installed.
     """
 
-    name, numbering, own_names = "features", mask_notes.SCENE, None
+    name, numbering = "features", mask_notes.SCENE
 
     def __init__(self, views: Sequence[View]):
         feature_points.require()
         self._views = tuple(views)
         self._tracks: list[_Track] | None = None
-        self.made_with: dict[str, Any] = {"version": VERSION}
+        self.made_with: dict[str, Any] = {"version": VERSION, "views": _digest(views)}
+        self.own_names: Path | Mapping[int, str] | None = {}  # its ids are not those of the data set
 
     def label(self, video: Video, room: Path, report: Callable[[float], None]) -> Iterator[np.ndarray | None]:
         """Implement `make_masks.MaskBackend.label`.
@@ -118,8 +130,9 @@ def find(views: Sequence[View], report: Callable[[float], None]) -> list[_Track]
     total, found = sum(len(group) for group in groups), []
     for group in groups:
         found.append(triangulate([features(datasets.load_image_8bit(view), view.camera) for view in group]))
-        report(sum(len(one.cameras) for one in found) / total)
+        report(EXTRACTION * sum(len(one.cameras) for one in found) / total)
     made = [_track(body, found, times) for body in feature_bodies.find(found, np.random.default_rng(SEED))]
+    report(1.0)
     if not made:
         count = round(float(np.median([len(one.places) for one in found]))) if found else 0
         raise errors.DatasetError(
@@ -129,6 +142,16 @@ def find(views: Sequence[View], report: Callable[[float], None]) -> list[_Track]
         )
     _log.info("%d rigid bodies, found at %s of %d times", len(made), [len(one.times) for one in made], len(times))
     return made
+
+
+def _digest(views: Sequence[View]) -> str:
+    """Return a digest of what the search depends on; ids of another set of views differ."""
+    hasher = hashlib.sha256()
+    for view in views:
+        camera = view.camera
+        hasher.update(f"{view.name} {view.t!r} {camera.width} {camera.height}".encode())
+        hasher.update(camera.T_cam_world.tobytes() + camera.intrinsics.tobytes())
+    return hasher.hexdigest()[:16]
 
 
 def _moments(views: Sequence[View]) -> tuple[np.ndarray, list[list[View]]]:
@@ -164,22 +187,22 @@ def _track(body: feature_bodies.Body, found: Sequence[Points], times: np.ndarray
     poses, center = np.array([body.poses[k] for k in known]), places.mean(0)
     quats = rotations.make_continuous(rotations.rotmats_to_quats(poses[:, :, :3]))
     centers = poses[:, :, :3] @ center + poses[:, :, 3]
-    margin = BEYOND * float(np.median(np.diff(times)))
-    return _Track(places - center, size, times[known], quats, centers, margin)
+    return _Track(places - center, size, times[known], quats, centers, spacing(times))
 
 
 def _drawn(tracks: Sequence[_Track], camera: Camera, t: float) -> np.ndarray:
-    """Draw the masks of the bodies at a time, near ones over far ones. [H, W] uint8"""
+    """Draw the masks of the bodies at a time, near ones over far ones; unknown if a pose is guessed. [H, W]"""
     import cv2
 
+    if any(track.is_guessed(t) for track in tracks):
+        return np.full((camera.height, camera.width), masks.UNKNOWN, np.uint16)
     factor = min(1.0, MAX_SIDE / max(camera.width, camera.height))
     small = cameras.resize(camera, max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
     layers = []
     for number, track in enumerate(tracks, 1):
-        places = track.at(t)
-        if places is None:
+        if not track.is_present(t):
             continue
-        pixels, depths = cameras.project(small, places)
+        pixels, depths = cameras.project(small, track.at(t))
         seen = np.isfinite(pixels[:, 0])
         if seen.mean() < 0.5:
             continue

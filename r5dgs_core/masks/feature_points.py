@@ -59,15 +59,15 @@ class Points:
     owners: np.ndarray
     descriptors: np.ndarray
 
-    def errors(self, places: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Return the largest distance from the pixels of points if they were at other places, pixels.
+    def reprojection_errors(self, places: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Return the largest distance between projections of points and their pixels, over the cameras.
 
         Args:
-            places: Positions in the world. [..., C, 3]
-            rows: The points. [C]
+            places: Positions of the points in the world. [..., C, 3]
+            rows: The points whose pixels are compared. [C]
 
         Returns:
-            Distances, infinite behind a camera. [..., C]
+            Distances in pixels, infinite behind a camera. [..., C]
         """
         worst = np.zeros(places.shape[:-1])
         for v, camera in enumerate(self.cameras):
@@ -118,7 +118,7 @@ def triangulate(found: Sequence[Features]) -> Points:
     seen = [one.camera for one in found]
     places, angles = _nearest_to_rays(seen, pixels)
     points = Points(seen, places, pixels, owners[rows], np.concatenate([one.descriptors for one in found])[rows])
-    sound = (points.errors(places) < EPIPOLAR) & (angles > PARALLAX)
+    sound = (points.reprojection_errors(places) < EPIPOLAR) & (angles > PARALLAX)
     kept = sound[points.owners]
     return Points(seen, places[sound], pixels[sound], _ranks(sound)[points.owners[kept]], points.descriptors[kept])
 
@@ -159,7 +159,7 @@ def _mutual(likeness: np.ndarray, owners: np.ndarray) -> tuple[np.ndarray, np.nd
     rows, best = np.arange(len(likeness)), likeness.argmax(1)
     first = likeness[rows, best]
     second = np.where(owners[None, :] == owners[best][:, None], -1, likeness).max(1)
-    nearer = np.sqrt(np.maximum(2 - 2 * first, 0)) < RATIO * np.sqrt(2 - 2 * second)
+    nearer = np.sqrt(np.maximum(2 - 2 * first, 0)) < RATIO * np.sqrt(np.maximum(2 - 2 * second, 0))
     good = (likeness.argmax(0)[best] == rows) & (first > 0) & nearer
     return rows[good], best[good]
 

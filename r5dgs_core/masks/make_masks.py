@@ -96,7 +96,7 @@ def make(
         BackendError: The backend fails.
     """
     folder = Path(folder)
-    notes = _begin(views, backend, folder, overwrite)
+    notes, is_new = _begin(views, backend, folder, overwrite)
     every = videos.of(views)
     todo = [video for video in every if not _is_done(video, notes, folder)]
     notes = dataclasses.replace(
@@ -105,6 +105,11 @@ def make(
     count = _Count()
 
     def keep(view: datasets.View, ids: np.ndarray | None) -> None:
+        nonlocal is_new
+        if is_new:  # not before the first mask: a backend that finds nothing leaves the folder as it was
+            mask_notes.write(notes, folder)
+            _remove(folder / OBJECTS)  # names of the replaced ids
+            is_new = False
         path = folder / f"{view.name}.png"
         if ids is None:
             _remove(path)  # a mask of an earlier set would be read with these
@@ -201,8 +206,10 @@ def _write_names(notes: mask_notes.MaskNotes, own_names: Path | Mapping[int, str
         raise errors.DatasetError(f"{path}: cannot be written: {error}") from error
 
 
-def _begin(views: Sequence[datasets.View], backend: MaskBackend, folder: Path, overwrite: bool) -> mask_notes.MaskNotes:
-    """Return the notes to continue: those of the folder if they match the backend, else new ones."""
+def _begin(
+    views: Sequence[datasets.View], backend: MaskBackend, folder: Path, overwrite: bool
+) -> tuple[mask_notes.MaskNotes, bool]:
+    """Return the notes to continue, those of the folder if they match the backend, and True if they are new."""
     fresh = mask_notes.MaskNotes(
         backend=backend.name, numbering=backend.numbering, finished=False, made_with=backend.made_with
     )
@@ -211,7 +218,7 @@ def _begin(views: Sequence[datasets.View], backend: MaskBackend, folder: Path, o
         notes = mask_notes.read(folder)
         known, wanted = ({**one.made_with, "numbering": one.numbering} for one in (notes, fresh))
         if notes.backend == fresh.backend and known == wanted:
-            return dataclasses.replace(notes, finished=False)
+            return dataclasses.replace(notes, finished=False), False
         changed = [key for key in {**wanted, **known} if known.get(key) != wanted.get(key)]
         other = repr(notes.backend) if notes.backend else "an unknown backend"
         if notes.backend == backend.name:
@@ -229,9 +236,7 @@ def _begin(views: Sequence[datasets.View], backend: MaskBackend, folder: Path, o
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise errors.DatasetError(f"{folder}: cannot be created: {error}") from error
-    mask_notes.write(fresh, folder)
-    _remove(folder / OBJECTS)  # names of the replaced ids
-    return fresh
+    return fresh, True
 
 
 def _remove(path: Path) -> None:

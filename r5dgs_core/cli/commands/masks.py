@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 NAME = "masks"
 SHORT = "make or check the masks of the training images"
-LONG = (
-    "Make object masks with image features, SAM2 or SAM3, convert masks of another program, or check the masks of a\n"
-    "data set."
-)
+LONG = "Make object masks from image features or with SAM2 or SAM3, convert masks, or check those of a data set."
 EXAMPLE = "DATA --backend sam2 --model SAM2_FOLDER"
 PAGE = "user/masks.md"
 

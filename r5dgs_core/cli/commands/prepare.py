@@ -179,8 +179,7 @@ def run_prepare(
             progress({"event": "prepared", "path": str(out)})
     if progress_kind == "auto":
         terminal.print_lines(summary(made))
-    _make_masks(made, masks, {"model": model, "words": words}, progress_kind)
-    _check_capture(made, progress_kind)
+    _complete(made, masks, {"model": model, "words": words}, progress_kind)
     return made
 
 
@@ -194,11 +193,27 @@ def _check(window: dict[str, Any], source: Path, calibration: Path | None) -> No
 
 
 def _check_masks(masks: str, model: Path | None, words: str | None) -> None:
-    """Raise UsageError for options that the choice of masks does not use."""
+    """Raise UsageError for options that the choice of masks does not use, and BackendError without its packages."""
     if words is not None and masks != "sam3":
         raise errors.UsageError(f"--words {words}: applies to --masks sam3, found --masks {masks}")
     if model is not None and masks not in ("sam2", "sam3"):
         raise errors.UsageError(f"--model {model}: applies to --masks sam2 and sam3, found --masks {masks}")
+    if masks == "features":
+        from ...masks import feature_points
+
+        feature_points.require()
+
+
+def _complete(plan: Plan, masks: str, given: dict[str, Any], progress_kind: str) -> None:
+    """Write the masks, and check the capture, also if image features show no object."""
+    try:
+        _make_masks(plan, masks, given, progress_kind)
+    except errors.DatasetError as error:
+        if masks != "features":
+            raise
+        _check_capture(plan, progress_kind)
+        raise errors.DatasetError(f"{error}. The data set without masks is complete") from error
+    _check_capture(plan, progress_kind)
 
 
 def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: str) -> None:

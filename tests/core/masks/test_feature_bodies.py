@@ -1,10 +1,12 @@
 """Rigid bodies among matched points."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 from r5dgs_core.masks import feature_bodies as bodies
-from r5dgs_core.masks.feature_points import Points
+from r5dgs_core.masks.feature_points import Points, matches
 from r5dgs_core.motion import rotations
 from r5dgs_core.scene.cameras import Camera, project
 from tests.support.room import look_at
@@ -76,3 +78,11 @@ def test_a_body_must_be_registered_at_enough_times(moments):
     rng = np.random.default_rng(2)
     empty = [seen(rng.uniform(-1, 1, (30, 3)), rng.integers(1000, 9999, 30), rng) for _ in range(40)]
     assert bodies.find(times + empty, np.random.default_rng(0)) == []
+
+
+def test_equal_descriptors_do_not_match_and_cause_no_warning():
+    same = np.full((4, 128), np.sqrt(np.float32(1 / 127)), np.float32)  # the product is above 1
+    points = Points(CAMERAS, np.zeros((4, 3)), np.zeros((4, 3, 2)), np.arange(4), same)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(matches(points, points)[0]) == 0

@@ -1,6 +1,7 @@
 """Masks of rigid bodies from image features."""
 
 import json
+import sys
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from r5dgs_core import errors
 from r5dgs_core.cli.commands import masks as cli_masks
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.data import images, mask_notes
+from r5dgs_core.data import images, mask_notes, masks
 from r5dgs_core.masks import feature_masks, feature_points
 from r5dgs_core.scene import cameras
 from tests.support import board_films
@@ -72,9 +73,63 @@ def test_finished_masks_are_kept_and_equal_new_ones(masked, tmp_path):
 
 
 @pytest.mark.parametrize(("moments", "count"), [((2, 2, 2), 3), ((0, 1, 2), 1), ((4,), 3)])
-def test_data_without_a_moving_body_is_refused(moments, count, tmp_path):
+def test_data_without_a_moving_body_is_refused_and_gets_no_masks(moments, count, tmp_path):
+    data = written(tmp_path, moments, count)
     with pytest.raises(errors.DatasetError, match=r"no rigid body moves.*Remedy"):
-        cli_masks.run_masks(written(tmp_path, moments, count), backend="features")
+        cli_masks.run_masks(data, backend="features")
+    assert list((data / "object_mask").iterdir()) == []
+
+
+def test_a_search_without_result_keeps_other_masks(masked, tmp_path):
+    data = written(tmp_path, (2, 2, 2))
+    for view in datasets.read(data).train:
+        images.write_png(data / "object_mask" / f"{view.name}.png", np.ones(SIZE[::-1], np.uint8))
+    (data / "object_mask" / "objects.json").write_text('{"1": "mug"}')
+    before = {path: path.read_bytes() for path in (data / "object_mask").rglob("*") if path.is_file()}
+    with pytest.raises(errors.DatasetError, match="no rigid body moves"):
+        cli_masks.run_masks(data, backend="features", overwrite=True)
+    assert {path: path.read_bytes() for path in (data / "object_mask").rglob("*") if path.is_file()} == before
+
+
+def test_names_of_the_data_set_are_not_those_of_found_objects(tmp_path):
+    data = written(tmp_path, range(4))
+    (data / "objects.json").write_text('{"1": "mug", "2": "robot"}')
+    cli_masks.run_masks(data, backend="features")
+    assert datasets.read(data).object_names == {1: "object 1"}
+
+
+def test_masks_of_other_views_are_not_continued(tmp_path):
+    cli_masks.run_masks(written(tmp_path, range(4), 2), backend="features")
+    with pytest.raises(errors.DatasetError, match=r"other settings \(views\)"):
+        cli_masks.run_masks(written(tmp_path, range(4), 3), backend="features")
+
+
+def test_missing_opencv_is_reported(carried, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(errors.BackendError, match=r"--backend features: .*r5dgs\[prepare\]"):
+        cli_masks.run_masks(carried, backend="features", out=tmp_path)
+
+
+def track(times, step):
+    """A point that moves along x."""
+    count = len(times)
+    centers = np.array([[0.1 * t, 0.0, 0.0] for t in times])
+    return feature_masks._Track(
+        np.zeros((1, 3)), 0.1, np.array(times), np.tile([1.0, 0, 0, 0], (count, 1)), centers, step
+    )
+
+
+def test_poses_are_interpolated_between_neighbours_only():
+    body = track([1.0, 2.0, 5.0, 6.0], 1.0)
+    np.testing.assert_allclose(body.at(1.25), [[0.125, 0, 0]])
+    np.testing.assert_allclose(body.at(0.0), [[0.1, 0, 0]])
+    assert [body.is_guessed(t) for t in (0.0, 1.5, 3.0, 3.5, 6.5, 7.5)] == [False, False, False, True, False, True]
+    assert [body.is_present(t) for t in (-1.5, -0.5, 3.5, 8.0, 8.5)] == [False, True, True, True, False]
+
+
+def test_images_of_guessed_poses_are_unknown(carried):
+    camera = datasets.read(carried).train[0].camera
+    assert (feature_masks._drawn([track([1.0, 2.0, 5.0], 1.0)], camera, 3.5) == masks.UNKNOWN).all()
 
 
 def test_times_between_those_that_are_searched_have_interpolated_masks(carried, monkeypatch):
@@ -82,7 +137,8 @@ def test_times_between_those_that_are_searched_have_interpolated_masks(carried, 
     views = datasets.read(carried).train
     backend = feature_masks.FeatureMasks(views)
     for video in feature_masks.videos.of(views):
-        assert all((mask == 1).any() for mask in backend.label(video, carried, lambda share: None))
+        for view, mask in zip(video.views, backend.label(video, carried, lambda share: None), strict=True):
+            assert (mask == 1).any(), view.name
 
 
 def test_large_images_are_reduced(carried, monkeypatch, tmp_path):

@@ -195,7 +195,7 @@ def test_masks_of_another_shape_are_named_before_anything_is_written(copied, tmp
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"backend": "deva"}, "--backend deva: expected one of precomputed, blender, sam2"),
+        ({"backend": "deva"}, "--backend deva: expected one of precomputed, blender, features, sam2"),
         ({"backend": "sam2"}, "--backend sam2: name the folder of the model with --model"),
         ({"model": "m"}, "--model: does not apply to --backend precomputed"),
         ({"points": 8}, "--points: does not apply to --backend precomputed"),

@@ -96,6 +96,13 @@ def test_a_folder_among_the_recordings_is_refused(capture):
             prepared(capture, out)
 
 
+def test_a_capture_without_features_is_complete_but_for_its_masks(capture, tmp_path):
+    with pytest.raises(errors.DatasetError, match=r"no rigid body moves.*The data set without masks is complete"):
+        prepared(capture, tmp_path / "data", masks="features")
+    assert "checks" in json.loads((tmp_path / "data" / "capture.json").read_text())
+    assert all(view.mask_path is None for view in dataset.read(tmp_path / "data").train)
+
+
 def test_masks_of_the_frames_are_undistorted_like_them(capture, tmp_path):
     folder = tmp_path / "masks"
     for name in ("cam0", "cam1", "cam2"):
