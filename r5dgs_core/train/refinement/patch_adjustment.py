@@ -17,7 +17,7 @@ import numpy as np
 from ...scene.camera_correction import COUNT, POSE, TIME, Correction
 from ...scene.cameras import Camera
 from . import patches
-from .patches import HOST, SHAPE, TARGET, Placed, Sight
+from .patches import HOST, SHAPE, TARGET, DepthView, Placed
 
 FIRST, ROUNDS = 3, 8  # iterations of the planes alone, and of everything
 ALIKE = (0.5, 0.8)  # least correlation of a pair that counts, in these
@@ -74,11 +74,11 @@ class _Equations:
     deviation: float
 
 
-def adjust(sights: Sequence[Sight], rig: Cameras, each: int, *, clocks: bool) -> Adjusted | None:
+def adjust(depth_views: Sequence[DepthView], rig: Cameras, each: int, *, clocks: bool) -> Adjusted | None:
     """Adjust the cameras to the patches of their pictures.
 
     Args:
-        sights: The pictures.
+        depth_views: The pictures.
         rig: Their cameras.
         each: Number of patches of a picture, at most.
         clocks: True to adjust the clocks, too.
@@ -86,7 +86,7 @@ def adjust(sights: Sequence[Sight], rig: Cameras, each: int, *, clocks: bool) ->
     Returns:
         The change; None if a camera shares too few patches with the others.
     """
-    work = _Work(sights, rig, each, clocks)
+    work = _Work(depth_views, rig, each, clocks)
     if not work.connected():
         return None
     for count, alike in zip((FIRST, ROUNDS), ALIKE, strict=True):
@@ -104,15 +104,17 @@ def adjust(sights: Sequence[Sight], rig: Cameras, each: int, *, clocks: bool) ->
 class _Work:
     """State of an adjustment."""
 
-    def __init__(self, sights: Sequence[Sight], rig: Cameras, each: int, clocks: bool):
-        self._sights, self._rig = sights, rig
+    def __init__(self, depth_views: Sequence[DepthView], rig: Cameras, each: int, clocks: bool):
+        self._depth_views, self._rig = depth_views, rig
         self._corrections = list(rig.corrections)
-        self.found = patches.find(sights, [c.camera(g) for c, g in zip(rig.corrections, rig.given, strict=True)], each)
+        self.found = patches.find(
+            depth_views, [c.camera(g) for c, g in zip(rig.corrections, rig.given, strict=True)], each
+        )
         self._planes = self.found.planes.copy()
         self._columns = EACH if clocks else EACH - 1
         self._active = np.ones(len(self.found.patch), bool)
         self._deviation = 0.0
-        pose_of = np.array([one.pose for one in sights])
+        pose_of = np.array([one.pose for one in depth_views])
         places = pose_of[self.found.host[self.found.patch]], pose_of[self.found.target]
         self._places = [EACH * place[:, None] + np.arange(EACH) for place in places]
         count = EACH * len(rig.given)
@@ -135,7 +137,7 @@ class _Work:
 
     def equations(self, alike: float) -> _Equations:
         """Return the normal equations of all pairs, 0 for those that are less than ``alike``."""
-        placed = [self._placed(one) for one in self._sights]
+        placed = [self._placed(one) for one in self._depth_views]
         size = SHAPE.stop
         matrix, vector = np.zeros((len(self.found.patch), size, size)), np.zeros((len(self.found.patch), size))
         host, target = self.found.host[self.found.patch], self.found.target
@@ -159,7 +161,7 @@ class _Work:
         self._deviation = 1.4826 * float(np.median(every)) + 1e-4 if len(every) else 1.0
         return _Equations(matrix, vector, self._deviation)
 
-    def _placed(self, one: Sight) -> Placed:
+    def _placed(self, one: DepthView) -> Placed:
         correction = self._corrections[one.pose]
         given = self._rig.given[one.pose]
         return Placed(one, correction.camera(given), np.asarray(correction.shift), one.t + correction.time)

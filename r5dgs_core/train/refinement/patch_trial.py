@@ -19,7 +19,7 @@ from ..train_views import TrainView
 from ..trainer import Trainer
 from . import agreement, gauge, patch_adjustment, patches
 from .patch_adjustment import Cameras
-from .patches import Sight
+from .patches import DepthView
 from .refinement import CLOCKS, POSES
 
 log = logging.getLogger(__name__)
@@ -60,11 +60,11 @@ def adjust(trainer: Trainer, points: np.ndarray) -> Found | None:
     rig, step = refinement.rig, spacing(trainer.times)
     if rig.poses != rig.lenses or rig.poses > MOST_POSES:
         return None
-    sights = _sights(trainer)
+    depth_views = _depth_views(trainer)
     corrections = [refinement.correction(row) for row in range(rig.poses)]
     units = np.stack([gauge.pixel_units(camera, points) for camera in rig.cameras])
     cameras = Cameras(rig.cameras, corrections, units, step)
-    each = max(1, PATCHES // max(1, len(sights)))
+    each = max(1, PATCHES // max(1, len(depth_views)))
 
     def size(part: str, first: np.ndarray, second: np.ndarray) -> float:
         return agreement.agreed(part, rig.cameras, first, second, points, step)
@@ -72,13 +72,13 @@ def adjust(trainer: Trainer, points: np.ndarray) -> Found | None:
     parts = [POSES]
     found = None
     if config.needs.time_offsets != "off" and len(trainer.times) > 3:
-        found = patch_adjustment.adjust(sights, cameras, each, clocks=True)
+        found = patch_adjustment.adjust(depth_views, cameras, each, clocks=True)
         late = 0.0 if found is None else size(CLOCKS, *found.halves)
         if late > config.refine.intervals:
             parts.append(CLOCKS)
             refinement.learn({CLOCKS: (late, math.nan)})
     if len(parts) == 1:
-        found = patch_adjustment.adjust(sights, cameras, each, clocks=False)
+        found = patch_adjustment.adjust(depth_views, cameras, each, clocks=False)
     if found is None or size(POSES, *found.halves) <= config.refine.pixels:
         return None
     changes = {POSES: found.changes[:, POSE], CLOCKS: found.changes[:, TIME.start]}
@@ -87,7 +87,7 @@ def adjust(trainer: Trainer, points: np.ndarray) -> Found | None:
     return Found({part: changes[part] for part in parts}, moved <= FAR)
 
 
-def _sights(trainer: Trainer) -> list[Sight]:
+def _depth_views(trainer: Trainer) -> list[DepthView]:
     """Return pictures of all cameras at some times."""
     rig, step = trainer.refinement.rig, spacing(trainer.times)
     series = []
@@ -100,12 +100,12 @@ def _sights(trainer: Trainer) -> list[Sight]:
         for row, views in enumerate(series):
             at = int(np.argmin([abs(view.t - t) for view in views]))
             if abs(views[at].t - t) <= NEAR * step:
-                found.append(_sight(trainer, row, moment, views, at))
+                found.append(_depth_view(trainer, row, moment, views, at))
     return found
 
 
 @torch.no_grad()
-def _sight(trainer: Trainer, row: int, moment: int, views: Sequence[TrainView], at: int) -> Sight:
+def _depth_view(trainer: Trainer, row: int, moment: int, views: Sequence[TrainView], at: int) -> DepthView:
     view, correction = views[at], trainer.refinement.correction(row)
     camera, t = correction.camera(view.camera), view.t + correction.time
     splats = trainer.splats(camera, t)
@@ -124,4 +124,4 @@ def _sight(trainer: Trainer, row: int, moment: int, views: Sequence[TrainView], 
     if 0 < at < len(views) - 1 and views[at + 1].t - views[at - 1].t <= 2 * reach:
         beside = [views[at - 1], views[at + 1]]
     images = [correction.unseen(one.image / np.float32(255)) for one in (beside[0], view, beside[1])]
-    return patches.sight(row, moment, view.t, images, beside[1].t - beside[0].t, to_host(drawn.depth), known)
+    return patches.depth_view(row, moment, view.t, images, beside[1].t - beside[0].t, to_host(drawn.depth), known)

@@ -36,7 +36,7 @@ PLANE = np.concatenate([np.ones((len(OFFSETS), 1)), OFFSETS], 1)  # [N, 3]
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class DepthView:
     """An image and the depth of the scene in it.
 
     Attributes:
@@ -54,13 +54,13 @@ class Sight:
     inverse: np.ndarray
 
 
-def sight(
+def depth_view(
     pose: int, moment: int, t: float, images: Sequence[np.ndarray], span: float, depth: np.ndarray, known: np.ndarray
-) -> Sight:
-    """Return a sight.
+) -> DepthView:
+    """Return an image with its slopes and the depth of the scene.
 
     Args:
-        pose, moment, t: As in `Sight`.
+        pose, moment, t: As in `DepthView`.
         images: The previous image, the image, and the next one, in the scene's colours. [H, W, 3] each
         span: Time between the previous and the next image; 0 if there are none.
         depth: Depth of the scene. [H, W]
@@ -72,7 +72,7 @@ def sight(
     layers = np.concatenate([image, by_x, by_y, by_time], axis=2).transpose(2, 0, 1)
     usable = known & ~_uneven(before, image, after)
     inverse = np.where(usable, 1 / np.maximum(depth, 1e-6), 0.0)
-    return Sight(pose, moment, t, np.ascontiguousarray(layers, np.float32), inverse)
+    return DepthView(pose, moment, t, np.ascontiguousarray(layers, np.float32), inverse)
 
 
 def _uneven(before: np.ndarray, image: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -89,11 +89,11 @@ class Patches:
     """Patches and the pictures that show them.
 
     Attributes:
-        host: Sight in which a patch is square. [P]
+        host: Image in which a patch is square. [P]
         centers: Its centre there, px. [P, 2]
         planes: Its inverse depth, which fits change. [P, 3]
         patch: Patch of each pair. [M]
-        target: Other sight of each pair. [M]
+        target: Other image of each pair. [M]
     """
 
     host: np.ndarray
@@ -103,26 +103,26 @@ class Patches:
     target: np.ndarray
 
 
-def find(sights: Sequence[Sight], rig: Sequence[Camera], each: int) -> Patches:
+def find(depth_views: Sequence[DepthView], rig: Sequence[Camera], each: int) -> Patches:
     """Choose patches with contrast on surfaces, and pair them with the pictures that show them.
 
     Args:
-        sights: The pictures.
+        depth_views: The pictures.
         rig: Present camera of each pose.
         each: Number of patches of a picture, at most.
     """
-    chosen = [_chosen(one, each) for one in sights]
+    chosen = [_chosen(one, each) for one in depth_views]
     host = np.concatenate([np.full(len(centers), k) for k, (centers, _) in enumerate(chosen)])
     centers, planes = (np.concatenate([one[k] for one in chosen]) for k in (0, 1))
     patch, target = [], []
-    for k, one in enumerate(sights):
+    for k, one in enumerate(depth_views):
         mine = np.flatnonzero(host == k)
         points = in_world(rig[one.pose], centers[mine], planes[mine, 0])
         ahead = rig[one.pose].forward
-        others = [j for j, other in enumerate(sights) if j != k and other.moment == one.moment]
+        others = [j for j, other in enumerate(depth_views) if j != k and other.moment == one.moment]
         count = np.zeros(len(mine), int)
-        for j in sorted(others, key=lambda j: float(-ahead @ rig[sights[j].pose].forward)):
-            seen = _shown(sights[j], rig[sights[j].pose], points) & (count < NEIGHBOURS)
+        for j in sorted(others, key=lambda j: float(-ahead @ rig[depth_views[j].pose].forward)):
+            seen = _shown(depth_views[j], rig[depth_views[j].pose], points) & (count < NEIGHBOURS)
             count += seen
             patch.append(mine[seen])
             target.append(np.full(int(seen.sum()), j))
@@ -130,7 +130,7 @@ def find(sights: Sequence[Sight], rig: Sequence[Camera], each: int) -> Patches:
     return Patches(host, centers, planes, np.concatenate([empty, *patch]), np.concatenate([empty, *target]))
 
 
-def _chosen(one: Sight, most: int) -> tuple[np.ndarray, np.ndarray]:
+def _chosen(one: DepthView, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Return centres [P, 2] and planes [P, 3] of the patches of a picture, those with the most contrast first."""
     by_x, by_y = one.layers[3:6], one.layers[6:9]
     size = 2 * RADIUS + 1
@@ -153,7 +153,7 @@ def _chosen(one: Sight, most: int) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([x, y], 1)[flat] + 0.5, planes[flat]
 
 
-def _shown(one: Sight, camera: Camera, points: np.ndarray) -> np.ndarray:
+def _shown(one: DepthView, camera: Camera, points: np.ndarray) -> np.ndarray:
     """True for points that are inside a picture and not hidden there. [P]"""
     pixels, depth = cameras.project(camera, points)
     height, width = one.inverse.shape
@@ -182,13 +182,13 @@ class Placed:
     """A picture with the present state of its camera.
 
     Attributes:
-        sight: The picture.
+        depth_view: The picture.
         camera: Corrected camera.
         pivot: Fixed point of its rotation, camera frame. [3]
         t: Corrected time.
     """
 
-    sight: Sight
+    depth_view: DepthView
     camera: Camera
     pivot: np.ndarray
     t: float
@@ -213,10 +213,12 @@ def differences(
     focal = np.diag(target.camera.intrinsics)[:2]
     x, y = (p[..., :2] / z[..., None] * focal + target.camera.intrinsics[:2, 2] - 0.5).transpose(2, 0, 1)
     at = np.stack([y, x])
-    layers = np.stack([ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in target.sight.layers], -1)
+    layers = np.stack(
+        [ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in target.depth_view.layers], -1
+    )
     shown, by_x, by_y, by_time = np.split(layers, 4, axis=-1)  # [M, N, 3] each
     col, row = (pixels - 0.5).astype(int).transpose(2, 0, 1)
-    own = host.sight.layers[:, row, col].transpose(1, 2, 0)
+    own = host.depth_view.layers[:, row, col].transpose(1, 2, 0)
     shown = shown + by_time * (host.t - target.t)
     shown, wanted = (one - one.mean(1, keepdims=True) for one in (shown, own[..., :3]))
     power = (shown**2).sum((1, 2)) * (wanted**2).sum((1, 2))

@@ -35,14 +35,14 @@ def drawn(camera, t):
 
 
 @functools.cache
-def sights(late=(0.0,) * 5, contrast=1.0):
+def depth_views(late=(0.0,) * 5, contrast=1.0):
     """Pictures of the true cameras with clocks that are late, and the true depths."""
     found = []
     for moment, t in enumerate(np.linspace(0.1, 0.6, MOMENTS)):
         for pose, camera in enumerate(RIG):
             images = [0.5 + contrast * (drawn(camera, t + late[pose] + h)[0] - 0.5) for h in (-STEP, 0, STEP)]
             depth = drawn(camera, t)[1]
-            found.append(patches.sight(pose, moment, t, images, 2 * STEP, depth, np.ones((SIZE, SIZE), bool)))
+            found.append(patches.depth_view(pose, moment, t, images, 2 * STEP, depth, np.ones((SIZE, SIZE), bool)))
     return found
 
 
@@ -77,7 +77,7 @@ def corrected(given, changes):
 
 
 def test_slopes_are_those_of_the_differences():
-    seen = sights()
+    seen = depth_views()
     found = patches.find(seen, RIG, EACH)
     pair = int(np.flatnonzero(found.target != found.host[found.patch])[7])
     here = found.patch[pair : pair + 1]
@@ -103,7 +103,7 @@ def test_slopes_are_those_of_the_differences():
 def test_wrong_poses_and_clocks_are_found_together():
     late = STEP * np.array([0.2, -0.15, 0.1, -0.25, 0.1])
     given = moved(0.5, 5)
-    found = adjusted(sights(tuple(late)), given)
+    found = adjusted(depth_views(tuple(late)), given)
     assert error(given) > 0.3
     assert error(corrected(given, found.changes)) < 0.1
     off = found.changes[:, TIME.start] - late
@@ -114,7 +114,7 @@ def test_wrong_poses_and_clocks_are_found_together():
 
 
 def test_exact_cameras_need_no_correction():
-    found = adjusted(sights(), RIG)
+    found = adjusted(depth_views(), RIG)
     assert error(corrected(RIG, found.changes)) < 0.1
     limits = RefineSection()
     assert agreement.agreed(POSES, RIG, *found.halves, POINTS, STEP) < limits.pixels
@@ -123,15 +123,15 @@ def test_exact_cameras_need_no_correction():
 
 def test_clocks_stay_unless_they_are_wanted():
     late = STEP * np.array([0.2, -0.15, 0.1, -0.25, 0.1])
-    assert not adjusted(sights(tuple(late)), RIG, clocks=False).changes[:, TIME].any()
+    assert not adjusted(depth_views(tuple(late)), RIG, clocks=False).changes[:, TIME].any()
 
 
 def test_pictures_without_contrast_adjust_nothing():
-    assert adjusted(sights(contrast=1e-3), RIG) is None
+    assert adjusted(depth_views(contrast=1e-3), RIG) is None
 
 
 def test_hidden_patches_are_not_compared():
-    seen = sights()
+    seen = depth_views()
     hidden = [dataclasses.replace(one, inverse=one.inverse * (1.1 if one.pose == 2 else 1.0)) for one in seen]
     found = patches.find(hidden, RIG, EACH)
     with_2 = [{hidden[a].pose, hidden[b].pose} for a, b in zip(found.host[found.patch], found.target, strict=True)]
