@@ -124,7 +124,7 @@ export class Model {
     return [...sizes].sort((a, b) => b[1] - a[1])[0]?.[0];
   }
 
-  // Whether a group is in the scene at a scene time.
+  // Returns true if a group is in the scene at a scene time.
   isThere(group: Group, t: number): boolean {
     return !group.absent?.some(([first, last]) => (first ?? -Infinity) <= t && t < (last ?? Infinity));
   }
