@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..motion import rotations
+from ..motion import rigid_path
 from ..scene import cameras
 from .feature_points import Points, matches
 
@@ -54,8 +54,8 @@ def find(times: Sequence[Points], rng: np.random.Generator) -> list[Body]:
     search = _Search(times, rng)
     found: list[Body] = []
     for _ in range(TRIALS):
-        body = search.start()
-        if body is None or len(found) == MAX_BODIES:
+        body = search.start() if len(found) < MAX_BODIES else None
+        if body is None:
             break
         search.grow(body)
         if len(body.poses) >= MIN_SHARE * len(times) and search.moves(body):
@@ -197,10 +197,9 @@ class _Search:
 
 
 def _fitted(places: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return the poses that move points to others best (least squares, Kabsch). [..., C, 3] each -> [..., 3, 4]"""
-    before, after = places.mean(-2, keepdims=True), targets.mean(-2, keepdims=True)
-    turns = rotations.nearest_rotmats(np.swapaxes(targets - after, -1, -2) @ (places - before))
-    return np.concatenate([turns, np.swapaxes(after, -1, -2) - turns @ np.swapaxes(before, -1, -2)], -1)
+    """Return the poses that move points to others best (least squares). [..., C, 3] each -> [..., 3, 4]"""
+    found = rigid_path.fit(np.stack([places, targets], -2), np.ones(places.shape[:-1]), 0)
+    return np.concatenate([found.rotmats[..., 1, :, :], found.shifts[..., 1, :, None]], -1)
 
 
 def _distances(points: Points, one: np.ndarray, other: np.ndarray) -> np.ndarray:

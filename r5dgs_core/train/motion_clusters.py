@@ -11,14 +11,13 @@ Notation: R points, S times, H proposals, K neighbours.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
-from ..motion import rotations
+from ..motion.rigid_path import RigidPath, fit
 
 SHARE = 0.12  # allowed residual / travel of a point; fields bend rigid motions slightly
 PROPOSALS = 48  # per part
@@ -30,19 +29,6 @@ MERGE_INLIERS = 0.7  # minimum share of inliers in both parts for a merge
 MERGE_FACTOR = 1.5  # factor on the allowed residual for a merge
 ATTACH_FACTOR = 1.5  # factor on the allowed residual for points that are added at the end
 MAX_POINTS = 4000  # maximum number of sampled points
-
-
-@dataclass(frozen=True)
-class RigidPath:
-    """Rigid motion x -> R_s x + t_s of points at the reference time: rotations [S, 3, 3] and shifts [S, 3]."""
-
-    rotmats: np.ndarray
-    shifts: np.ndarray
-
-    def residuals(self, paths: np.ndarray, reference: int) -> np.ndarray:
-        """Return the root mean squared distance over time of points from this motion. [R, S, 3] -> [R]"""
-        put = np.einsum("sij,rj->rsi", self.rotmats, paths[:, reference]) + self.shifts
-        return np.sqrt(((put - paths) ** 2).sum(-1).mean(-1))
 
 
 def find(paths: np.ndarray, weights: np.ndarray, tolerance: float, fewest: int, rng: np.random.Generator) -> np.ndarray:
@@ -89,26 +75,6 @@ def attach(paths: np.ndarray, weights: np.ndarray, tolerance: float, labels: np.
         rows = labels == part
         motions.append(fit(paths[rows], weights[rows], reference) if rows.sum() > 3 else None)
     return _attached(paths, _allowed(paths, tolerance), reference, labels, motions)
-
-
-def fit(paths: np.ndarray, weights: np.ndarray, reference: int) -> RigidPath:
-    """Fit rigid motions from the points at one time to those at each time (least squares, Kabsch).
-
-    Args:
-        paths: Positions over time. [..., R, S, 3]
-        weights: Weights of the points, with a positive sum. [..., R]
-        reference: Index of the time at which the motion starts.
-
-    Returns:
-        The motion, with the leading dimensions of ``paths``.
-    """
-    share = (weights / weights.sum(-1, keepdims=True))[..., None, None]
-    centers = (share * paths).sum(-3)  # [..., S, 3]
-    arms = paths - centers[..., None, :, :]
-    spread = np.einsum("...rsi,...rj->...sij", share * arms, arms[..., reference, :])
-    rotmats = rotations.nearest_rotmats(spread)
-    home = centers[..., reference, :]
-    return RigidPath(rotmats, centers - np.einsum("...sij,...j->...si", rotmats, home))
 
 
 def _allowed(paths: np.ndarray, tolerance: float) -> np.ndarray:

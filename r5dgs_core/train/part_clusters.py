@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..model import track_state
-from ..motion import rotations
+from ..motion import rigid_path, rotations
 from . import motion_clusters
 
 TOLERANCES = (0.02, 0.01, 0.005)  # residuals allowed in the search for parts, relative to the size of the body
@@ -77,7 +77,7 @@ def _parts(labels: np.ndarray) -> range:
 
 def _residuals(paths: np.ndarray, weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Return the distance of each member from the rigid motion of each part. [R, P]"""
-    fits = [motion_clusters.fit(paths[labels == k], weights[labels == k], 0) for k in _parts(labels)]
+    fits = [rigid_path.fit(paths[labels == k], weights[labels == k], 0) for k in _parts(labels)]
     return np.stack([fit.residuals(paths, 0) for fit in fits], axis=1)
 
 
@@ -139,7 +139,7 @@ def split(
     changed["tracks.rotvecs"].zero_()
     for part, number in enumerate(numbers):
         mine = labels == part
-        motion = motion_clusters.fit(paths[mine], weights[mine], 0)
+        motion = rigid_path.fit(paths[mine], weights[mine], 0)
         center = np.average(paths[mine, 0], axis=0, weights=weights[mine])
         quats = rotations.make_continuous(rotations.rotmats_to_quats(motion.rotmats[1:]))
         moves = motion.rotmats[1:] @ center + motion.shifts[1:] - center

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r5dgs_core.motion import rotations
+from r5dgs_core.motion import rigid_path, rotations
 from r5dgs_core.train import motion_clusters
 
 TIMES = np.linspace(0, 1, 9)
@@ -79,7 +79,7 @@ def test_too_few_points_form_no_part(count):
 def test_the_fit_is_the_motion_of_a_rigid_body(seed, count):
     rng = np.random.default_rng(seed)
     paths = body(rng, rng.normal(size=3), rng.normal(size=3), 2 * rng.normal(size=3), count)
-    motion = motion_clusters.fit(paths, rng.uniform(0.1, 1, count), 4)
+    motion = rigid_path.fit(paths, rng.uniform(0.1, 1, count), 4)
     assert motion.residuals(paths, 4).max() < 1e-9
     np.testing.assert_allclose(np.linalg.det(motion.rotmats), 1, atol=1e-9)
     np.testing.assert_allclose(motion.rotmats[4], np.eye(3), atol=1e-9)
