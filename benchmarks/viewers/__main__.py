@@ -28,7 +28,7 @@ from r5dgs_core.evaluation import metrics
 from r5dgs_core.formats import glb, registry
 from r5dgs_core.formats.glb_motion import seconds_per_unit
 from r5dgs_core.playback.scene_player import Frame, Player
-from r5dgs_core.render import scene_renderer, viewpoints
+from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import cameras, predictability, scene_file, spherical_harmonics
 from r5dgs_core.scene.scene import Scene
 
@@ -85,7 +85,7 @@ def measured(scene: Scene, folder: Path, web: Path, engines: list[str], count: i
     (path,) = glb.export(scene, folder / "scene.glb", registry.Options((0.0,)))
     start, end = float(scene.tracks.times[0]), predictability.horizon(scene)
     times = [start, 0.5 * (start + scene.t_max), scene.t_max, 0.4 * scene.t_max + 0.6 * end, end]
-    views = [viewpoints.resized(camera, SIDE) for camera in spread(scene.cameras, count)]
+    views = [cameras.resized(camera, SIDE) for camera in spread(scene.cameras, count)]
     views = [squared(view) for view in views]
     wanted = {(k, i): frozen(scene, t, view) for k, view in enumerate(views) for i, t in enumerate(times)}
     sky = np.clip(spherical_harmonics.dc_to_rgb(scene.background_sh[0]), 0, 1).tolist()

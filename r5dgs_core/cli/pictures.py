@@ -80,7 +80,8 @@ def draw(
         ConfigError: The camera or mode does not exist, or the objects have no Gaussians.
     """
     from ..data import images
-    from ..render import highlight, viewpoints
+    from ..render import highlight
+    from ..scene import cameras
 
     check("--render", out, camera, t, size)
     inputs.check_mode(mode, scene, scene.name)
@@ -88,7 +89,7 @@ def draw(
     if empty and len(empty) == len(object_ids):
         raise errors.ConfigError(f"--render {out}: {', '.join(empty)}: no Gaussians, so there is nothing to draw")
     viewpoint = best_viewpoint(scene, object_ids, camera, t, mode)
-    view = viewpoint.camera if size is None else viewpoints.resized(viewpoint.camera, size)
+    view = viewpoint.camera if size is None else cameras.resized(viewpoint.camera, size)
     drawn = highlight.highlight if context else highlight.isolate
     images.write_png(out, drawn(scene, object_ids, view, viewpoint.t, mode))
     return viewpoint

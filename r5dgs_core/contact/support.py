@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..playback import scene_player
-from ..render import posed_scene, scene_renderer, viewpoints
+from ..render import posed_scene, scene_renderer
 from ..scene import sampling
-from ..scene.cameras import Camera
+from ..scene.cameras import Camera, reduced
 from ..scene.scene import Scene
 from .world import Plane
 
@@ -81,7 +81,7 @@ def surface(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     posed = posed_scene.rows_of(posed_scene.pose_frame(scene, player.frame(scene.t_max)), rows)
     found, origins = [], []
     for camera in cameras:
-        small = viewpoints.resized(camera, min(PIXELS, max(camera.width, camera.height)))
+        small = reduced(camera, PIXELS)
         shown = scene_renderer.render_frame(scene, posed, small, background=None)
         y, x = np.nonzero(np.asarray(shown.alpha) > _SOLID)
         rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(small.intrinsics).T

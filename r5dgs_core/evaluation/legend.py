@@ -19,6 +19,7 @@ from matplotlib.transforms import IdentityTransform
 from scipy import ndimage
 
 from ..render import viewpoints
+from ..scene import cameras
 from ..scene.scene import Scene, SceneObject
 from . import evaluate, label_placement
 
@@ -53,7 +54,7 @@ def draw(
     """
     camera = viewpoint.camera
     longest = max(camera.width, camera.height, LONGEST) if longest is None else longest
-    camera = viewpoints.resized(camera, longest)
+    camera = cameras.resized(camera, longest)
     shown = evaluate.render(scene, camera, viewpoint.t, mode, backend=backend)
     future = evaluate.is_later(scene, viewpoint.t)
     when = f"t = {viewpoint.t:.4g}, past t_max = {scene.t_max:.4g}" if future else f"t = {viewpoint.t:.4g}"

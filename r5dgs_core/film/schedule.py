@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import errors
 from ..render import viewpoints
-from ..scene import predictability
+from ..scene import cameras, predictability
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from . import camera_path, path_file
@@ -126,7 +126,7 @@ def _shot(settings: Settings, number: int, camera: Camera, t: float) -> Shot:
     if settings.size is not None:
         width, height = settings.size
         if width == 0:
-            resized = viewpoints.resized(camera, height)
+            resized = cameras.resized(camera, height)
             width, height = resized.width, resized.height
     if settings.even:
         width, height = max(width - width % 2, 2), max(height - height % 2, 2)

@@ -14,7 +14,7 @@ import numpy as np
 from ..playback import scene_player
 from ..render import highlight, scene_renderer, viewpoints
 from ..scene import sampling
-from ..scene.cameras import Camera
+from ..scene.cameras import Camera, resized
 from ..scene.scene import Scene
 
 VIEWS = 6  # maximum number of views per object
@@ -66,7 +66,7 @@ def find(
     seen: dict[int, list[tuple[Sighting, np.ndarray]]] = {object_id: [] for object_id in object_ids}
     places, player = _viewpoints(scene), scene_player.Player(scene)
     for done, at in enumerate(places):
-        small = viewpoints.resized(at.camera, _LOOK)
+        small = resized(at.camera, _LOOK)
         ids = scene_renderer.render(player, small, at.t, backend=backend).ids
         for object_id in object_ids:
             mask = ids == object_id
@@ -118,7 +118,7 @@ def _sighting(at: viewpoints.Viewpoint, small: Camera, mask: np.ndarray) -> Sigh
 
 def _unhidden(scene: Scene, object_id: int, sighting: Sighting, mask: np.ndarray, backend: str) -> float:
     """Share of an object's pixels that are not occluded."""
-    small = viewpoints.resized(sighting.camera, _LOOK)
+    small = resized(sighting.camera, _LOOK)
     alone = highlight.isolate(scene, [object_id], small, sighting.t, backend=backend)[..., 3] > 0.5
     return float((mask & alone).sum() / max(alone.sum(), 1))
 

@@ -56,7 +56,7 @@ class _Track:
         times: Times of its poses. [K]
         quats: Rotations. [K, 4]
         centers: Positions of the mean. [K, 3]
-        step: Time between two searched times. A pose is guessed further than this from all poses.
+        step: Time between two searched times. A pose that is farther than this from all others is a guess.
     """
 
     places: np.ndarray
@@ -196,8 +196,7 @@ def _drawn(tracks: Sequence[_Track], camera: Camera, t: float) -> np.ndarray:
 
     if any(track.is_guessed(t) for track in tracks):
         return np.full((camera.height, camera.width), masks.UNKNOWN, np.uint16)
-    factor = min(1.0, MAX_SIDE / max(camera.width, camera.height))
-    small = cameras.resize(camera, max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+    small = cameras.reduced(camera, MAX_SIDE)
     layers = []
     for number, track in enumerate(tracks, 1):
         if not track.is_present(t):

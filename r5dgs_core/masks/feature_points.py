@@ -88,10 +88,9 @@ def features(image: np.ndarray, camera: Camera) -> Features:
     """Find the features of an image [H, W, 3] uint8."""
     import cv2
 
-    factor = min(1.0, MAX_SIDE / max(camera.width, camera.height))
-    if factor < 1:
-        size = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
-        image, camera = cv2.resize(image, size, interpolation=cv2.INTER_AREA), cameras.resize(camera, *size)
+    camera = cameras.reduced(camera, MAX_SIDE)
+    if image.shape[:2] != (camera.height, camera.width):
+        image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     sift = cv2.SIFT.create(FEATURES, contrastThreshold=CONTRAST)
     grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
     keypoints, descriptors = sift.detectAndCompute(grey, None)  # pyright: ignore[reportCallIssue, reportArgumentType]

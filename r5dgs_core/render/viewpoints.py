@@ -103,12 +103,6 @@ def best(
     return among[max(range(len(among)), key=lambda k: scores[k])]
 
 
-def resized(camera: Camera, longest: int) -> Camera:
-    """Resize a camera so that its longer side has ``longest`` pixels."""
-    scale = longest / max(camera.width, camera.height)
-    return axes.resize(camera, max(round(scale * camera.width), 1), max(round(scale * camera.height), 1))
-
-
 def overview(scene: Scene) -> Camera:
     """Return a camera that sees the whole scene obliquely from above, for scenes without cameras."""
     up = axes.WORLD_TO_BLENDER[scene.world_convention].T @ np.array([0.0, 0.0, 1.0])
@@ -133,7 +127,9 @@ def _score(
     player: scene_player.Player, viewpoint: Viewpoint, object_ids: Collection[int], backend: str
 ) -> tuple[int, float]:
     """Number of visible objects, and sum of the square roots of their shares, halved for those at the border."""
-    ids = scene_renderer.render(player, resized(viewpoint.camera, THUMBNAIL_SIDE), viewpoint.t, backend=backend).ids
+    ids = scene_renderer.render(
+        player, axes.resized(viewpoint.camera, THUMBNAIL_SIDE), viewpoint.t, backend=backend
+    ).ids
     border = np.concatenate([ids[0], ids[-1], ids[:, 0], ids[:, -1]])
     count, quality = 0, 0.0
     for object_id in object_ids:

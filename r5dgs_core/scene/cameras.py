@@ -185,6 +185,17 @@ def resize(camera: Camera, width: int, height: int) -> Camera:
     return dataclasses.replace(camera, width=width, height=height, intrinsics=intrinsics)
 
 
+def resized(camera: Camera, longest: int) -> Camera:
+    """Resize a camera so that its longer side has ``longest`` pixels."""
+    scale = longest / max(camera.width, camera.height)
+    return resize(camera, max(round(scale * camera.width), 1), max(round(scale * camera.height), 1))
+
+
+def reduced(camera: Camera, longest: int) -> Camera:
+    """Resize a camera so that its longer side has at most ``longest`` pixels."""
+    return resized(camera, min(longest, max(camera.width, camera.height)))
+
+
 def reached_by(camera: Camera, points: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Return a mask of the Gaussians that may reach a camera's image: within three standard deviations and 1 px.
 

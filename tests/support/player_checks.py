@@ -15,7 +15,8 @@ import numpy as np
 from r5dgs_core import errors
 from r5dgs_core.data import images
 from r5dgs_core.playback.scene_player import Player
-from r5dgs_core.render import scene_renderer, viewpoints
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import cameras
 from r5dgs_core.scene.scene import Scene
 from r5dgs_core.search import object_search
 
@@ -67,7 +68,7 @@ def compare(
     """
     player, found = Player(scene), []
     for number in shown_cameras(scene):
-        camera = viewpoints.resized(scene.cameras[number], side)
+        camera = cameras.resized(scene.cameras[number], side)
         window = (camera.width // ratio, camera.height // ratio)
         browser.open(f"{url}?ui=0&t={scene.t_max}&camera={number}", *window, ratio=ratio)
         for t in shown_times(scene, end):
@@ -111,7 +112,7 @@ def picks(
     """
     player, random_, result = Player(scene), random.Random(0), {}
     for number in shown_cameras(scene):
-        camera = viewpoints.resized(scene.cameras[number], side)
+        camera = cameras.resized(scene.cameras[number], side)
         ids = scene_renderer.render(player, camera, scene.t_max).ids
         window = (camera.width // ratio, camera.height // ratio)
         browser.open(f"{url}?ui=0&t={scene.t_max}&camera={number}", *window, ratio=ratio)

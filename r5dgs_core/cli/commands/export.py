@@ -219,8 +219,9 @@ def _still(scene: Scene, object_ids: frozenset[int] | None) -> bytes | None:
     from ...formats import image_files
     from ...playback.scene_player import Player
     from ...render import highlight, scene_renderer, viewpoints
+    from ...scene import cameras
 
-    camera = viewpoints.resized(scene.cameras[0] if scene.cameras else viewpoints.overview(scene), STILL_SIDE)
+    camera = cameras.resized(scene.cameras[0] if scene.cameras else viewpoints.overview(scene), STILL_SIDE)
     frame = Player(scene).frame(scene.t_max, origin=camera.center)
     if object_ids is not None:
         frame = highlight.without_others(frame, object_ids)

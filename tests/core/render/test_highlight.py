@@ -134,7 +134,7 @@ def test_a_scene_without_cameras_is_viewed_obliquely_from_above(convention):
 
 
 def test_a_resized_camera_keeps_its_field_of_view():
-    camera = viewpoints.resized(CAMERA, 96)
+    camera = cameras.resized(CAMERA, 96)
     assert (camera.width, camera.height) == (96, 72)
     points = np.array([[0.1, 0.2, 0.3], [-0.5, 0.1, 0.0]])
     np.testing.assert_allclose(cameras.project(camera, points)[0], 2 * cameras.project(CAMERA, points)[0])

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.render import viewpoints
-from r5dgs_core.scene import scene_file
+from r5dgs_core.scene import cameras, scene_file
 from r5dgs_core.scene.hull import Hull
 from r5dgs_core.shapes import object_hulls, solid
 from tests.support import contact_scenes, scenes, solid_gaussians
@@ -57,7 +56,7 @@ def box_scene():
     arrays = {name: getattr(scene.gaussians, name).copy() for name in ("means", "quats", "log_scales")}
     for name, values in zip(arrays, (box[0], box[1], np.log(box[2])), strict=True):
         arrays[name][rows] = values
-    return dataclasses.replace(scene.with_arrays(**arrays), cameras=(viewpoints.resized(scene.cameras[0], 200),))
+    return dataclasses.replace(scene.with_arrays(**arrays), cameras=(cameras.resized(scene.cameras[0], 200),))
 
 
 def test_boxes_are_as_large_as_in_pictures_with_their_low_pass_filter():
