@@ -17,7 +17,7 @@ import numpy as np
 from ...scene.camera_correction import COUNT, POSE, TIME, Correction
 from ...scene.cameras import Camera
 from . import patches
-from .patches import HOST, SHAPE, TARGET, DepthView, Placed
+from .patches import HOST, SHAPE, TARGET, DepthView, Patches, Placed
 
 FIRST, ROUNDS = 3, 8  # iterations of the planes alone, and of everything
 ALIKE = (0.5, 0.8)  # least correlation of a pair that counts, in these
@@ -44,6 +44,10 @@ class Cameras:
     corrections: Sequence[Correction]
     units: np.ndarray
     spacing: float
+
+    def corrected(self) -> list[Camera]:
+        """Return the cameras with their present corrections."""
+        return [change.camera(camera) for change, camera in zip(self.corrections, self.given, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,19 +78,19 @@ class _Equations:
     deviation: float
 
 
-def adjust(depth_views: Sequence[DepthView], rig: Cameras, each: int, *, clocks: bool) -> Adjusted | None:
+def adjust(depth_views: Sequence[DepthView], rig: Cameras, found: Patches, *, clocks: bool) -> Adjusted | None:
     """Adjust the cameras to the patches of their pictures.
 
     Args:
         depth_views: The pictures.
         rig: Their cameras.
-        each: Number of patches of a picture, at most.
+        found: Patches of the pictures; they are not changed.
         clocks: True to adjust the clocks, too.
 
     Returns:
         The change; None if a camera shares too few patches with the others.
     """
-    work = _Work(depth_views, rig, each, clocks)
+    work = _Work(depth_views, rig, found, clocks)
     if not work.connected():
         return None
     for count, alike in zip((FIRST, ROUNDS), ALIKE, strict=True):
@@ -104,12 +108,10 @@ def adjust(depth_views: Sequence[DepthView], rig: Cameras, each: int, *, clocks:
 class _Work:
     """State of an adjustment."""
 
-    def __init__(self, depth_views: Sequence[DepthView], rig: Cameras, each: int, clocks: bool):
+    def __init__(self, depth_views: Sequence[DepthView], rig: Cameras, found: Patches, clocks: bool):
         self._depth_views, self._rig = depth_views, rig
         self._corrections = list(rig.corrections)
-        self.found = patches.find(
-            depth_views, [c.camera(g) for c, g in zip(rig.corrections, rig.given, strict=True)], each
-        )
+        self.found = found
         self._planes = self.found.planes.copy()
         self._columns = EACH if clocks else EACH - 1
         self._active = np.ones(len(self.found.patch), bool)

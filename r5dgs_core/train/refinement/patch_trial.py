@@ -65,6 +65,7 @@ def adjust(trainer: Trainer, points: np.ndarray) -> Found | None:
     units = np.stack([gauge.pixel_units(camera, points) for camera in rig.cameras])
     cameras = Cameras(rig.cameras, corrections, units, step)
     each = max(1, PATCHES // max(1, len(depth_views)))
+    compared = patches.find(depth_views, cameras.corrected(), each)
 
     def size(part: str, first: np.ndarray, second: np.ndarray) -> float:
         return agreement.agreed(part, rig.cameras, first, second, points, step)
@@ -72,13 +73,13 @@ def adjust(trainer: Trainer, points: np.ndarray) -> Found | None:
     parts = [POSES]
     found = None
     if config.needs.time_offsets != "off" and len(trainer.times) > 3:
-        found = patch_adjustment.adjust(depth_views, cameras, each, clocks=True)
+        found = patch_adjustment.adjust(depth_views, cameras, compared, clocks=True)
         late = 0.0 if found is None else size(CLOCKS, *found.halves)
         if late > config.refine.intervals:
             parts.append(CLOCKS)
             refinement.learn({CLOCKS: (late, math.nan)})
     if len(parts) == 1:
-        found = patch_adjustment.adjust(depth_views, cameras, each, clocks=False)
+        found = patch_adjustment.adjust(depth_views, cameras, compared, clocks=False)
     if found is None or size(POSES, *found.halves) <= config.refine.pixels:
         return None
     changes = {POSES: found.changes[:, POSE], CLOCKS: found.changes[:, TIME.start]}

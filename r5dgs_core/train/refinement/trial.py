@@ -86,12 +86,12 @@ def decide(trainer: Trainer, possible: Sequence[str]) -> None:
     refinement.learn({part: (one.size, one.gain) for part, one in evidence.items()})
     forced = {part for part in possible if getattr(config.needs, part) == "on"}
     helpful = {part for part, one in evidence.items() if one.size > least_size(part, config)}
-    wanted, patched = POSES in possible and POSES in forced | helpful | refinement.parts, None
-    if wanted and not refinement.settled and trainer.iteration in steps(config):
-        patched = patch_trial.adjust(trainer, some)
-        if patched is not None:
-            refinement.change(patched.changes, final=patched.final)
-            helpful = helpful - {CLOCKS} | patched.changes.keys()
+    wrong = POSES in possible and POSES in forced | helpful | refinement.parts
+    due = not refinement.settled and trainer.iteration in steps(config)
+    patched = patch_trial.adjust(trainer, some) if wrong and due else None
+    if patched is not None:
+        refinement.change(patched.changes, final=patched.final)
+        helpful = helpful - {CLOCKS} | patched.changes.keys()
     taken = [part for part in PARTS if part in forced | helpful | refinement.parts]
     log.info("cameras, step %d: %s; refined: %s", trainer.iteration, _text(evidence), ", ".join(taken) or "nothing")
     if not taken:

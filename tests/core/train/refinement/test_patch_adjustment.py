@@ -49,7 +49,7 @@ def depth_views(late=(0.0,) * 5, contrast=1.0):
 def adjusted(seen, given, *, clocks=True):
     units = np.stack([gauge.pixel_units(camera, POINTS) for camera in given])
     rig = patch_adjustment.Cameras(given, [Correction() for _ in given], units, STEP)
-    return patch_adjustment.adjust(seen, rig, EACH, clocks=clocks)
+    return patch_adjustment.adjust(seen, rig, patches.find(seen, rig.corrected(), EACH), clocks=clocks)
 
 
 def moved(pixels, seed):
