@@ -144,7 +144,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def prepared(folder: Path, out: Path, kind: str, without: str | None, lines: int) -> Plan:
-    """Prepare the videos with masks of a kind, and add the true poses."""
+    """Prepare the videos, and add the true poses; ``kind`` is the source of the masks, as in ``--masks``."""
     source, calibration = folder / RECORDING, folder / "camera_array.toml"
     hold_out: dict[str, Any] = {"every": 8, "cameras": () if without is None else (without,)}
     fields = {"calibration": calibration, "lines": lines, "hold_out": hold_out}

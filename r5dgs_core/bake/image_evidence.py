@@ -202,18 +202,18 @@ class ImageEvidence:
         return slice(0, camera.height), slice(0, camera.width)
 
     def _window(
-        self, row: int, frames: Sequence[scene_player.Frame], moving: np.ndarray, small: int
+        self, row: int, frames: Sequence[scene_player.Frame], moving: np.ndarray, whole_up_to: int
     ) -> tuple[slice, slice]:
-        """Return rows and columns of a view outside of which some Gaussians do not show; of small images, all.
+        """Return rows and columns of a view outside of which some Gaussians do not show.
 
         Args:
             row: Index of the view.
             frames: Frames in which they may be drawn.
             moving: Mask of the Gaussians. [N]
-            small: Number of pixels of the largest small image.
+            whole_up_to: Number of pixels of the largest image that is drawn as a whole.
         """
         camera, whole = self._views[row].camera, self._whole(row)
-        if camera.width * camera.height <= small:
+        if camera.width * camera.height <= whole_up_to:
             return whole
         low, high = np.full(2, np.inf), np.full(2, -np.inf)
         for frame in frames:

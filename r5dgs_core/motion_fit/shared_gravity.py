@@ -121,7 +121,8 @@ def _largest_agreeing(found: dict[int, tuple[np.ndarray, np.ndarray]]) -> list[i
                 total += float(apart[seed, i])
                 fits &= agree[i]
         best = max(best, (len(chosen), -total, chosen), key=lambda entry: entry[:2])
-    return sorted(list(found)[i] for i in best[2])
+    names = list(found)
+    return sorted(names[i] for i in best[2])
 
 
 def _refit(

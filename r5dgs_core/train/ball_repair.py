@@ -40,7 +40,9 @@ STEEPEST = 0.3  # smallest cosine of the angle between the surface and the ray t
 CLEARLY = 0.93  # largest error of new rotations, relative to that of the track
 TEXTURED = 0.2  # largest error of them, relative to that of shade without texture
 APART = np.radians(1.0)  # smallest change of a rotation near the end of a run
-FAR = np.radians(8.0)  # change of a rotation that training would not undo; its median tells if Gaussians are smeared
+FAR = np.radians(
+    8.0
+)  # change of a rotation that training would not undo; Gaussians are smeared if the median exceeds it
 OPACITY = 0.9  # of Gaussians that are placed anew
 WIDE, FLAT = 0.5, 0.2  # their standard deviations along the surface and across it, in distances of neighbours
 

@@ -193,7 +193,7 @@ def _check(window: dict[str, Any], source: Path, calibration: Path | None) -> No
 
 
 def _check_masks(masks: str, model: Path | None, words: str | None) -> None:
-    """Raise UsageError for options that the choice of masks does not use, and BackendError without its packages."""
+    """Raise UsageError for options that the choice of masks does not use, and BackendError if OpenCV is missing."""
     if words is not None and masks != "sam3":
         raise errors.UsageError(f"--words {words}: applies to --masks sam3, found --masks {masks}")
     if model is not None and masks not in ("sam2", "sam3"):
