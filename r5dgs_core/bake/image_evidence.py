@@ -14,8 +14,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -28,7 +27,9 @@ from ..scene import cameras
 from ..scene.sampling import spread
 from ..scene.scene import Scene
 from ..train import train_views
+from . import motion_support
 from .draft import Context
+from .motion_support import Compared, Support
 
 log = logging.getLogger(__name__)
 
@@ -42,25 +43,6 @@ REACH = 3.4  # standard deviations at which an opaque Gaussian is fainter than t
 MARGIN = 2.0  # pixels added to the reach, for the low-pass filter and rounding
 KEPT = 2_000_000  # Gaussians in the frames of the trained motion that are kept in memory
 STEP = 0.02  # change of the poses for finite differences of the images, rad or radii
-
-
-@dataclass(frozen=True)
-class Support:
-    """Statistics of the change of the images by a simplification of a group's motion.
-
-    Attributes:
-        sigmas: Distance (1 - l) of the simpler motion from the best fit to the images, in standard deviations; negative
-            if the best fit lies beyond the simpler motion.
-        clusters: Number of clusters or of patches, whichever is smaller, that the standard deviation is estimated from.
-        level: Root mean square change of the pixels that show the group, colours in [0, 1].
-        shape: Share of shape and texture in the change of the images; the rest is due to colours that turn with the
-            group.
-    """
-
-    sigmas: float
-    clusters: int
-    level: float
-    shape: float
 
 
 class ImageEvidence:
@@ -121,7 +103,13 @@ class ImageEvidence:
         return self.psnr - _mean_psnr(errors)
 
     def support(
-        self, group: int, before: np.ndarray, after: np.ndarray, size: float, rows: Sequence[int] | None = None
+        self,
+        group: int,
+        before: np.ndarray,
+        after: np.ndarray,
+        size: float,
+        rows: Sequence[int] | None = None,
+        compared: dict[int, Compared] | None = None,
     ) -> Support:
         """Return the significance of a change of shape and place. All pictures are drawn with the shading of ``after``,
         so that changes of colour do not count.
@@ -132,8 +120,23 @@ class ImageEvidence:
             after: Poses of all groups with the simpler motion. [G, S, 7]
             size: Largest change, rad or radii.
             rows: Indices of the views to use; None for all.
+            compared: Views compared before for the same change, which are not drawn again; new ones are added.
         """
         rows = range(len(self._views)) if rows is None else rows
+        compared = {} if compared is None else compared
+        missing = [row for row in rows if row not in compared]
+        compared |= dict(zip(missing, self._compare(group, before, after, size, missing), strict=True))
+        scores, information = np.zeros((2, int(self._clusters.max()) + 1, PATCHES + 1))
+        for row in rows:
+            scores[self._clusters[row]] += compared[row].scores
+            information[self._clusters[row]] += compared[row].information
+        pixels = sum(compared[row].pixels for row in rows)
+        return motion_support.estimate(scores, information, pixels, sum(compared[row].changed for row in rows))
+
+    def _compare(
+        self, group: int, before: np.ndarray, after: np.ndarray, size: float, rows: Sequence[int]
+    ) -> Iterator[Compared]:
+        """Compare a change with the images of some views; arguments as for `support`."""
         step = min(1.0, STEP / max(size, 1e-12))
         simpler = scene_player.Player(self._with(after))
         here, plus, minus = (
@@ -141,10 +144,8 @@ class ImageEvidence:
         )
         colored = self._scene.shading is not None and not np.array_equal(before[..., :4], after[..., :4])
         octants, moving = self._octants(group), self._moving(before, after)
-        scores, information = np.zeros((2, int(self._clusters.max()) + 1, PATCHES + 1))
-        pixels, changed = 0, 0.0
         for row in rows:
-            trained = self._trained(row)
+            trained, changed = self._trained(row), 0.0
             own = [player.frame_after(trained) for player in (here, plus, minus, simpler)]
             window = self._window(row, own, moving, WHOLE if self._bodies <= FEW else 0)
             factor = own[3].shading_factor
@@ -156,14 +157,16 @@ class ImageEvidence:
             if explained is not None:
                 slope[~explained[window]] = 0
                 patches = np.where(explained[window], patches, PATCHES)
-            pixels += int((patches < PATCHES).sum())
-            cluster, error = self._clusters[row], (picture - self._truths[row][window]) * slope
-            scores[cluster] -= np.bincount(patches.ravel(), error.sum(-1).ravel(), PATCHES + 1)
-            information[cluster] += np.bincount(patches.ravel(), (slope**2).sum(-1).ravel(), PATCHES + 1)
+            error = (picture - self._truths[row][window]) * slope
             if colored:
                 turned = (self._draw(own[3], row, window)[0] - self._draw(own[0], row, window)[0]) ** 2
-                changed += float((turned if explained is None else turned[explained[window]]).sum())
-        return _support(scores, information, pixels, changed)
+                changed = float((turned if explained is None else turned[explained[window]]).sum())
+            yield Compared(
+                -np.bincount(patches.ravel(), error.sum(-1).ravel(), PATCHES + 1),
+                np.bincount(patches.ravel(), (slope**2).sum(-1).ravel(), PATCHES + 1),
+                int((patches < PATCHES).sum()),
+                changed,
+            )
 
     def _with(self, poses: np.ndarray) -> Scene:
         return self._scene.with_arrays(track_poses=poses)
@@ -263,28 +266,6 @@ class ImageEvidence:
 
 def _mean_psnr(errors: Sequence[float]) -> float:
     return float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
-
-
-def _support(scores: np.ndarray, information: np.ndarray, pixels: int, changed: float) -> Support:
-    """Return the support from the scores and the information of each cluster and patch. [C, PATCHES + 1] each
-
-    The variance is the sum of the variances over clusters and over patches, minus that over their intersections, which
-    both contain.
-    """
-    total = float(information.sum())
-    if total <= 0:
-        return Support(0.0, 1, 0.0, 1.0)
-    best = float(scores.sum()) / total
-    left = scores - best * information
-    counts = [int((information.sum(axis) > 0).sum()) for axis in (0, 1)]
-    ways = [float((left.sum(axis) ** 2).sum()) * n / max(n - 1, 1) for axis, n in enumerate(counts)]
-    variance = max(sum(ways) - float((left**2).sum()), *ways, 1e-12 * total)
-    return Support(
-        (1 - best) * total / math.sqrt(variance),
-        min(counts),
-        math.sqrt(total / (3 * max(pixels, 1))),
-        min(1.0, total / changed) if changed > 0 else 1.0,
-    )
 
 
 def gather(scene: Scene, context: Context) -> ImageEvidence | None:

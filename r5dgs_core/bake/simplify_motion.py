@@ -245,9 +245,9 @@ def _measured(
         after = scene.tracks.poses.copy()
         after[group] = poses
         largest = 2 * float(np.linalg.norm(dropped, axis=1).max()) / (2.0 if kind.turns else unit)
-        free, seen = 3 * _independent(dropped[weights > 0]), True
+        free, seen, drawn = 3 * _independent(dropped[weights > 0]), True, {}
         for rows in (evidence.strongest_views(np.linalg.norm(dropped, axis=1)), None):
-            support = evidence.support(group, scene.tracks.poses, _move_followers(scene, after), largest, rows)
+            support = evidence.support(group, scene.tracks.poses, _move_followers(scene, after), largest, rows, drawn)
             change = max(support.sigmas, 0.0) / np.sqrt(free)
             allowed = float(np.sqrt(special.fdtri(free, max(support.clusters - 1, 1), 1 - LEVEL)))
             if change > CLEARLY * allowed:

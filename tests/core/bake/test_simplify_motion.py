@@ -272,3 +272,27 @@ def test_a_change_of_one_body_poses_no_other_gaussians_again(given, monkeypatch)
             found.append((evidence.support(BRICK, truth.tracks.poses, noisy, 0.1), evidence.loss(noisy)))
         assert len(posed) == (0 if kept else 2 * len(evidence._views))
     assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("given", ["turn"], indirect=True)
+def test_a_candidate_that_all_views_decide_is_compared_with_each_view_once(given, monkeypatch):
+    _, truth, data = given
+    compare, asked = image_evidence.ImageEvidence._compare, {}
+
+    def counted(evidence, group, before, after, size, rows):
+        asked.setdefault((group, after.tobytes()), []).append(list(rows))
+        return compare(evidence, group, before, after, size, rows)
+
+    monkeypatch.setattr(image_evidence.ImageEvidence, "_compare", counted)
+    simplified(with_noise(truth, 3e-4, 3e-5), data)
+    twice = [sum(calls, []) for calls in asked.values() if len(calls) > 1]
+    assert twice and all(len(rows) == len(set(rows)) for rows in twice)
+
+
+@pytest.mark.parametrize("given", ["slide"], indirect=True)
+def test_views_compared_before_give_equal_support(given):
+    _, truth, data = given
+    evidence, noisy = evidence_of(truth, data), with_noise(truth, 0.02, 0.02).tracks.poses
+    change, compared = (BRICK, truth.tracks.poses, noisy, 0.1), {}
+    for rows in ([4, 1], None):
+        assert evidence.support(*change, rows, compared) == evidence.support(*change, rows)
