@@ -12,6 +12,7 @@ clustered both ways).
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +23,7 @@ from ..data import dataset as datasets
 from ..errors import DatasetError
 from ..motion import rotations
 from ..playback import scene_player
-from ..render import scene_renderer
+from ..render import posed_scene, scene_renderer
 from ..scene import cameras
 from ..scene.sampling import spread
 from ..scene.scene import Scene
@@ -35,10 +36,9 @@ log = logging.getLogger(__name__)
 
 PIXELS = 700_000  # total of the sampled views
 MIN_VIEWS, MAX_VIEWS = 20, 40  # limits of the number of sampled views
-CLUSTERS = 8  # smallest number of clusters; with fewer cameras, their views are split in time
 PATCHES = 8  # patches per body: its octants
 WHOLE = 500_000  # pixels of an image above which only the part that a group may reach is drawn
-FEW = 20  # bodies above which a change of one is drawn only there in images of any size
+FEW = 20  # bodies above which a change of one is drawn only there, of the Gaussians there, in images of any size
 REACH = 3.4  # standard deviations at which an opaque Gaussian is fainter than the rasterizer draws
 MARGIN = 2.0  # pixels added to the reach, for the low-pass filter and rounding
 KEPT = 2_000_000  # Gaussians in the frames of the trained motion that are kept in memory
@@ -74,7 +74,7 @@ class ImageEvidence:
             given = datasets.load_given_image(view, behind)
             self._truths.append(datasets.in_scene_colors(view, given))
             self._explained.append(explained(view, given))
-        self._clusters = _clusters(views)
+        self._clusters = motion_support.clusters(views)
         moves = (scene.tracks.poses[..., 1:] != 0).any(axis=(1, 2))
         self._bodies = sum(group.role == "body" and bool(moves[group.id]) for group in scene.groups)
         self.remember()
@@ -83,6 +83,7 @@ class ImageEvidence:
         """Compare the pictures of the trained motion with the images; to be called when these have changed."""
         self._player = scene_player.Player(self._scene)
         self._frames: dict[int, scene_player.Frame] = {}
+        self._reach: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # pixels of all Gaussians in each of the frames
         self._errors = [self._error(self._trained(row), row) for row in range(len(self._views))]
         self.psnr = _mean_psnr(self._errors)
 
@@ -94,11 +95,11 @@ class ImageEvidence:
         for row, error in enumerate(self._errors):
             trained = self._trained(row)
             frames = [trained, player.frame_after(trained)]
-            window = self._window(row, frames, moving, WHOLE)
+            window, shown = self._window(row, frames, moving)
             if window == self._whole(row):
                 errors.append(self._error(frames[1], row))
             else:
-                old, new = (self._error(frame, row, window) for frame in frames)
+                old, new = (self._error(frame, row, window, shown) for frame in frames)
                 errors.append(error + (new - old) * self._count(row, window) / self._count(row, self._whole(row)))
         return self.psnr - _mean_psnr(errors)
 
@@ -147,11 +148,12 @@ class ImageEvidence:
         for row in rows:
             trained, changed = self._trained(row), 0.0
             own = [player.frame_after(trained) for player in (here, plus, minus, simpler)]
-            window = self._window(row, own, moving, WHOLE if self._bodies <= FEW else 0)
+            window, shown = self._window(row, own, moving)
+            draw = functools.partial(self._draw, row=row, window=window, shown=shown)
             factor = own[3].shading_factor
             lit = own[:3] if factor is None else [dataclasses.replace(f, shading_factor=factor) for f in own[:3]]
-            picture, patches = self._draw(dataclasses.replace(lit[0], object_ids=octants), row, window)
-            slope = (self._draw(lit[1], row, window)[0] - self._draw(lit[2], row, window)[0]).astype(np.float64)
+            picture, patches = draw(dataclasses.replace(lit[0], object_ids=octants))
+            slope = (draw(lit[1])[0] - draw(lit[2])[0]).astype(np.float64)
             slope /= 2 * step
             explained = self._explained[row]
             if explained is not None:
@@ -159,7 +161,7 @@ class ImageEvidence:
                 patches = np.where(explained[window], patches, PATCHES)
             error = (picture - self._truths[row][window]) * slope
             if colored:
-                turned = (self._draw(own[3], row, window)[0] - self._draw(own[0], row, window)[0]) ** 2
+                turned = (draw(own[3])[0] - draw(own[0])[0]) ** 2
                 changed = float((turned if explained is None else turned[explained[window]]).sum())
             yield Compared(
                 -np.bincount(patches.ravel(), error.sum(-1).ravel(), PATCHES + 1),
@@ -205,36 +207,55 @@ class ImageEvidence:
         return slice(0, camera.height), slice(0, camera.width)
 
     def _window(
-        self, row: int, frames: Sequence[scene_player.Frame], moving: np.ndarray, whole_up_to: int
-    ) -> tuple[slice, slice]:
-        """Return rows and columns of a view outside of which some Gaussians do not show.
+        self, row: int, frames: Sequence[scene_player.Frame], moving: np.ndarray
+    ) -> tuple[tuple[slice, slice], np.ndarray | None]:
+        """Return the part of a view to draw: its rows and columns, and the Gaussians [n] int that may show there.
+
+        With up to `FEW` bodies, it is all of a small image, and all Gaussians (None).
 
         Args:
             row: Index of the view.
-            frames: Frames in which they may be drawn.
-            moving: Mask of the Gaussians. [N]
-            whole_up_to: Number of pixels of the largest image that is drawn as a whole.
+            frames: Frames to draw.
+            moving: Mask of the Gaussians that differ between the frames and the trained motion. [N]
         """
-        camera, whole = self._views[row].camera, self._whole(row)
-        if camera.width * camera.height <= whole_up_to:
-            return whole
+        camera = self._views[row].camera
+        if self._bodies <= FEW and camera.width * camera.height <= WHOLE:
+            return self._whole(row), None
         low, high = np.full(2, np.inf), np.full(2, -np.inf)
         for frame in frames:
-            pixels, depth = cameras.project(camera, frame.means[moving].astype(np.float64) + camera.center)
-            if not (depth > self._scene.near_plane).all():  # close to the camera, it may cover everything
-                return whole
-            sizes = np.exp(frame.log_scales[moving].max(axis=1).astype(np.float64))
-            slant = np.linalg.norm(pixels - camera.intrinsics[:2, 2], axis=1) / camera.intrinsics[0, 0]
-            reach = (REACH * sizes * camera.intrinsics[0, 0] / depth * (1 + slant) + MARGIN)[:, None]
-            low = np.minimum(low, (pixels - reach).min(axis=0, initial=np.inf))
-            high = np.maximum(high, (pixels + reach).max(axis=0, initial=-np.inf))
+            first, last = self._boxes(row, frame, moving)
+            low = np.minimum(low, first.min(axis=0, initial=np.inf))
+            high = np.maximum(high, last.max(axis=0, initial=-np.inf))
         size = np.array([camera.width, camera.height])
         first, last = np.floor(np.clip(low, 0, size - 1)), np.ceil(np.clip(high, 1, size))
         (left, top), (right, bottom) = first.astype(int).tolist(), np.maximum(last, first + 1).astype(int).tolist()
-        return slice(top, bottom), slice(left, right)
+        shown = None
+        if self._bodies > FEW:
+            found = self._reach.get(row) or self._boxes(row, self._trained(row))
+            if row in self._frames:
+                self._reach[row] = found
+            near = (found[1] >= [left, top]) & (found[0] <= [right, bottom])
+            shown = np.flatnonzero(moving | near.all(axis=1))
+        return (slice(top, bottom), slice(left, right)), shown
+
+    def _boxes(
+        self, row: int, frame: scene_player.Frame, rows: np.ndarray | slice = slice(None)
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lowest and the highest pixels that some Gaussians may show in, x and y. [P, 2] each"""
+        camera = self._views[row].camera
+        pixels, depth = cameras.project(camera, frame.means[rows].astype(np.float64) + camera.center)
+        sizes = np.exp(frame.log_scales[rows].max(axis=1).astype(np.float64))
+        slant = np.linalg.norm(pixels - camera.intrinsics[:2, 2], axis=1) / camera.intrinsics[0, 0]
+        reach = (REACH * sizes * camera.intrinsics[0, 0] / depth * (1 + slant) + MARGIN)[:, None]
+        near = ~(depth > self._scene.near_plane)[:, None]  # close to the camera, it may cover everything
+        return np.where(near, -np.inf, pixels - reach), np.where(near, np.inf, pixels + reach)
 
     def _draw(
-        self, frame: scene_player.Frame, row: int, window: tuple[slice, slice] | None = None
+        self,
+        frame: scene_player.Frame,
+        row: int,
+        window: tuple[slice, slice] | None = None,
+        shown: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the image of a view, sRGB in [0, 1] [H, W, 3], and the patch that each pixel shows [H, W].
 
@@ -242,18 +263,26 @@ class ImageEvidence:
             frame: Frame of the view. Its object ids are the patches of the Gaussians.
             row: Index of the view.
             window: Rows and columns to draw; None for all.
+            shown: Gaussians that may show there; None for all.
         """
-        camera = self._views[row].camera
+        camera, posed = self._views[row].camera, posed_scene.pose_frame(self._scene, frame)
+        posed = posed if shown is None else posed_scene.rows_of(posed, shown)
         if window is None or window == self._whole(row):
-            output = scene_renderer.render_frame(self._scene, frame, camera)
+            output = scene_renderer.render_frame(self._scene, posed, camera)
         else:
-            output = scene_renderer.render_window(self._scene, frame, camera, *window)
+            output = scene_renderer.render_window(self._scene, posed, camera, *window)
         return np.clip(output.color, 0, 1), np.where(output.ids < 0, PATCHES, output.ids)
 
-    def _error(self, frame: scene_player.Frame, row: int, window: tuple[slice, slice] | None = None) -> float:
+    def _error(
+        self,
+        frame: scene_player.Frame,
+        row: int,
+        window: tuple[slice, slice] | None = None,
+        shown: np.ndarray | None = None,
+    ) -> float:
         """Return the mean squared error of a picture, or of a part of it, over the explained pixels."""
         window, explained = window or self._whole(row), self._explained[row]
-        squared = (self._draw(frame, row, window)[0] - self._truths[row][window]) ** 2
+        squared = (self._draw(frame, row, window, shown)[0] - self._truths[row][window]) ** 2
         if explained is not None:
             squared = squared[explained[window]]
         return float(np.mean(squared)) if squared.size else 0.0
@@ -291,36 +320,10 @@ def sample(views: Sequence[datasets.View]) -> list[datasets.View]:
     """Return views spread evenly over the times of each camera, as many as `PIXELS` allows."""
     size = float(np.median([view.camera.width * view.camera.height for view in views]))
     limit = int(np.clip(PIXELS / size, MIN_VIEWS, MAX_VIEWS))
-    cameras = _by_camera(views)
+    cameras = motion_support.by_camera(views)
     if 2 * len(cameras) > limit:
         return spread(sorted(views, key=lambda view: (view.t, view.name)), limit)
     return [view for group in cameras.values() for view in spread(group, limit // len(cameras))]
-
-
-def _by_camera(views: Sequence[datasets.View]) -> dict[str, list[datasets.View]]:
-    cameras: dict[str, list[datasets.View]] = {}
-    for view in sorted(views, key=lambda view: view.t):
-        cameras.setdefault(view.camera.name, []).append(view)
-    return cameras
-
-
-def _clusters(views: Sequence[datasets.View]) -> np.ndarray:
-    """Return the cluster of each view: its camera, or an interval of its camera's times if cameras are few. [V]"""
-    cameras = _by_camera(views)
-    parts = -(-CLUSTERS // len(cameras))
-    found: dict[int, int] = {}
-    count = 0
-    for group in cameras.values():
-        for part in np.array_split(np.arange(len(group)), min(parts, len(group))):
-            found |= {id(group[i]): count for i in part}
-            count += 1
-    if count > 2 * CLUSTERS and all(len(group) == 1 for group in cameras.values()):  # one moving camera
-        order = np.argsort([view.t for view in views], kind="stable")
-        result = np.zeros(len(views), int)
-        for cluster, part in enumerate(np.array_split(order, CLUSTERS)):
-            result[part] = cluster
-        return result
-    return np.array([found[id(view)] for view in views])
 
 
 def _between(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:

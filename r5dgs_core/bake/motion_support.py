@@ -6,9 +6,14 @@ Notation as in `image_evidence`: clusters c of views, patches of a body's surfac
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from ..data import dataset as datasets
+
+CLUSTERS = 8  # smallest number of clusters; with fewer cameras, their views are split in time
 
 
 @dataclass(frozen=True)
@@ -67,3 +72,30 @@ def estimate(scores: np.ndarray, information: np.ndarray, pixels: int, changed: 
         math.sqrt(total / (3 * max(pixels, 1))),
         min(1.0, total / changed) if changed > 0 else 1.0,
     )
+
+
+def by_camera(views: Sequence[datasets.View]) -> dict[str, list[datasets.View]]:
+    """Return the views of each camera in the order of time."""
+    cameras: dict[str, list[datasets.View]] = {}
+    for view in sorted(views, key=lambda view: view.t):
+        cameras.setdefault(view.camera.name, []).append(view)
+    return cameras
+
+
+def clusters(views: Sequence[datasets.View]) -> np.ndarray:
+    """Return the cluster of each view: its camera, or an interval of its camera's times if cameras are few. [V]"""
+    cameras = by_camera(views)
+    parts = -(-CLUSTERS // len(cameras))
+    found: dict[int, int] = {}
+    count = 0
+    for group in cameras.values():
+        for part in np.array_split(np.arange(len(group)), min(parts, len(group))):
+            found |= {id(group[i]): count for i in part}
+            count += 1
+    if count > 2 * CLUSTERS and all(len(group) == 1 for group in cameras.values()):  # one moving camera
+        order = np.argsort([view.t for view in views], kind="stable")
+        result = np.zeros(len(views), int)
+        for cluster, part in enumerate(np.array_split(order, CLUSTERS)):
+            result[part] = cluster
+        return result
+    return np.array([found[id(view)] for view in views])

@@ -296,3 +296,23 @@ def test_views_compared_before_give_equal_support(given):
     change, compared = (BRICK, truth.tracks.poses, noisy, 0.1), {}
     for rows in ([4, 1], None):
         assert evidence.support(*change, rows, compared) == evidence.support(*change, rows)
+
+
+@pytest.mark.parametrize("given", ["slide"], indirect=True)
+def test_with_many_bodies_only_gaussians_near_a_change_are_drawn(given, monkeypatch):
+    _, truth, data = given
+    evidence, noisy = evidence_of(truth, data), with_noise(truth, 0.02, 0.02).tracks.poses
+    counts, draw, found = [], scene_renderer.render_frame, []
+
+    def counted(scene, posed, camera, **options):
+        counts[-1] += len(posed.means)
+        return draw(scene, posed, camera, **options)
+
+    monkeypatch.setattr(scene_renderer, "render_frame", counted)
+    for few in (image_evidence.FEW, 1):
+        monkeypatch.setattr(image_evidence, "FEW", few)
+        counts.append(0)
+        support = evidence.support(BRICK, truth.tracks.poses, noisy, 0.1)
+        found.append((evidence.loss(noisy), *dataclasses.astuple(support)))
+    assert counts[1] < 0.8 * counts[0]
+    assert found[1] == pytest.approx(found[0], rel=1e-3)
