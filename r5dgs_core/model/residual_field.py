@@ -48,26 +48,33 @@ class ResidualField:
         nodes: Canonical positions. [Q, 3]
         owners: Motion group of each node. [Q] int64
         values: d and the rows of l at the knots. [S, Q, 4, 3]
+        sizes: Length and spacing of each body, as from another field with the same nodes; None to measure them.
     """
 
-    def __init__(self, nodes: Tensor, owners: Tensor, values: Tensor):
+    def __init__(
+        self,
+        nodes: Tensor,
+        owners: Tensor,
+        values: Tensor,
+        sizes: dict[int, tuple[float, float]] | None = None,
+    ):
         self.nodes = nodes
         self.owners = owners
         self.values = values.detach().requires_grad_(True)
         self.bodies: list[int] = owners.unique().tolist()
         self._slots, self._there = _padded(owners, self.bodies)
-        sizes = [_lengths(nodes[owners == body]) for body in self.bodies]
-        self._lengths = nodes.new_tensor([length for length, _ in sizes]).reshape(-1, 1, 1)
-        self._spacings = nodes.new_tensor([spacing for _, spacing in sizes]).reshape(-1, 1, 1)
-        self._share = nodes.new_ones(len(nodes), 1, 1)  # 1 / length of each node's body
-        for body, (length, _) in zip(self.bodies, sizes, strict=True):
-            self._share[owners == body] = 1 / length
+        self._sizes = sizes or {body: _lengths(nodes[owners == body]) for body in self.bodies}
+        mine = [self._sizes[body] for body in self.bodies]
+        self._lengths = nodes.new_tensor([length for length, _ in mine]).reshape(-1, 1, 1)
+        self._spacings = nodes.new_tensor([spacing for _, spacing in mine]).reshape(-1, 1, 1)
+        shares = nodes.new_tensor([1 / length for length, _ in mine]).reshape(-1, 1, 1)
+        self._share = shares[owners.unique(return_inverse=True)[1]]  # 1 / length of each node's body
         self._members: Remembered[tuple[Tensor, Tensor, Tensor]] = Remembered()
 
     def only(self, bodies: list[int]) -> ResidualField:
         """Return the field of some of its bodies."""
         kept = torch.isin(self.owners, self.owners.new_tensor(bodies))
-        return ResidualField(self.nodes[kept], self.owners[kept], self.values.detach()[:, kept].clone())
+        return ResidualField(self.nodes[kept], self.owners[kept], self.values.detach()[:, kept].clone(), self._sizes)
 
     def change(
         self,
@@ -140,13 +147,15 @@ class ResidualField:
 
 
 def _padded(ids: Tensor, bodies: list[int]) -> tuple[Tensor, Tensor]:
-    """Rows with each body's id, padded with zeros, and the mask of valid entries. [F, largest count]"""
-    found = [torch.nonzero(ids == body)[:, 0] for body in bodies]
-    most = max((len(rows) for rows in found), default=0)
-    index = ids.new_zeros(len(bodies), most, dtype=torch.int64)
+    """Rows with the id of each body, ascending, padded with zeros, and the mask of valid entries. [F, largest count]"""
+    wanted = ids.new_tensor(bodies)  # ascending
+    rows = torch.nonzero(torch.isin(ids, wanted))[:, 0]
+    slots, order = torch.searchsorted(wanted, ids[rows]).sort(stable=True)
+    counts = torch.bincount(slots, minlength=len(bodies))
+    columns = torch.arange(len(rows), device=ids.device) - (counts.cumsum(0) - counts)[slots]
+    index = ids.new_zeros(len(bodies), int(counts.max()) if bodies else 0, dtype=torch.int64)
     there = torch.zeros_like(index, dtype=torch.bool)
-    for k, rows in enumerate(found):
-        index[k, : len(rows)], there[k, : len(rows)] = rows, True
+    index[slots, columns], there[slots, columns] = rows[order], True
     return index, there
 
 

@@ -136,6 +136,25 @@ def test_nodes_spread_over_each_body_and_strays_carry_none():
     assert field_on(means, ids, weights, (1, 9)).bodies == [1]
 
 
+def test_a_part_of_a_field_measures_no_body_again(monkeypatch):
+    means, quats, weights, ids = random_state(300)
+    field = field_on(means, ids, weights, nodes=12)
+    field.values = torch.randn_like(field.values)
+    fresh = residual_field.ResidualField(
+        *(x[field.owners == 2] for x in (field.nodes, field.owners)), field.only([2]).values
+    )
+    monkeypatch.setattr(residual_field, "_lengths", None)
+    found = [f.change(means, quats, weights, ids, {1: 1.0}) for f in (field.only([2]), fresh)]
+    assert torch.equal(found[0].rows, torch.nonzero(ids == 2)[:, 0])
+    assert torch.equal(found[0].offsets, found[1].offsets) and found[0].offsets.abs().max() > 0
+
+
+def test_rows_of_bodies_are_padded_to_the_largest():
+    index, there = residual_field._padded(torch.tensor([7, 2, 0, 7, 7, 5]), [2, 5, 7])
+    assert index.tolist() == [[1, 0, 0], [5, 0, 0], [0, 3, 4]]
+    assert there.tolist() == [[True, False, False], [True, False, False], [True, True, True]]
+
+
 def test_a_field_without_bodies_changes_nothing():
     means, quats, weights, ids = random_state()
     field = field_on(means, ids, weights).only([])
