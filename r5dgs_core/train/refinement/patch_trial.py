@@ -26,8 +26,10 @@ log = logging.getLogger(__name__)
 
 MOMENTS = 10  # times whose pictures are compared
 PATCHES = 4000  # in all pictures
+MANY = 2  # factor of both for clocks alone, which only moving surfaces determine
 MOST_POSES = 24
 FAR = 1.0  # change of the poses after which the depth of the scene is not good enough, px
+MOVING = 0.2  # motion between two times above which a surface is taken to move, px
 NEAR = 0.75  # distance of a picture from its time, spacings of the observed times
 BESIDE = 1.5  # distance of the previous and the next picture, likewise
 
@@ -60,12 +62,9 @@ def adjust(trainer: Trainer, points: np.ndarray) -> Found | None:
     rig, step = refinement.rig, spacing(trainer.times)
     if rig.poses != rig.lenses or rig.poses > MOST_POSES:
         return None
-    depth_views = _depth_views(trainer)
-    corrections = [refinement.correction(row) for row in range(rig.poses)]
-    units = np.stack([gauge.pixel_units(camera, points) for camera in rig.cameras])
-    cameras = Cameras(rig.cameras, corrections, units, step)
-    each = max(1, PATCHES // max(1, len(depth_views)))
-    compared = patches.find(depth_views, cameras.corrected(), each)
+    depth_views = _depth_views(trainer, MOMENTS, carried=False)
+    cameras = _cameras(trainer, points)
+    compared = patches.find(depth_views, cameras.corrected(), max(1, PATCHES // max(1, len(depth_views))))
 
     def size(part: str, first: np.ndarray, second: np.ndarray) -> float:
         return agreement.agreed(part, rig.cameras, first, second, points, step)
@@ -88,8 +87,41 @@ def adjust(trainer: Trainer, points: np.ndarray) -> Found | None:
     return Found({part: changes[part] for part in parts}, moved <= FAR)
 
 
-def _depth_views(trainer: Trainer) -> list[DepthView]:
-    """Return pictures of all cameras at some times."""
+def adjust_clocks(trainer: Trainer, points: np.ndarray) -> np.ndarray | None:
+    """Adjust the clocks of a run whose poses have been adjusted, once the motion of its scene is known.
+
+    The motion carries the patches between the times of two pictures, so that fast surfaces count, too. The poses are
+    free in the equations, but are not changed.
+
+    Args:
+        trainer: The run.
+        points: Points of the scene, for the units of the poses. [N, 3]
+
+    Returns:
+        The changes [R]; None if two halves of the patches do not agree that the given clocks are wrong.
+    """
+    rig, step = trainer.refinement.rig, spacing(trainer.times)
+    depth_views = _depth_views(trainer, MANY * MOMENTS, carried=True)
+    cameras = _cameras(trainer, points)
+    compared = patches.find(depth_views, cameras.corrected(), max(1, MANY * PATCHES // max(1, len(depth_views))))
+    found = patch_adjustment.adjust(depth_views, cameras, compared, clocks=True)
+    least = trainer.config.refine.intervals
+    if found is None or agreement.agreed(CLOCKS, rig.cameras, *found.halves, points, step) <= least:
+        return None
+    changes = found.changes[:, TIME.start]
+    log.info("moving patches change the clocks by up to %.2g intervals", np.abs(changes).max() / step)
+    return changes
+
+
+def _cameras(trainer: Trainer, points: np.ndarray) -> Cameras:
+    refinement = trainer.refinement
+    corrections = [refinement.correction(row) for row in range(refinement.rig.poses)]
+    units = np.stack([gauge.pixel_units(camera, points) for camera in refinement.rig.cameras])
+    return Cameras(refinement.rig.cameras, corrections, units, spacing(trainer.times))
+
+
+def _depth_views(trainer: Trainer, moments: int, *, carried: bool) -> list[DepthView]:
+    """Return pictures of all cameras at some times; ``carried`` if the motion of the scene is known."""
     rig, step = trainer.refinement.rig, spacing(trainer.times)
     series = []
     for row in range(rig.poses):
@@ -97,32 +129,41 @@ def _depth_views(trainer: Trainer) -> list[DepthView]:
         series.append(sorted(mine, key=lambda view: view.t))
     inner = trainer.times[1:-1] if len(trainer.times) > 3 else trainer.times
     found = []
-    for moment, t in enumerate(spread(list(inner), MOMENTS)):
+    for moment, t in enumerate(spread(list(inner), moments)):
         for row, views in enumerate(series):
             at = int(np.argmin([abs(view.t - t) for view in views]))
             if abs(views[at].t - t) <= NEAR * step:
-                found.append(_depth_view(trainer, row, moment, views, at))
+                found.append(_depth_view(trainer, row, moment, views, at, carried))
     return found
 
 
 @torch.no_grad()
-def _depth_view(trainer: Trainer, row: int, moment: int, views: Sequence[TrainView], at: int) -> DepthView:
+def _depth_view(
+    trainer: Trainer, row: int, moment: int, views: Sequence[TrainView], at: int, carried: bool
+) -> DepthView:
     view, correction = views[at], trainer.refinement.correction(row)
     camera, t = correction.camera(view.camera), view.t + correction.time
+    step = spacing(trainer.times)
     splats = trainer.splats(camera, t)
-    shapes = splats.means, splats.quats, splats.scales, splats.opacities
-    drawn = rasterize_splats(*shapes, splats.colors, camera)
-    known = to_host(drawn.alpha) > patches.OPAQUE
-    mask, left_out, alpha = view.mask, view.unexplained, view.alpha
+    velocities = torch.zeros_like(splats.means)
+    if carried:
+        velocities = (trainer.splats(camera, t + step).means - trainer.splats(camera, t - step).means) / (2 * step)
+    drawn = rasterize_splats(splats.means, splats.quats, splats.scales, splats.opacities, velocities, camera)
+    alpha, depth = to_host(drawn.alpha), to_host(drawn.depth)
+    known = alpha > patches.OPAQUE
+    velocity = to_host(drawn.image) / np.maximum(alpha, 1e-6)[..., None]
+    moving = np.linalg.norm(velocity, axis=2) * step * camera.intrinsics[0, 0] > MOVING * depth
+    velocity[~moving] = 0
+    mask, left_out, opaque = view.mask, view.unexplained, view.alpha
     if mask is not None:
         known &= mask != masks.UNKNOWN
     if left_out is not None:
         known &= ~left_out
-    if alpha is not None:
-        known &= alpha > 127
+    if opaque is not None:
+        known &= opaque > 127
     beside = [view, view]
-    reach = BESIDE * spacing(trainer.times)
-    if 0 < at < len(views) - 1 and views[at + 1].t - views[at - 1].t <= 2 * reach:
+    if 0 < at < len(views) - 1 and views[at + 1].t - views[at - 1].t <= 2 * BESIDE * step:
         beside = [views[at - 1], views[at + 1]]
     images = [correction.unseen(one.image / np.float32(255)) for one in (beside[0], view, beside[1])]
-    return patches.depth_view(row, moment, view.t, images, beside[1].t - beside[0].t, to_host(drawn.depth), known)
+    span = beside[1].t - beside[0].t
+    return patches.depth_view(row, moment, view.t, images, span, depth, velocity, known)

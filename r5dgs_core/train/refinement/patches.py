@@ -43,8 +43,9 @@ class DepthView:
         pose: Row of its camera.
         moment: Number of its time; pictures of one moment are compared.
         t: Its time as given.
-        layers: Colours, their slopes along x and y (per px) and along time. [12, H, W] float32
-        inverse: Inverse depth of the scene, 0 where it is unknown or transparent, or moves too fast. [H, W]
+        layers: Colours, their slopes along x and y (per px), and along time (0 if it moves). [12, H, W] float32
+        inverse: Inverse depth of the scene, 0 where it is unknown or transparent, or its light changes too fast. [H, W]
+        velocity: Velocity of the surface, world frame; 0 where it is at rest or unknown. [H, W, 3]
     """
 
     pose: int
@@ -52,27 +53,38 @@ class DepthView:
     t: float
     layers: np.ndarray
     inverse: np.ndarray
+    velocity: np.ndarray
 
 
 def depth_view(
-    pose: int, moment: int, t: float, images: Sequence[np.ndarray], span: float, depth: np.ndarray, known: np.ndarray
+    pose: int,
+    moment: int,
+    t: float,
+    images: Sequence[np.ndarray],
+    span: float,
+    depth: np.ndarray,
+    velocity: np.ndarray,
+    known: np.ndarray,
 ) -> DepthView:
-    """Return an image with its slopes and the depth of the scene.
+    """Return an image with its slopes, and the depth and velocity of the scene.
 
     Args:
         pose, moment, t: As in `DepthView`.
         images: The previous image, the image, and the next one, in the scene's colours. [H, W, 3] each
         span: Time between the previous and the next image; 0 if there are none.
         depth: Depth of the scene. [H, W]
+        velocity: As in `DepthView`.
         known: Pixels at which image and depth are known. [H, W] bool
     """
     before, image, after = (ndimage.gaussian_filter(one.astype(np.float32), (BLUR, BLUR, 0)) for one in images)
     by_y, by_x = np.gradient(image, axis=(0, 1))
     by_time = (after - before) / span if span > 0 else np.zeros_like(image)
+    moving = velocity.any(axis=2)  # the motion of the surface then replaces the slope of its colours
+    by_time[moving] = 0
     layers = np.concatenate([image, by_x, by_y, by_time], axis=2).transpose(2, 0, 1)
-    usable = known & ~_uneven(before, image, after)
+    usable = known & (moving | ~_uneven(before, image, after))
     inverse = np.where(usable, 1 / np.maximum(depth, 1e-6), 0.0)
-    return DepthView(pose, moment, t, np.ascontiguousarray(layers, np.float32), inverse)
+    return DepthView(pose, moment, t, np.ascontiguousarray(layers, np.float32), inverse, velocity)
 
 
 def _uneven(before: np.ndarray, image: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -208,7 +220,10 @@ def differences(
     inverse = np.maximum(planes @ PLANE.T, 1e-6)
     p_host = in_camera(host.camera, pixels, inverse)
     turn = target.camera.T_cam_world[:3, :3] @ host.camera.T_cam_world[:3, :3].T
+    col, row = (pixels - 0.5).astype(int).transpose(2, 0, 1)
+    velocity = host.depth_view.velocity[row, col] @ target.camera.T_cam_world[:3, :3].T
     p = p_host @ turn.T + target.camera.T_cam_world[:3, 3] - turn @ host.camera.T_cam_world[:3, 3]
+    p += velocity * (target.t - host.t)
     z = np.maximum(p[..., 2], 1e-6)
     focal = np.diag(target.camera.intrinsics)[:2]
     x, y = (p[..., :2] / z[..., None] * focal + target.camera.intrinsics[:2, 2] - 0.5).transpose(2, 0, 1)
@@ -217,7 +232,6 @@ def differences(
         [ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in target.depth_view.layers], -1
     )
     shown, by_x, by_y, by_time = np.split(layers, 4, axis=-1)  # [M, N, 3] each
-    col, row = (pixels - 0.5).astype(int).transpose(2, 0, 1)
     own = host.depth_view.layers[:, row, col].transpose(1, 2, 0)
     shown = shown + by_time * (host.t - target.t)
     shown, wanted = (one - one.mean(1, keepdims=True) for one in (shown, own[..., :3]))
@@ -226,6 +240,7 @@ def differences(
     by_p = np.empty((*by_x.shape, 3))
     by_p[..., 0], by_p[..., 1] = by_x * (focal[0] / z)[..., None], by_y * (focal[1] / z)[..., None]
     by_p[..., 2] = -(by_p[..., 0] * (p[..., 0] / z)[..., None] + by_p[..., 1] * (p[..., 1] / z)[..., None])
+    by_time = by_time - (by_p * velocity[:, :, None]).sum(-1)
     by_host = by_p @ turn
     slopes = np.empty((*by_x.shape, SHAPE.stop), np.float32)
     slopes[..., :3] = -np.cross((p_host - host.pivot)[:, :, None], by_host)

@@ -92,6 +92,11 @@ def decide(trainer: Trainer, possible: Sequence[str]) -> None:
     if patched is not None:
         refinement.change(patched.changes, final=patched.final)
         helpful = helpful - {CLOCKS} | patched.changes.keys()
+    if (
+        CLOCKS in refinement.settled and trainer.iteration in steps(config)[2:3]
+    ):  # the times that entered last are trained
+        later = patch_trial.adjust_clocks(trainer, some)
+        refinement.change({} if later is None else {CLOCKS: later}, final=True)
     taken = [part for part in PARTS if part in forced | helpful | refinement.parts]
     log.info("cameras, step %d: %s; refined: %s", trainer.iteration, _text(evidence), ", ".join(taken) or "nothing")
     if not taken:

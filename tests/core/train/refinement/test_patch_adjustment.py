@@ -5,6 +5,7 @@ import functools
 import math
 
 import numpy as np
+import pytest
 
 from r5dgs_core.config.sections.training import RefineSection
 from r5dgs_core.scene import cameras
@@ -25,24 +26,26 @@ def texture(places):
     return 0.5 + 0.06 * np.sin(phase[..., None] + WAVES[1]).sum(-2)
 
 
-def drawn(camera, t):
-    """Image of the plane z = 0, whose texture moves on a circle, and the depth."""
+def drawn(camera, t, rate=9):
+    """Image of the plane z = 0, whose texture moves on a circle, the depth, and the velocity."""
     rays = cameras.pixel_rays(camera)
     depth = -camera.center[2] / rays[..., 2]
     places = (camera.center + depth[..., None] * rays)[..., :2]
-    shift = 0.15 * np.array([math.cos(9 * t), math.sin(9 * t)])
-    return texture(places - shift), depth * (rays @ camera.forward)
+    shift = 0.15 * np.array([math.cos(rate * t), math.sin(rate * t)])
+    velocity = np.broadcast_to([-rate * shift[1], rate * shift[0], 0], (SIZE, SIZE, 3))
+    return texture(places - shift), depth * (rays @ camera.forward), velocity
 
 
 @functools.cache
-def depth_views(late=(0.0,) * 5, contrast=1.0):
-    """Pictures of the true cameras with clocks that are late, and the true depths."""
+def depth_views(late=(0.0,) * 5, contrast=1.0, rate=9, carried=False):
+    """Pictures of the true cameras with clocks that are late, the true depths, and the true velocities if carried."""
     found = []
     for moment, t in enumerate(np.linspace(0.1, 0.6, MOMENTS)):
         for pose, camera in enumerate(RIG):
-            images = [0.5 + contrast * (drawn(camera, t + late[pose] + h)[0] - 0.5) for h in (-STEP, 0, STEP)]
-            depth = drawn(camera, t)[1]
-            found.append(patches.depth_view(pose, moment, t, images, 2 * STEP, depth, np.ones((SIZE, SIZE), bool)))
+            images = [0.5 + contrast * (drawn(camera, t + late[pose] + h, rate)[0] - 0.5) for h in (-STEP, 0, STEP)]
+            depth, velocity = drawn(camera, t, rate)[1:]
+            known = np.ones((SIZE, SIZE), bool)
+            found.append(patches.depth_view(pose, moment, t, images, 2 * STEP, depth, carried * velocity, known))
     return found
 
 
@@ -76,8 +79,9 @@ def corrected(given, changes):
     return [Correction().plus(row).camera(camera) for row, camera in zip(changes, given, strict=True)]
 
 
-def test_slopes_are_those_of_the_differences():
-    seen = depth_views()
+@pytest.mark.parametrize("carried", [False, True])
+def test_slopes_are_those_of_the_differences(carried):
+    seen = depth_views(carried=carried)
     found = patches.find(seen, RIG, EACH)
     pair = int(np.flatnonzero(found.target != found.host[found.patch])[7])
     here = found.patch[pair : pair + 1]
@@ -111,6 +115,16 @@ def test_wrong_poses_and_clocks_are_found_together():
     limits = RefineSection()
     assert agreement.agreed(POSES, given, *found.halves, POINTS, STEP) > limits.pixels
     assert agreement.agreed(CLOCKS, given, *found.halves, POINTS, STEP) > limits.intervals
+
+
+def test_the_motion_of_the_scene_gives_clocks_of_what_moves_too_fast_for_slopes():
+    late = STEP * np.array([0.2, -0.15, 0.1, -0.25, 0.1])
+    errors = []
+    for carried in (False, True):
+        found = adjusted(depth_views(tuple(late), rate=60, carried=carried), RIG)
+        off = -late if found is None else found.changes[:, TIME.start] - late
+        errors.append(np.abs(off - off.mean()).max())
+    assert errors[1] < 0.04 * STEP < 2 * errors[1] + errors[0] and errors[1] < 0.25 * errors[0]
 
 
 def test_exact_cameras_need_no_correction():

@@ -212,6 +212,25 @@ def test_an_adjustment_to_patches_replaces_training_once_it_is_final(tiny, monke
     assert np.allclose(found, kept, atol=1e-9) == final
 
 
+def test_adjusted_clocks_are_adjusted_once_more_when_the_motion_is_known(tiny, monkeypatch):
+    due, calls = trial.steps(tiny_datasets.settings(*tiny_datasets.EXAMINED, *STEPS))[2], []
+
+    def adjust(trainer, points):
+        count = trainer.refinement.rig.poses
+        return patch_trial.Found({"camera_poses": np.zeros((count, 6)), "time_offsets": np.zeros(count)}, True)
+
+    def adjust_clocks(trainer, points):
+        calls.append(trainer.iteration)
+        return 0.01 * np.arange(trainer.refinement.rig.poses)
+
+    monkeypatch.setattr(patch_trial, "adjust", adjust)
+    monkeypatch.setattr(patch_trial, "adjust_clocks", adjust_clocks)
+    trainer = train(datasets.read(tiny.root), "needs.camera_poses=on", "needs.camera_colours=off")
+    times = [trainer.refinement.correction(row).time for row in range(trainer.refinement.rig.poses)]
+    assert calls == [due]
+    assert np.allclose(np.diff(times), 0.01)
+
+
 def test_pictures_that_share_too_little_adjust_nothing(tiny):
     trainer = train(datasets.read(tiny.root), *(f"needs.{part}=off" for part in PARTS[:3]), stop=5)
     assert patch_trial.adjust(trainer, trainer.gaussians.means.detach().numpy()) is None
