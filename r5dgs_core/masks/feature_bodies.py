@@ -9,7 +9,7 @@ Notation: P points, C matches, H hypotheses. A pose [3, 4] maps points of the bo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -49,9 +49,18 @@ class Body:
         return np.concatenate([undone(self.poses[k], times[k].places[sorted(rows)]) for k, rows in self.rows.items()])
 
 
-def find(times: Sequence[Points], rng: np.random.Generator) -> list[Body]:
-    """Find the rigid bodies that move among the points of several times, the largest first."""
-    search = _Search(times, rng)
+def find(
+    times: Sequence[Points], rng: np.random.Generator, report: Callable[[float], None] = lambda share: None
+) -> list[Body]:
+    """Find the rigid bodies that move among the points of several times, the largest first.
+
+    Args:
+        times: The points of each time.
+        rng: Source of the hypotheses.
+        report: Called with the share of the search that is done: of the pairs of times that may be matched, which take
+            most of its time.
+    """
+    search = _Search(times, rng, report)
     found: list[Body] = []
     for _ in range(TRIALS):
         body = search.start() if len(found) < MAX_BODIES else None
@@ -76,8 +85,9 @@ def undone(pose: np.ndarray, places: np.ndarray) -> np.ndarray:
 class _Search:
     """Points of all times, their matches, and the points that belong to a body already."""
 
-    def __init__(self, times: Sequence[Points], rng: np.random.Generator):
-        self._times, self._rng = times, rng
+    def __init__(self, times: Sequence[Points], rng: np.random.Generator, report: Callable[[float], None]):
+        self._times, self._rng, self._report = times, rng, report
+        self._pairs = sum(max(len(times) - gap, 0) for gap in range(1, max(GAPS) + 1))
         self._matches: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         self._taken = [np.zeros(len(points.places), bool) for points in times]
 
@@ -170,6 +180,7 @@ class _Search:
             return b, a
         if (i, j) not in self._matches:
             self._matches[i, j] = matches(self._times[i], self._times[j])
+            self._report(min(1.0, len(self._matches) / self._pairs))
         return self._matches[i, j]
 
     def _registered(self, places: np.ndarray, k: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

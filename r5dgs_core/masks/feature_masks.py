@@ -131,7 +131,10 @@ def find(views: Sequence[View], report: Callable[[float], None]) -> list[_Track]
     for group in groups:
         found.append(triangulate([features(datasets.load_image_8bit(view), view.camera) for view in group]))
         report(EXTRACTION * sum(len(one.cameras) for one in found) / total)
-    made = [_track(body, found, times) for body in feature_bodies.find(found, np.random.default_rng(SEED))]
+    bodies = feature_bodies.find(
+        found, np.random.default_rng(SEED), lambda share: report(EXTRACTION + (1 - EXTRACTION) * share)
+    )
+    made = [_track(body, found, times) for body in bodies]
     report(1.0)
     if not made:
         count = round(float(np.median([len(one.places) for one in found]))) if found else 0

@@ -6,7 +6,7 @@ Notation: F features of an image, V cameras of a time, P points, D descriptors o
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,7 @@ CONTRAST = 0.015  # threshold of SIFT; the default of 0.04 misses weak texture
 RATIO = 0.8  # maximum distance of the best match relative to that of the second best
 EPIPOLAR = 1.5  # maximum distance of a match from its epipolar line, and of a point from its pixels, pixels
 PARALLAX = 0.03  # minimum angle between two rays of a point, rad
+BLOCK = 512  # descriptors that are compared with all others at once, which bounds the memory
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,9 @@ def triangulate(found: Sequence[Features]) -> Points:
 
 def matches(one: Points, other: Points) -> tuple[np.ndarray, np.ndarray]:
     """Match the points of two times by their descriptors. Returns the matching rows of both. [C], [C]"""
-    rows, columns = _mutual(one.descriptors @ other.descriptors.T, other.owners)
+    starts = range(0, len(one.descriptors), BLOCK)
+    blocks = (one.descriptors[start : start + BLOCK] @ other.descriptors.T for start in starts)
+    rows, columns = _mutual(blocks, other.owners)
     pairs = np.unique(np.stack([one.owners[rows], other.owners[columns]], 1), axis=0)
     return pairs[:, 0], pairs[:, 1]
 
@@ -136,7 +139,7 @@ def _connected(found: Sequence[Features]) -> tuple[np.ndarray, np.ndarray]:
     for a, b in itertools.combinations(range(len(found)), 2):
         likeness = found[a].descriptors @ found[b].descriptors.T
         likeness[_epipolar_distances(found[a], found[b]) > EPIPOLAR] = -1
-        rows, columns = _mutual(likeness, np.arange(likeness.shape[1]))
+        rows, columns = _mutual([likeness], np.arange(likeness.shape[1]))
         links.append(np.stack([starts[a] + rows, starts[b] + columns], 1))
     a, b = np.concatenate(links).T
     graph = sparse.coo_matrix((np.ones(len(a)), (a, b)), shape=(starts[-1], starts[-1]))
@@ -151,16 +154,31 @@ def _epipolar_distances(one: Features, other: Features) -> np.ndarray:
     return across / np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
 
 
-def _mutual(likeness: np.ndarray, owners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows and columns that are most alike, if the row is clearly less like all columns of other owners."""
-    if min(likeness.shape) == 0:
+def _mutual(blocks: Iterable[np.ndarray], owners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows and columns that are most alike, if the row is clearly less like all columns of other owners.
+
+    Args:
+        blocks: Likeness of successive rows to all columns. [B, C] each
+        owners: Owner of each column. [C]
+    """
+    if not len(owners):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    rows, best = np.arange(len(likeness)), likeness.argmax(1)
-    first = likeness[rows, best]
-    second = np.where(owners[None, :] == owners[best][:, None], -1, likeness).max(1)
-    nearer = np.sqrt(np.maximum(2 - 2 * first, 0)) < RATIO * np.sqrt(np.maximum(2 - 2 * second, 0))
-    good = (likeness.argmax(0)[best] == rows) & (first > 0) & nearer
-    return rows[good], best[good]
+    best, good, count = [np.zeros(0, np.int64)], [np.zeros(0, bool)], 0
+    highest, row_of = np.full(len(owners), -np.inf), np.full(len(owners), -1)  # of each column, so far
+    for likeness in blocks:
+        mine, tops = likeness.argmax(1), likeness.argmax(0)
+        first = np.take_along_axis(likeness, mine[:, None], 1)[:, 0]
+        second = np.where(owners[None, :] == owners[mine][:, None], -1, likeness).max(1)
+        nearer = np.sqrt(np.maximum(2 - 2 * first, 0)) < RATIO * np.sqrt(np.maximum(2 - 2 * second, 0))
+        best.append(mine)
+        good.append((first > 0) & nearer)
+        values = np.take_along_axis(likeness, tops[None], 0)[0]
+        row_of = np.where(values > highest, count + tops, row_of)
+        highest = np.maximum(highest, values)
+        count += len(likeness)
+    columns = np.concatenate(best)
+    rows = np.flatnonzero(np.concatenate(good) & (row_of[columns] == np.arange(count)))
+    return rows, columns[rows]
 
 
 def _ranks(good: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.masks import feature_bodies as bodies
+from r5dgs_core.masks import feature_points
 from r5dgs_core.masks.feature_points import Points, matches
 from r5dgs_core.motion import rotations
 from r5dgs_core.scene.cameras import Camera, project
@@ -78,6 +79,47 @@ def test_a_body_must_be_registered_at_enough_times(moments):
     rng = np.random.default_rng(2)
     empty = [seen(rng.uniform(-1, 1, (30, 3)), rng.integers(1000, 9999, 30), rng) for _ in range(40)]
     assert bodies.find(times + empty, np.random.default_rng(0)) == []
+
+
+def test_matches_do_not_depend_on_the_size_of_blocks(moments, monkeypatch):
+    one, other = moments[0][0], moments[3][0]
+    whole = matches(one, other)
+    assert len(whole[0]) > 50
+    sizes = []
+    mutual = feature_points._mutual
+    monkeypatch.setattr(feature_points, "BLOCK", 7)
+    monkeypatch.setattr(
+        feature_points,
+        "_mutual",
+        lambda blocks, owners: mutual((sizes.append(block.size) or block for block in blocks), owners),
+    )
+    for found, expected in zip(matches(one, other), whole, strict=True):
+        np.testing.assert_array_equal(found, expected)
+    assert max(sizes) == 7 * len(other.descriptors)
+
+
+def test_an_equal_row_of_a_later_block_does_not_replace_the_first():
+    likeness = np.array([[0.9, 0.1], [0.2, 0.8], [0.9, 0.3]], np.float32)
+    for blocks in ([likeness], list(likeness[:, None])):
+        rows, columns = feature_points._mutual(blocks, np.arange(2))
+        assert (rows.tolist(), columns.tolist()) == ([0, 1], [0, 1])
+
+
+@pytest.mark.parametrize(("count", "other"), [(0, 5), (5, 0), (0, 0)])
+def test_times_without_points_have_no_matches(count, other):
+    rng = np.random.default_rng(3)
+    times = [
+        Points(CAMERAS, np.zeros((n, 3)), np.zeros((n, 3, 2)), np.arange(n), rng.random((n, 128), np.float32))
+        for n in (count, other)
+    ]
+    assert [len(rows) for rows in matches(*times)] == [0, 0]
+
+
+def test_the_search_reports_its_progress(moments):
+    shares = []
+    bodies.find([points for points, _ in moments], np.random.default_rng(0), shares.append)
+    assert shares == sorted(shares) and shares[0] < 0.1 and len(set(shares)) >= 20
+    assert 0.8 < shares[-1] <= 1.0
 
 
 def test_equal_descriptors_do_not_match_and_cause_no_warning():

@@ -141,6 +141,13 @@ def test_times_between_those_that_are_searched_have_interpolated_masks(carried, 
             assert (mask == 1).any(), view.name
 
 
+def test_the_search_for_bodies_is_part_of_the_progress(carried):
+    shares = []
+    feature_masks.find(datasets.read(carried).train, shares.append)
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    assert sum(feature_masks.EXTRACTION < share < 1.0 for share in shares) >= TIMES
+
+
 def test_large_images_are_reduced(carried, monkeypatch, tmp_path):
     monkeypatch.setattr(feature_points, "MAX_SIDE", 400)
     monkeypatch.setattr(feature_masks, "MAX_SIDE", 200)
