@@ -48,7 +48,7 @@ class ResidualField:
         nodes: Canonical positions. [Q, 3]
         owners: Motion group of each node. [Q] int64
         values: d and the rows of l at the knots. [S, Q, 4, 3]
-        sizes: Length and spacing of each body, as from another field with the same nodes; None to measure them.
+        sizes: Length and spacing of each body, by id, of a field with the same nodes; None to measure them.
     """
 
     def __init__(
@@ -61,14 +61,15 @@ class ResidualField:
         self.nodes = nodes
         self.owners = owners
         self.values = values.detach().requires_grad_(True)
-        self.bodies: list[int] = owners.unique().tolist()
+        bodies, body_of = owners.unique(return_inverse=True)
+        self.bodies: list[int] = bodies.tolist()
         self._slots, self._there = _padded(owners, self.bodies)
         self._sizes = sizes or {body: _lengths(nodes[owners == body]) for body in self.bodies}
         mine = [self._sizes[body] for body in self.bodies]
         self._lengths = nodes.new_tensor([length for length, _ in mine]).reshape(-1, 1, 1)
         self._spacings = nodes.new_tensor([spacing for _, spacing in mine]).reshape(-1, 1, 1)
         shares = nodes.new_tensor([1 / length for length, _ in mine]).reshape(-1, 1, 1)
-        self._share = shares[owners.unique(return_inverse=True)[1]]  # 1 / length of each node's body
+        self._share = shares[body_of]  # 1 / length of each node's body
         self._members: Remembered[tuple[Tensor, Tensor, Tensor]] = Remembered()
 
     def only(self, bodies: list[int]) -> ResidualField:

@@ -19,17 +19,17 @@ from ..train_views import TrainView
 from ..trainer import Trainer
 from . import agreement, gauge, patch_adjustment, patches
 from .patch_adjustment import Cameras
-from .patches import DepthView
+from .patches import DepthView, Patches
 from .refinement import CLOCKS, POSES
 
 log = logging.getLogger(__name__)
 
 MOMENTS = 10  # times whose pictures are compared
 PATCHES = 4000  # in all pictures
-MANY = 2  # factor of both for clocks alone, which only moving surfaces determine
+MANY = 2  # factor of both for an adjustment of the clocks alone, which only moving surfaces determine
 MOST_POSES = 24
 FAR = 1.0  # change of the poses after which the depth of the scene is not good enough, px
-MOVING = 0.2  # motion between two times above which a surface is taken to move, px
+MOVING = 0.2  # least motion of a moving surface between two times, px
 NEAR = 0.75  # distance of a picture from its time, spacings of the observed times
 BESIDE = 1.5  # distance of the previous and the next picture, likewise
 
@@ -62,9 +62,7 @@ def adjust(trainer: Trainer, points: np.ndarray) -> Found | None:
     rig, step = refinement.rig, spacing(trainer.times)
     if rig.poses != rig.lenses or rig.poses > MOST_POSES:
         return None
-    depth_views = _depth_views(trainer, MOMENTS, carried=False)
-    cameras = _cameras(trainer, points)
-    compared = patches.find(depth_views, cameras.corrected(), max(1, PATCHES // max(1, len(depth_views))))
+    problem = _problem(trainer, points, carried=False)
 
     def size(part: str, first: np.ndarray, second: np.ndarray) -> float:
         return agreement.agreed(part, rig.cameras, first, second, points, step)
@@ -72,13 +70,13 @@ def adjust(trainer: Trainer, points: np.ndarray) -> Found | None:
     parts = [POSES]
     found = None
     if config.needs.time_offsets != "off" and len(trainer.times) > 3:
-        found = patch_adjustment.adjust(depth_views, cameras, compared, clocks=True)
+        found = patch_adjustment.adjust(*problem, clocks=True)
         late = 0.0 if found is None else size(CLOCKS, *found.halves)
         if late > config.refine.intervals:
             parts.append(CLOCKS)
             refinement.learn({CLOCKS: (late, math.nan)})
     if len(parts) == 1:
-        found = patch_adjustment.adjust(depth_views, cameras, compared, clocks=False)
+        found = patch_adjustment.adjust(*problem, clocks=False)
     if found is None or size(POSES, *found.halves) <= config.refine.pixels:
         return None
     changes = {POSES: found.changes[:, POSE], CLOCKS: found.changes[:, TIME.start]}
@@ -90,8 +88,8 @@ def adjust(trainer: Trainer, points: np.ndarray) -> Found | None:
 def adjust_clocks(trainer: Trainer, points: np.ndarray) -> np.ndarray | None:
     """Adjust the clocks of a run whose poses have been adjusted, once the motion of its scene is known.
 
-    The motion carries the patches between the times of two pictures, so that fast surfaces count, too. The poses are
-    free in the equations, but are not changed.
+    The motion carries the patches between the times of two pictures, so that fast surfaces count, too. Poses are
+    unknowns of the equations, but keep their values.
 
     Args:
         trainer: The run.
@@ -101,10 +99,7 @@ def adjust_clocks(trainer: Trainer, points: np.ndarray) -> np.ndarray | None:
         The changes [R]; None if two halves of the patches do not agree that the given clocks are wrong.
     """
     rig, step = trainer.refinement.rig, spacing(trainer.times)
-    depth_views = _depth_views(trainer, MANY * MOMENTS, carried=True)
-    cameras = _cameras(trainer, points)
-    compared = patches.find(depth_views, cameras.corrected(), max(1, MANY * PATCHES // max(1, len(depth_views))))
-    found = patch_adjustment.adjust(depth_views, cameras, compared, clocks=True)
+    found = patch_adjustment.adjust(*_problem(trainer, points, carried=True), clocks=True)
     least = trainer.config.refine.intervals
     if found is None or agreement.agreed(CLOCKS, rig.cameras, *found.halves, points, step) <= least:
         return None
@@ -113,15 +108,19 @@ def adjust_clocks(trainer: Trainer, points: np.ndarray) -> np.ndarray | None:
     return changes
 
 
-def _cameras(trainer: Trainer, points: np.ndarray) -> Cameras:
-    refinement = trainer.refinement
+def _problem(trainer: Trainer, points: np.ndarray, *, carried: bool) -> tuple[list[DepthView], Cameras, Patches]:
+    """Return the pictures, cameras and patches of an adjustment; ``carried`` if the motion of the scene is known."""
+    refinement, factor = trainer.refinement, MANY if carried else 1
+    depth_views = _depth_views(trainer, factor * MOMENTS, carried)
     corrections = [refinement.correction(row) for row in range(refinement.rig.poses)]
     units = np.stack([gauge.pixel_units(camera, points) for camera in refinement.rig.cameras])
-    return Cameras(refinement.rig.cameras, corrections, units, spacing(trainer.times))
+    cameras = Cameras(refinement.rig.cameras, corrections, units, spacing(trainer.times))
+    each = max(1, factor * PATCHES // max(1, len(depth_views)))
+    return depth_views, cameras, patches.find(depth_views, cameras.corrected(), each)
 
 
-def _depth_views(trainer: Trainer, moments: int, *, carried: bool) -> list[DepthView]:
-    """Return pictures of all cameras at some times; ``carried`` if the motion of the scene is known."""
+def _depth_views(trainer: Trainer, moments: int, carried: bool) -> list[DepthView]:
+    """Return pictures of all cameras at some times, with the velocity of the scene if ``carried``."""
     rig, step = trainer.refinement.rig, spacing(trainer.times)
     series = []
     for row in range(rig.poses):

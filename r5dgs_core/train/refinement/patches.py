@@ -43,9 +43,9 @@ class DepthView:
         pose: Row of its camera.
         moment: Number of its time; pictures of one moment are compared.
         t: Its time as given.
-        layers: Colours, their slopes along x and y (per px), and along time (0 if it moves). [12, H, W] float32
-        inverse: Inverse depth of the scene, 0 where it is unknown or transparent, or its light changes too fast. [H, W]
-        velocity: Velocity of the surface, world frame; 0 where it is at rest or unknown. [H, W, 3]
+        layers: Colours, their slopes along x and y (per px), and along time, 0 for moving surfaces. [12, H, W] float32
+        inverse: Inverse depth of the scene; 0 if it is unknown, or if colours change too fast for a slope. [H, W]
+        velocity: Velocity of the surface, world frame; 0 if it is at rest or unknown. [H, W, 3]
     """
 
     pose: int
@@ -79,7 +79,7 @@ def depth_view(
     before, image, after = (ndimage.gaussian_filter(one.astype(np.float32), (BLUR, BLUR, 0)) for one in images)
     by_y, by_x = np.gradient(image, axis=(0, 1))
     by_time = (after - before) / span if span > 0 else np.zeros_like(image)
-    moving = velocity.any(axis=2)  # the motion of the surface then replaces the slope of its colours
+    moving = velocity.any(axis=2)  # `differences` moves these surfaces, so their colours need no slope in time
     by_time[moving] = 0
     layers = np.concatenate([image, by_x, by_y, by_time], axis=2).transpose(2, 0, 1)
     usable = known & (moving | ~_uneven(before, image, after))
@@ -211,7 +211,8 @@ def differences(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compare patches [M] of one picture with another picture.
 
-    The mean colour of a patch does not count, nor the time between the pictures to first order.
+    The mean colour of a patch does not count, nor the time between the pictures to first order: a patch moves with its
+    velocity, or its colours change by their slope in time.
 
     Returns:
         Differences [M, 3 N], their slopes [M, 3 N, 17], and the correlation of each pair [M].

@@ -92,11 +92,11 @@ def decide(trainer: Trainer, possible: Sequence[str]) -> None:
     if patched is not None:
         refinement.change(patched.changes, final=patched.final)
         helpful = helpful - {CLOCKS} | patched.changes.keys()
-    if (
-        CLOCKS in refinement.settled and trainer.iteration in steps(config)[2:3]
-    ):  # the times that entered last are trained
+    # Not at once when all times have entered: the motion at the last of them has to be trained first.
+    if CLOCKS in refinement.settled and trainer.iteration in steps(config)[2:3]:
         later = patch_trial.adjust_clocks(trainer, some)
-        refinement.change({} if later is None else {CLOCKS: later}, final=True)
+        if later is not None:
+            refinement.change({CLOCKS: later}, final=True)
     taken = [part for part in PARTS if part in forced | helpful | refinement.parts]
     log.info("cameras, step %d: %s; refined: %s", trainer.iteration, _text(evidence), ", ".join(taken) or "nothing")
     if not taken:
