@@ -22,7 +22,7 @@ import numpy as np
 from scipy import optimize, sparse
 
 from ..data import masks
-from . import assignment, clustering, leave_one_out, segment_stack, supergaussians, tracklets
+from . import assignment, clustering, leave_one_out, segment_stack, supergaussians, tracklet_overlaps, tracklets
 
 GAIN = 0.5  # minimum mean gain per changed pixel, relative to the usual IoU, for many images
 FEW = 4  # number of images at which the minimum gain is doubled, because little evidence can agree by chance
@@ -136,7 +136,7 @@ def associate(
 
 def _objects(stack: segment_stack.SegmentStack, runs: np.ndarray) -> tuple[np.ndarray, int]:
     """Initial objects [S], 0 = background, -1 = none, and their number K."""
-    of_runs = clustering.cluster(clustering.gather(stack, runs))
+    of_runs = clustering.cluster(tracklet_overlaps.gather(stack, runs))
     labels = np.where(runs >= 0, of_runs[runs] + 1, 0)
     # Repeat with lower weights for Gaussians that several objects share, because they are misplaced.
     cast = sparse.csc_matrix(leave_one_out.cast(stack, labels, int(labels.max())))
@@ -146,7 +146,7 @@ def _objects(stack: segment_stack.SegmentStack, runs: np.ndarray) -> tuple[np.nd
     weighed = replace(
         stack, shared=sparse.csr_matrix(stack.shared @ purity), seen=sparse.csr_matrix(stack.seen @ purity)
     )
-    of_runs = clustering.cluster(clustering.gather(weighed, runs))
+    of_runs = clustering.cluster(tracklet_overlaps.gather(weighed, runs))
     labels = np.where(runs >= 0, of_runs[runs] + 1, 0)
     fewest = int(np.clip(round(SHOWN * len(stack.views)), 2, 4))
     pairs = np.unique(np.stack([labels, stack.images]), axis=1)

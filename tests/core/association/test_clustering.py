@@ -1,38 +1,49 @@
-"""Clustering of runs: laws on tables of evidence written by hand."""
+"""Clustering of tracklets: properties of the objects found in made-up overlaps."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+from scipy import sparse
 
 from r5dgs_core.association import clustering
+from r5dgs_core.association.tracklet_overlaps import TrackletOverlaps
+
+LENGTH = 10  # images of a tracklet
 
 
 def evidence(objects: list[int], views: list[int], overlap: float, ids: list[int] | None = None, noise: float = 0.0):
-    """Runs of 10 images each of 100 pixels; runs of one object overlap by an IoU, others by a share of it."""
-    objects, views = np.array(objects), np.array(views)
-    iou = np.where(objects[:, None] == objects[None], overlap, noise * overlap)
-    seen = np.full(iou.shape, 100.0 * 100)
-    return clustering.TrackletOverlaps(
-        common=2 * seen * iou / (1 + iou),
-        seen=seen,
-        together=np.where(views[:, None] == views[None], 10.0, 0.0),
-        lengths=np.full(len(objects), 10),
-        pixels=np.full(len(objects), 100.0),
-        views=views,
-        ids=np.array(ids if ids is not None else [7] * len(objects)),
+    """Tracklets in all images of their views, of 100 pixels; those of one object overlap by an IoU, others by less."""
+    count = len(objects)
+    rows, columns = np.triu_indices(count, 1)
+    places, index = np.unique(views, return_inverse=True)
+    images = np.repeat(np.arange(len(places)) == index[:, None], LENGTH, axis=1)
+    iou = np.where(np.equal(*np.array(objects, int)[np.stack([rows, columns])]), overlap, noise * overlap)
+    whole = 100.0 * LENGTH**2
+    return TrackletOverlaps(
+        rows=rows[iou > 0],
+        columns=columns[iou > 0],
+        common=2 * whole * iou[iou > 0] / (1 + iou[iou > 0]),
+        own=np.full(count, 2 * whole * overlap / (1 + overlap)),
+        visible=np.full(images.shape, 100.0 * LENGTH, np.float32),
+        images=sparse.csr_matrix(images.astype(np.float32)),
+        pixels=np.full(count, 100.0),
+        views=np.array(views, int),
+        ids=np.array(ids if ids is not None else [7] * count, int),
     )
 
 
 @pytest.mark.parametrize("overlap", [0.9, 0.5, 0.2, 0.08])
-def test_runs_join_by_the_usual_overlap_not_by_a_fixed_one(overlap):
+def test_tracklets_join_by_the_usual_overlap_not_by_a_fixed_one(overlap):
     objects, views = [0, 1, 2, 0, 1, 2, 2, 0, 1], [0, 0, 0, 1, 1, 1, 2, 2, 2]
     found = clustering.cluster(evidence(objects, views, overlap, noise=0.15))
     pairs = {(o, f) for o, f in zip(objects, found.tolist(), strict=True)}
     assert len(pairs) == len(set(objects)) == len(set(found.tolist()))
 
 
-def test_runs_that_appear_together_stay_separate_however_similar():
+def test_tracklets_that_appear_together_stay_separate_however_similar():
     found = clustering.cluster(evidence([0, 0], [0, 0], 0.9))
     assert found[0] != found[1]
 
@@ -47,12 +58,13 @@ def test_shared_ids_decide_if_geometry_does_not():
     objects, views = [0, 1, 2, 3] * 4, np.repeat([0, 1, 2, 3], 4).tolist()
     ids = [o + 1 for o in objects]
     made = evidence(objects, views, 0.3, ids, noise=0.3)
-    made.common[0, 4:] = made.common[4:, 0] = made.common[1, 4]  # of this run geometry knows nothing
-    found = clustering.cluster(made)
+    unsure = (made.rows == 0) & (made.columns >= 4)  # geometry does not distinguish the objects of this tracklet
+    common = np.where(unsure, made.common.min(), made.common)
+    found = clustering.cluster(dataclasses.replace(made, common=common))
     assert found[0] == found[4]
 
 
-def test_no_runs_are_no_objects():
+def test_no_tracklets_are_no_objects():
     assert clustering.cluster(evidence([], [], 0.5)).tolist() == []
 
 
@@ -74,4 +86,70 @@ def test_medians_of_all_pairs_of_views_are_taken_at_once(monkeypatch):
     views = 30
     many = evidence([0, 1] * views, np.repeat(np.arange(views), 2).tolist(), 0.5)
     assert len(np.unique(clustering.cluster(many))) == 2
-    assert max(sorts) > views**2 and len(sorts) < 5
+    assert max(sorts) == views * (views - 1) and len(sorts) < 10
+
+
+def random_evidence(seed: int, objects: int = 6, views: int = 4, parts: int = 3) -> TrackletOverlaps:
+    """Tracklets of a few images; most of different objects share no Gaussians."""
+    rng = np.random.default_rng(seed)
+    of, at = (a.ravel() for a in np.meshgrid(np.arange(objects), np.repeat(np.arange(views), parts)))
+    made = evidence(of.tolist(), at.tolist(), 0.5, noise=0.3)
+    different = of[made.rows] != of[made.columns]
+    kept = (rng.random(len(made.rows)) < np.where(different, 0.2, 0.9)) & (made.together == 0)
+    images = np.zeros(made.images.shape, np.float32)
+    for k, view in enumerate(at):  # the parts of a view share its images
+        images[k, LENGTH * view + k // objects % parts : LENGTH * (view + 1) : parts] = 1
+    return dataclasses.replace(
+        made,
+        rows=made.rows[kept],
+        columns=made.columns[kept],
+        common=(made.common * rng.uniform(0.02, 0.2, len(made.rows)))[kept],
+        visible=(made.visible * rng.uniform(0.5, 1.0, made.visible.shape)).astype(np.float32),
+        images=sparse.csr_matrix(images),
+    )
+
+
+def joined_one_by_one(made: TrackletOverlaps, usual: np.ndarray, hints: np.ndarray) -> np.ndarray:
+    """Join the best pair of all, again and again, with sums over all pairs of tracklets. [T]"""
+    count = len(made.views)
+    common, plain = np.zeros((2, count, count))
+    common[made.rows, made.columns] = made.common * hints
+    plain[made.rows, made.columns] = made.common
+    pairs = np.stack(np.meshgrid(np.arange(count), np.arange(count), indexing="ij")).reshape(2, -1)
+    union = made.seen(*pairs).reshape(count, count) - plain - plain.T
+    thin = clustering.THIN * np.minimum(made.pixels, made.pixels[:, None]) * np.outer(made.lengths, made.lengths)
+    expected = usual[made.views[:, None], made.views] * (union + thin)
+    together = (made.images @ made.images.T).toarray()
+    labels = np.arange(count)
+    while True:
+        member = np.equal.outer(np.unique(labels), labels).astype(float)
+        lengths = member @ made.lengths
+        few = member @ together @ member.T <= clustering.SIDE_BY_SIDE * np.minimum(lengths, lengths[:, None])
+        affinity = np.where(few, (member @ (common + common.T) @ member.T) / (member @ expected @ member.T), 0.0)
+        np.fill_diagonal(affinity, 0.0)
+        one, other = np.unravel_index(affinity.argmax(), affinity.shape)
+        if affinity[one, other] < clustering.SAME:
+            return labels
+        names = np.unique(labels)
+        labels[labels == names[max(one, other)]] = names[min(one, other)]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_joining_in_rounds_equals_joining_the_best_pair_again_and_again(seed):
+    made = random_evidence(seed)
+    usual = np.random.default_rng(seed).uniform(0.05, 0.2, (4, 4))
+    usual, hints = usual + usual.T, np.ones(len(made.rows))
+    expected = joined_one_by_one(made, usual, hints)
+    found = clustering._join(made, usual, hints)
+    np.testing.assert_array_equal(found, expected)
+    assert 1 < len(np.unique(found)) < len(found) / 2
+
+
+def test_hints_count_the_shorter_lengths_of_tracklets_that_never_appear_together():
+    made = random_evidence(3)
+    made = dataclasses.replace(made, ids=np.random.default_rng(0).integers(0, 3, len(made.views)))
+    apart = np.triu((made.images @ made.images.T).toarray() == 0, 1)
+    least = np.minimum(made.lengths, made.lengths[:, None]) * apart
+    equal, within = made.ids == made.ids[:, None], made.views == made.views[:, None]
+    for (everything, alike), scope in zip(clustering._least_lengths(made), (within, ~within), strict=True):
+        assert everything == (least * scope).sum() > alike == (least * (scope & equal)).sum() > 0
