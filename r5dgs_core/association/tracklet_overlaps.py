@@ -1,9 +1,8 @@
 """Overlap of tracklets, as evidence that two of them show the same object.
 
-Most tracklets share no Gaussians, so only the pairs that do are stored. The overlap of any other pair is computed from
-its images when it is needed.
+Only pairs of tracklets that share Gaussians are stored. Everything else is computed for the pairs that are needed.
 
-Notation: T tracklets, I images, P pairs of tracklets, N Gaussians.
+Notation: T tracklets, I images, P pairs of tracklets that share Gaussians.
 """
 
 from __future__ import annotations
@@ -17,8 +16,9 @@ from scipy import sparse
 
 from . import segment_stack
 
-CHUNK = 2**22  # maximum number of values that `summed` gathers at once
-IMAGES_AT_ONCE = 256
+CHUNK = 2**20  # maximum number of values that are computed at once
+ROWS = 512  # tracklets that are compared with all others at once
+IMAGES = 256  # images that are compared with all tracklets at once
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,7 @@ class TrackletOverlaps:
     """Overlaps of tracklets, summed over the pairs of their images.
 
     Attributes:
-        rows: First tracklet of each pair that shares Gaussians, less than the second. [P]
-        columns: Second tracklet of each pair. [P]
-        common: Weight of Gaussians in both tracklets of each pair. [P]
+        common: Weight of Gaussians in two tracklets, the first one less than the second. [T, T] CSR, P values float32
         own: Weight of Gaussians that a tracklet's images have in common. [T]
         visible: Weight of each tracklet's Gaussians that each image shows. [T, I] float32
         images: 1 for the images of each tracklet. [T, I] CSR
@@ -37,9 +35,7 @@ class TrackletOverlaps:
         ids: Incoming id of each tracklet. [T]
     """
 
-    rows: np.ndarray
-    columns: np.ndarray
-    common: np.ndarray
+    common: sparse.csr_matrix
     own: np.ndarray
     visible: np.ndarray
     images: sparse.csr_matrix
@@ -63,21 +59,44 @@ class TrackletOverlaps:
         return self.images.toarray() > 0
 
     @functools.cached_property
-    def union(self) -> np.ndarray:
-        """Weight in either tracklet of each pair that is visible in the other's images. [P]"""
-        return self.seen(self.rows, self.columns) - self.common
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Tracklets of each pair that shares Gaussians, in the order of the values of `common`. [P], [P] int32"""
+        return np.repeat(np.arange(len(self.views), dtype=np.int32), np.diff(self.common.indptr)), self.common.indices
 
     @functools.cached_property
-    def together(self) -> np.ndarray:
-        """Number of images that show both tracklets of each pair. [P]"""
-        return self.shared_images(self.rows, self.columns)
+    def union(self) -> np.ndarray:
+        """Weight in either tracklet of each pair that is visible in the other's images. [P] float32"""
+        result = np.empty(self.common.nnz, np.float32)
+        for some, rows, columns in self.chunks():
+            result[some] = self.seen(rows, columns) - self.common.data[some]
+        return result
+
+    @functools.cached_property
+    def ious(self) -> np.ndarray:
+        """IoU of each pair where both are visible; 0 if an image shows both. [P] float32"""
+        result = np.float32(self.common.data) / np.maximum(self.union, np.float32(1e-9))
+        for some, rows, columns in self.chunks():
+            result[some] *= self.together(rows, columns) == 0
+        return result
+
+    def chunks(self) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+        """Yield parts of the pairs that share Gaussians: their place among all, and both tracklets."""
+        rows, columns = self.pairs
+        for start in range(0, len(rows), CHUNK):
+            some = slice(start, start + CHUNK)
+            yield some, rows[some], columns[some]
+
+    def common_of(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Weight of Gaussians in both of two tracklets. [M], [M] -> [M]"""
+        found = self.common[np.minimum(rows, columns), np.maximum(rows, columns)]
+        return np.asarray(found, float).ravel()
 
     def seen(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Weight of two tracklets that is visible in the images of the other. [P], [P] -> [P]"""
+        """Weight of two tracklets that is visible in the images of the other, summed. [M], [M] -> [M]"""
         return summed(self.visible, self.images, rows, columns) + summed(self.visible, self.images, columns, rows)
 
-    def shared_images(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Number of images that show both of two tracklets. [P], [P] -> [P]"""
+    def together(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Number of images that show both of two tracklets. [M], [M] -> [M]"""
         result = np.zeros(len(rows))
         same = np.flatnonzero(self.views[rows] == self.views[columns])
         result[same] = summed(self.shown, self.images, rows[same], columns[same])
@@ -95,15 +114,15 @@ def gather(stack: segment_stack.SegmentStack, runs: np.ndarray) -> TrackletOverl
     ones = np.ones(len(rows), np.float32)
     shared = sparse.csr_matrix(sparse.csr_matrix((ones, (runs[rows], rows)), (count, len(runs))) @ stack.shared)
     visible = np.empty((count, images), np.float32)
-    for start in range(0, images, IMAGES_AT_ONCE):
-        some = slice(start, start + IMAGES_AT_ONCE)
+    for start in range(0, images, IMAGES):
+        some = slice(start, start + IMAGES)
         visible[:, some] = (shared @ stack.seen[some].T).toarray()
-    pairs = sparse.coo_matrix(sparse.triu(shared @ shared.T, 1))
+    common = [
+        sparse.triu(shared[start : start + ROWS] @ shared.T, start + 1, format="csr") for start in range(0, count, ROWS)
+    ]
     first = rows[np.unique(runs[rows], return_index=True)[1]]
-    return TrackletOverlaps(
-        rows=pairs.row,
-        columns=pairs.col,
-        common=pairs.data.astype(float),
+    found = TrackletOverlaps(
+        common=sparse.csr_matrix(sparse.vstack(common, "csr")) if common else sparse.csr_matrix((0, 0)),
         own=np.asarray(shared.multiply(shared).sum(axis=1), float).ravel(),
         visible=visible,
         images=sparse.csr_matrix((ones, (runs[rows], stack.images[rows])), (count, images)),
@@ -111,6 +130,8 @@ def gather(stack: segment_stack.SegmentStack, runs: np.ndarray) -> TrackletOverl
         views=stack.views[stack.images[first]],
         ids=stack.ids[first],
     )
+    found.common.sort_indices()
+    return found
 
 
 def summed(table: np.ndarray, images: sparse.csr_matrix, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -119,10 +140,10 @@ def summed(table: np.ndarray, images: sparse.csr_matrix, rows: np.ndarray, colum
     Args:
         table: A value for each row and image. [T, I]
         images: Weight of each image for each column; no row is empty. [T, I]
-        rows, columns: Elements to compute. [P], [P]
+        rows, columns: Elements to compute. [M], [M]
 
     Returns:
-        The sums. [P] float64
+        The sums. [M] float64
     """
     counts = np.diff(images.indptr)[columns]
     result = np.zeros(len(rows))
@@ -136,7 +157,7 @@ def summed(table: np.ndarray, images: sparse.csr_matrix, rows: np.ndarray, colum
 
 
 def batches(counts: np.ndarray, most: int) -> Iterator[slice]:
-    """Yield slices of consecutive items whose counts add up to ``most`` or less, or of one larger item. [P]"""
+    """Yield slices of consecutive items whose counts add up to ``most`` or less, or of one larger item. [M]"""
     ends = np.cumsum(counts)
     start = 0
     while start < len(counts):
@@ -146,6 +167,6 @@ def batches(counts: np.ndarray, most: int) -> Iterator[slice]:
 
 
 def ragged(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return each item's index as often as it counts, and numbers from 0 for each item. [P] -> two arrays [sum]"""
+    """Return each item's index as often as it counts, and numbers from 0 for each item. [M] -> two arrays [sum]"""
     of = np.repeat(np.arange(len(counts)), counts)
     return of, np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts)

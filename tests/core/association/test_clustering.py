@@ -17,15 +17,12 @@ LENGTH = 10  # images of a tracklet
 def evidence(objects: list[int], views: list[int], overlap: float, ids: list[int] | None = None, noise: float = 0.0):
     """Tracklets in all images of their views, of 100 pixels; those of one object overlap by an IoU, others by less."""
     count = len(objects)
-    rows, columns = np.triu_indices(count, 1)
     places, index = np.unique(views, return_inverse=True)
     images = np.repeat(np.arange(len(places)) == index[:, None], LENGTH, axis=1)
-    iou = np.where(np.equal(*np.array(objects, int)[np.stack([rows, columns])]), overlap, noise * overlap)
+    iou = np.where(np.equal.outer(objects, objects), overlap, noise * overlap)
     whole = 100.0 * LENGTH**2
     return TrackletOverlaps(
-        rows=rows[iou > 0],
-        columns=columns[iou > 0],
-        common=2 * whole * iou[iou > 0] / (1 + iou[iou > 0]),
+        common=sparse.csr_matrix(np.triu(2 * whole * iou / (1 + iou), 1).astype(np.float32)),
         own=np.full(count, 2 * whole * overlap / (1 + overlap)),
         visible=np.full(images.shape, 100.0 * LENGTH, np.float32),
         images=sparse.csr_matrix(images.astype(np.float32)),
@@ -58,9 +55,8 @@ def test_shared_ids_decide_if_geometry_does_not():
     objects, views = [0, 1, 2, 3] * 4, np.repeat([0, 1, 2, 3], 4).tolist()
     ids = [o + 1 for o in objects]
     made = evidence(objects, views, 0.3, ids, noise=0.3)
-    unsure = (made.rows == 0) & (made.columns >= 4)  # geometry does not distinguish the objects of this tracklet
-    common = np.where(unsure, made.common.min(), made.common)
-    found = clustering.cluster(dataclasses.replace(made, common=common))
+    made.common[0, 4:] = made.common[1, 4]  # geometry does not distinguish the objects of this tracklet
+    found = clustering.cluster(made)
     assert found[0] == found[4]
 
 
@@ -94,38 +90,31 @@ def random_evidence(seed: int, objects: int = 6, views: int = 4, parts: int = 3)
     rng = np.random.default_rng(seed)
     of, at = (a.ravel() for a in np.meshgrid(np.arange(objects), np.repeat(np.arange(views), parts)))
     made = evidence(of.tolist(), at.tolist(), 0.5, noise=0.3)
-    different = of[made.rows] != of[made.columns]
-    kept = (rng.random(len(made.rows)) < np.where(different, 0.2, 0.9)) & (made.together == 0)
+    share = np.where(np.equal.outer(of, of), 0.9, 0.2) * np.not_equal.outer(at, at)
     images = np.zeros(made.images.shape, np.float32)
     for k, view in enumerate(at):  # the parts of a view share its images
         images[k, LENGTH * view + k // objects % parts : LENGTH * (view + 1) : parts] = 1
     return dataclasses.replace(
         made,
-        rows=made.rows[kept],
-        columns=made.columns[kept],
-        common=(made.common * rng.uniform(0.02, 0.2, len(made.rows)))[kept],
+        common=made.common.multiply(rng.uniform(0.02, 0.2, share.shape) * (rng.random(share.shape) < share)).tocsr(),
         visible=(made.visible * rng.uniform(0.5, 1.0, made.visible.shape)).astype(np.float32),
         images=sparse.csr_matrix(images),
     )
 
 
-def joined_one_by_one(made: TrackletOverlaps, usual: np.ndarray, hints: np.ndarray) -> np.ndarray:
+def joined_one_by_one(sums: clustering._Sums) -> np.ndarray:
     """Join the best pair of all, again and again, with sums over all pairs of tracklets. [T]"""
-    count = len(made.views)
-    common, plain = np.zeros((2, count, count))
-    common[made.rows, made.columns] = made.common * hints
-    plain[made.rows, made.columns] = made.common
-    pairs = np.stack(np.meshgrid(np.arange(count), np.arange(count), indexing="ij")).reshape(2, -1)
-    union = made.seen(*pairs).reshape(count, count) - plain - plain.T
-    thin = clustering.THIN * np.minimum(made.pixels, made.pixels[:, None]) * np.outer(made.lengths, made.lengths)
-    expected = usual[made.views[:, None], made.views] * (union + thin)
-    together = (made.images @ made.images.T).toarray()
+    made, count = sums.evidence, len(sums.evidence.views)
+    rows, columns = (a.ravel() for a in np.meshgrid(np.arange(count), np.arange(count)))
+    common = made.common_of(rows, columns)
+    table = sums.of_tracklets(rows, columns, common, made.seen(rows, columns) - common).reshape(3, count, count)
     labels = np.arange(count)
     while True:
         member = np.equal.outer(np.unique(labels), labels).astype(float)
         lengths = member @ made.lengths
-        few = member @ together @ member.T <= clustering.SIDE_BY_SIDE * np.minimum(lengths, lengths[:, None])
-        affinity = np.where(few, (member @ (common + common.T) @ member.T) / (member @ expected @ member.T), 0.0)
+        common, expected, together = member @ table @ member.T
+        apart = together <= clustering.SIDE_BY_SIDE * np.minimum(lengths, lengths[:, None])
+        affinity = np.where(apart, common / expected, 0.0)
         np.fill_diagonal(affinity, 0.0)
         one, other = np.unravel_index(affinity.argmax(), affinity.shape)
         if affinity[one, other] < clustering.SAME:
@@ -137,11 +126,11 @@ def joined_one_by_one(made: TrackletOverlaps, usual: np.ndarray, hints: np.ndarr
 @pytest.mark.parametrize("seed", range(8))
 def test_joining_in_rounds_equals_joining_the_best_pair_again_and_again(seed):
     made = random_evidence(seed)
+    made = dataclasses.replace(made, ids=np.random.default_rng(seed).integers(0, 3, len(made.views)))
     usual = np.random.default_rng(seed).uniform(0.05, 0.2, (4, 4))
-    usual, hints = usual + usual.T, np.ones(len(made.rows))
-    expected = joined_one_by_one(made, usual, hints)
-    found = clustering._join(made, usual, hints)
-    np.testing.assert_array_equal(found, expected)
+    sums = clustering._Sums(made, usual + usual.T, np.array([[0.9, 1.2], [0.8, 1.1]]))
+    found = clustering._join(sums)
+    np.testing.assert_array_equal(found, joined_one_by_one(sums))
     assert 1 < len(np.unique(found)) < len(found) / 2
 
 
@@ -151,5 +140,5 @@ def test_hints_count_the_shorter_lengths_of_tracklets_that_never_appear_together
     apart = np.triu((made.images @ made.images.T).toarray() == 0, 1)
     least = np.minimum(made.lengths, made.lengths[:, None]) * apart
     equal, within = made.ids == made.ids[:, None], made.views == made.views[:, None]
-    for (everything, alike), scope in zip(clustering._least_lengths(made), (within, ~within), strict=True):
+    for (everything, alike), scope in zip(clustering._least_lengths(made), (~within, within), strict=True):
         assert everything == (least * scope).sum() > alike == (least * (scope & equal)).sum() > 0

@@ -30,13 +30,19 @@ def test_overlaps_are_sums_over_the_segments_of_tracklets():
     shared = segments.shared.toarray().astype(float)
     common = member @ shared @ shared.T @ member.T
     seen = member @ shared @ segments.seen.toarray().T[:, segments.images] @ member.T
-    assert (found.rows < found.columns).all()
-    assert len(found.rows) == np.count_nonzero(np.triu(common, 1)) < count * (count - 1) / 2
-    np.testing.assert_allclose(found.common, common[found.rows, found.columns], rtol=1e-5)
+    rows, columns = found.pairs
+    assert (rows < columns).all()
+    assert len(rows) == np.count_nonzero(np.triu(common, 1)) < count * (count - 1) / 2
+    np.testing.assert_allclose(found.common.data, common[rows, columns], rtol=1e-5)
+    np.testing.assert_allclose(found.common_of(columns, rows), common[rows, columns], rtol=1e-5)
+    assert found.common_of(*np.nonzero(np.triu(common == 0, 1))).tolist() == [0.0] * np.sum(np.triu(common == 0, 1))
     np.testing.assert_allclose(found.own, np.diag(common), rtol=1e-5)
-    np.testing.assert_allclose(found.union, (seen + seen.T - common)[found.rows, found.columns], rtol=1e-5)
+    np.testing.assert_allclose(found.seen(rows, columns), (seen + seen.T)[rows, columns], rtol=1e-5)
     images = np.array([[np.any(segments.images[runs == run] == k) for k in range(12)] for run in range(count)])
-    np.testing.assert_array_equal(found.together, (images * 1.0 @ images.T)[found.rows, found.columns])
+    together = images * 1.0 @ images.T
+    np.testing.assert_array_equal(found.together(rows, columns), together[rows, columns])
+    ious = np.where(together > 0, 0.0, common / (seen + seen.T - common))
+    np.testing.assert_allclose(found.ious, ious[rows, columns], rtol=1e-5)
     np.testing.assert_array_equal(found.lengths, images.sum(axis=1))
 
 
