@@ -115,9 +115,10 @@ def _agreement(stack: segment_stack.SegmentStack, ious: np.ndarray, labels: np.n
 
 def _add_parts(result: np.ndarray, rows: np.ndarray, start: int, overlap: leave_one_out.Overlaps, usual: float) -> None:
     """Assign leftover segments to an object that covers them, if that raises the object's IoU."""
+    shares = overlap.shares
     for row in sorted(rows[result[rows] < 0], key=lambda r: -overlap.segments[r - start]):
-        k = int(overlap.shares[row - start, 1:].argmax()) + 1
-        if overlap.shares[row - start, k] < PART * usual:
+        k = int(shares[row - start, 1:].argmax()) + 1
+        if shares[row - start, k] < PART * usual:
             continue
         mine = rows[result[rows] == k] - start
         before, after = (_joint_iou(overlap, m, k) for m in (mine, np.append(mine, row - start)))
