@@ -39,6 +39,20 @@ def present(out: Path) -> dict[str, Any] | None:
     return found
 
 
+def check_outside(out: Path, given: Path) -> None:
+    """Check that an input is outside the places of the data set that are replaced.
+
+    Raises:
+        ConfigError: It is in one of them.
+    """
+    path = Path(given).resolve()
+    for name in (IMAGES, *_LATER):
+        if path.is_relative_to((out / name).resolve()):
+            raise errors.ConfigError(
+                f"{given}: is in {out / name}, which is replaced; copy it elsewhere, or name another folder with --out"
+            )
+
+
 def check_replaceable(out: Path, record: dict[str, Any], changed: Iterable[str]) -> None:
     """Check that a data set may be replaced without ``--overwrite``.
 

@@ -24,6 +24,7 @@ from . import (
     data_splits,
     existing_dataset,
     frame_choice,
+    frame_masks,
     image_size,
     record,
     unknown_cameras,
@@ -52,6 +53,9 @@ def prepare(request: Request, progress: Progress) -> Plan:
         raise errors.ConfigError(
             f"--out {request.out}: is among the recordings; name a folder outside {request.source}"
         )
+    for given in (source, request.masks):
+        if given is not None:
+            existing_dataset.check_outside(out, given)
     if request.up is not None:
         gauge.check_up(request.up)
     file = request.calibration
@@ -66,10 +70,14 @@ def prepare(request: Request, progress: Progress) -> Plan:
     progress({"event": "read", "text": "recordings and calibration"})
     up = request.up if file == request.calibration else None  # a reconstruction is upright
     opened, calibration = cameras.open_all(request.source, file, request.rate, up, request.meters_per_unit)
+    if request.masks is not None:
+        frame_masks.find(request.masks, [camera.source for camera in opened])  # a fault is reported at once
     with folder_lock.hold(out):
         identity = record.identity(request, opened, calibration)
-        known = _begin(out, identity, overwrite=request.overwrite)
+        known = _known(out, identity, overwrite=request.overwrite)
         plan = _plan(request, opened, calibration, known, progress)
+        if known is None:
+            existing_dataset.remove(out)
         finished = known is not None and known.get("finished") is True
         if not finished:  # a finished one stays so, or a stop would permit to replace it without --overwrite
             capture_file.write(out, record.content(plan, identity, finished=False))
@@ -100,10 +108,11 @@ def _reconstructed(request: Request, out: Path, progress: Progress) -> Path:
     )
 
 
-def _begin(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, Any] | None:
+def _known(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, Any] | None:
     """Return the record of a run with the identity, or None.
 
-    The data set of another run is removed if it is unfinished, or with ``overwrite``.
+    Raises:
+        DatasetError: The folder has a data set of another run, which must not be replaced.
     """
     present = existing_dataset.present(out)
     if present is None or present.get("identity") == wanted:
@@ -111,7 +120,6 @@ def _begin(out: Path, wanted: dict[str, Any], *, overwrite: bool) -> dict[str, A
     if not overwrite:
         changed = [key for key in wanted if present.get("identity", {}).get(key) != wanted[key]]
         existing_dataset.check_replaceable(out, present, changed)
-    existing_dataset.remove(out)
     return None
 
 

@@ -139,3 +139,34 @@ def test_a_folder_with_other_files_is_not_touched(capture, tmp_path):
     with pytest.raises(errors.DatasetError, match="expected an empty folder or a prepared data set, found notes.txt"):
         prepared(capture, tmp_path)
     assert content(tmp_path) == {(tmp_path / "notes.txt").relative_to(tmp_path): b"mine"}
+
+
+def test_inputs_that_would_be_replaced_are_refused(capture, tmp_path):
+    """With ``overwrite``, they would be removed before they are read."""
+    out = tmp_path / "data"
+    prepared(capture, out, lines=36)
+    (out / "object_mask" / "cam0").mkdir(parents=True)
+    before = content(out)
+    with pytest.raises(errors.ConfigError, match=r"data/images: is in .*data/images, which is replaced; copy it"):
+        prepared(out / "images", out, calibration=out, overwrite=True)
+    with pytest.raises(errors.ConfigError, match=r"data/object_mask: is in .*name another folder with --out"):
+        prepared(capture, out, masks=str(out / "object_mask"), overwrite=True)
+    assert content(out) == before
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"hold_out": {"cameras": ("cam9",)}}, {"offsets": {"cam9": 0.1}}, {"masks": "none9"}]
+)
+def test_a_mistake_in_the_options_keeps_the_data_set_that_is_to_be_replaced(capture, tmp_path, wrong):
+    prepared(capture, tmp_path / "data", lines=36)
+    before = content(tmp_path / "data")
+    with pytest.raises(errors.R5dgsError, match="cam9|none9"):
+        prepared(capture, tmp_path / "data", lines=24, overwrite=True, **wrong)
+    assert content(tmp_path / "data") == before
+
+
+def test_masks_are_checked_before_the_images_are_written(capture, tmp_path):
+    (tmp_path / "masks" / "cam9").mkdir(parents=True)
+    with pytest.raises(errors.DatasetError, match=r"expected a folder of masks per camera \(cam0, cam1, cam2\)"):
+        prepared(capture, tmp_path / "data", masks=str(tmp_path / "masks"))
+    assert not (tmp_path / "data").exists()
