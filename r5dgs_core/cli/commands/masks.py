@@ -120,10 +120,7 @@ def run_masks(data: Path, *, progress_kind: str = "none", **fields: Any) -> Mask
         ConfigError, DatasetError, BackendError: An input cannot be used.
         Interrupted: Ctrl-C; finished videos are kept.
     """
-    given = Options(**fields)
-    if given.backend == "sam2" and given.model is None:
-        given = dataclasses.replace(given, model=_user_model())
-    _check(given)
+    given = checked(Options(**fields))
     inputs.check_dataset(data)
     from ...data import dataset as datasets
     from ...data import view_masks
@@ -219,8 +216,19 @@ def _user_model() -> Path | None:
     return None if found is None else Path(found)
 
 
+def checked(given: Options) -> Options:
+    """Return the options, with the model of the user's settings if SAM2 needs one.
+
+    Raises:
+        UsageError: An option does not fit the backend, or a value is out of range.
+    """
+    if given.backend == "sam2" and given.model is None:
+        given = dataclasses.replace(given, model=_user_model())
+    _check(given)
+    return given
+
+
 def _check(given: Options) -> None:
-    """Raise UsageError for options that do not fit the backend, and for values out of range."""
     if given.backend not in BACKENDS:
         raise errors.UsageError(f"--backend {given.backend}: expected one of {', '.join(BACKENDS)}")
     tuned = {"key_frames": given.key_frames, **given.segmentation()}

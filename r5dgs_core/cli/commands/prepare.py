@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ... import errors, input_paths, terminal
+from ... import errors, findings, input_paths, terminal
 from .. import options
 
 if TYPE_CHECKING:
@@ -193,11 +194,26 @@ def _check(window: dict[str, Any], source: Path, calibration: Path | None) -> No
 
 
 def _check_masks(masks: str, model: Path | None, words: str | None) -> None:
-    """Raise UsageError for options that the choice of masks does not use, and BackendError if OpenCV is missing."""
+    """Check the options of masks before the images are written.
+
+    Raises:
+        UsageError: An option is missing, or the choice of masks does not use it.
+        ConfigError: The folder of the weights does not exist.
+        BackendError: OpenCV is missing.
+    """
     if words is not None and masks != "sam3":
         raise errors.UsageError(f"--words {words}: applies to --masks sam3, found --masks {masks}")
     if model is not None and masks not in ("sam2", "sam3"):
         raise errors.UsageError(f"--model {model}: applies to --masks sam2 and sam3, found --masks {masks}")
+    if masks in ("sam2", "sam3"):
+        from . import masks as masks_command
+
+        try:
+            checked = masks_command.checked(masks_command.Options(masks, model, words))
+        except errors.UsageError as error:
+            raise errors.UsageError(str(error).replace("--backend", "--masks")) from error
+        if checked.model is not None and not checked.model.is_dir():
+            raise errors.ConfigError(f"--model {checked.model}: expected a folder of weights, found none")
     if masks == "features":
         from ...masks import feature_points
 
@@ -291,7 +307,7 @@ def _offsets(given: Sequence[str]) -> dict[str, float]:
             found[name] = float(value) / 1e3
         except ValueError:
             mark = ""
-        if not mark or not name:
+        if not mark or not name or not math.isfinite(found[name]):
             raise errors.UsageError(f"--offset {text}: expected a camera and milliseconds, such as cam0=12.5")
     return found
 

@@ -171,8 +171,13 @@ def test_lenses_of_other_cameras_are_refused(recordings, tmp_path):
             ["--masks", "folder", "--model", "sam"],
             "--model sam: applies to --masks sam2 and sam3, found --masks folder",
         ),
+        (["--masks", "sam2"], "--masks sam2: name the folder of the model with --model DIR"),
+        (["--masks", "sam2", "--model", "sam"], "--model sam: expected a folder of weights, found none"),
+        (["--masks", "sam3", "--model", "."], "--masks sam3: name the objects with --words"),
+        (["--offset", "cam0=nan"], "--offset cam0=nan: expected a camera and milliseconds"),
     ],
 )
 def test_wrong_options_are_refused(recordings, tmp_path, capsys, arguments, message):
     assert main.main(["prepare", str(recordings), "--out", str(tmp_path / "data"), *arguments]) != 0
     assert message in capsys.readouterr().err
+    assert not (tmp_path / "data" / "images").exists()
