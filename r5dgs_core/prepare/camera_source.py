@@ -106,6 +106,13 @@ def open_camera(files: CameraFiles, rate: float | None = None) -> CameraSource:
 
 
 def _open_frames(files: CameraFiles) -> CameraSource:
+    by_name: dict[str, Path] = {}
+    for path in files.paths:
+        other = by_name.setdefault(path.stem, path)
+        if other is not path:
+            raise errors.DatasetError(
+                f"{path}: two frames of {files.name} have the name {path.stem}, the other is {other}; keep one of them"
+            )
     width, height = frame_file.size(files.paths[0])
     times = np.arange(len(files.paths)) / FRAME_RATE
     return CameraSource(files.name, files.paths, width, height, times, RATE)

@@ -3,7 +3,7 @@
 import pytest
 
 from r5dgs_core.errors import DatasetError
-from r5dgs_core.prepare import names, source_files
+from r5dgs_core.prepare import camera_source, names, source_files
 
 
 def touch(root, *paths):
@@ -96,3 +96,10 @@ def test_a_path_that_is_no_recording_is_refused(tmp_path, name):
 )
 def test_names_match_exactly_or_without_case_or_by_number(wanted, given, expected):
     assert names.match(wanted, given) == expected
+
+
+def test_frames_of_one_name_are_refused(tmp_path):
+    """A phone may write each picture as HEIC and as JPEG; one image of the data set would replace the other."""
+    camera = source_files.find(touch(tmp_path, "cam0/1.heic", "cam0/1.jpg", "cam0/2.jpg"))[0]
+    with pytest.raises(DatasetError, match=r"two frames of cam0 have the name 1, the other is .*1\.heic; keep one"):
+        camera_source.open_camera(camera)
