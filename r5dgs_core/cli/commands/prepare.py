@@ -254,7 +254,11 @@ def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: st
 
 
 def _check_capture(plan: Plan, progress_kind: str) -> None:
-    """Check the data set, add the findings to its record, and print them before the next command."""
+    """Check the data set, add the findings to its record, and print them before the next command.
+
+    Raises:
+        DatasetError: The data set has errors.
+    """
     from ...check import check
     from ...prepare import capture_file
 
@@ -267,8 +271,12 @@ def _check_capture(plan: Plan, progress_kind: str) -> None:
     rows = [{k: v.replace(f"{out}/", "").replace(str(out), ".") for k, v in row.items()} for row in rows]
     capture_file.write(out, {**capture, "checks": rows})
     if progress_kind == "auto":
+        terminal.print_lines(map(str, found))
+    if wrong := [one for one in found if one.severity == findings.ERROR]:
+        raise errors.DatasetError(f"{out}: the data set cannot be trained: {wrong[0]}")
+    if progress_kind == "auto":
         next_command = f"r5dgs train {shlex.quote(str(plan.request.out))} --out RUN --scene SCENE.r5dgs"
-        terminal.print_lines([*map(str, found), f"written: {plan.request.out}. Next: {next_command}"])
+        terminal.print_lines([f"written: {plan.request.out}. Next: {next_command}"])
 
 
 def summary(plan: Plan) -> list[str]:

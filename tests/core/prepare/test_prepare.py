@@ -283,3 +283,9 @@ def test_the_size_is_the_largest_whose_training_fits_half_of_the_memory(monkeypa
     assert memory[0] <= 4e9 < memory[1] and size.training_bytes == memory[0]
     assert image_size.choose([(640, 480)], [10], None).lines == 480
     assert image_size.choose([(3840, 2160)], [10], None).lines == 960
+
+
+def test_a_data_set_with_errors_is_not_recommended_for_training(capture, tmp_path, capsys):
+    with pytest.raises(errors.DatasetError, match="cannot be trained: D23 error.*seconds_per_unit"):
+        prepared(capture, tmp_path / "data", lines=36, hold_out={"horizon": 1e12}, progress_kind="auto")
+    assert "Next: r5dgs train" not in capsys.readouterr().out
