@@ -54,7 +54,7 @@ def arrange(names: Sequence[str], choice: Choice, hold_out: HoldOut) -> Timeline
     """Distribute frames to splits, and map their times to [0, 1].
 
     Raises:
-        ConfigError: A held-out camera does not exist, or no frame is left for training.
+        ConfigError: A held-out camera does not exist, no frame is held out, or none is left for training.
     """
     unknown = [name for name in hold_out.cameras if name not in names]
     if unknown:
@@ -70,6 +70,7 @@ def arrange(names: Sequence[str], choice: Choice, hold_out: HoldOut) -> Timeline
             between = hold_out.every is not None and 0 < moment < last_moment and moment % hold_out.every == 0
             kinds.append("test" if later else "val" if name in hold_out.cameras or between else "train")
         splits.append(tuple(kinds))
+    _check_held_out(splits, hold_out, last - zero, last_moment + 1)
     observed = [
         t
         for times, kinds in zip(choice.times, splits, strict=True)
@@ -96,3 +97,24 @@ def arrange(names: Sequence[str], choice: Choice, hold_out: HoldOut) -> Timeline
         seconds_per_unit=float(unit),
         frames_per_unit=float(unit / choice.source_interval) if choice.source_interval else float(unit * 30.0),
     )
+
+
+def _check_held_out(splits: Sequence[Sequence[str]], hold_out: HoldOut, last: float, moments: int) -> None:
+    """Raise ConfigError if an option holds out no frame, because the recordings are too short.
+
+    Args:
+        splits: Split of each frame. C lists
+        hold_out: The options.
+        last: Time of the last frame, seconds from the first moment.
+        moments: Number of moments.
+    """
+    used = {split for one in splits for split in one}
+    if hold_out.after is not None and "test" not in used:
+        raise errors.ConfigError(
+            f"--hold-out-after {hold_out.after:g}: expected a time before the last frame, which is at {last:.3g} s"
+        )
+    if hold_out.every is not None and moments <= hold_out.every + 1:
+        raise errors.ConfigError(
+            f"--hold-out-every {hold_out.every}: expected at most {max(moments - 2, 0)}, because the recordings have "
+            f"{moments} times, and the first and the last one are not held out"
+        )

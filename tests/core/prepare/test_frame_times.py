@@ -148,3 +148,10 @@ def test_held_out_frames_outside_the_observed_time_are_left_out():
 def test_impossible_hold_outs_are_refused(fields, message):
     with pytest.raises(ConfigError, match=message):
         arranged(**fields)
+
+
+def test_options_that_hold_out_nothing_are_refused():
+    with pytest.raises(ConfigError, match="--hold-out-after 9: expected a time before the last frame, which"):
+        arranged(after=9.0)
+    with pytest.raises(ConfigError, match="--hold-out-every 99: expected at most "):
+        arranged(every=99)
