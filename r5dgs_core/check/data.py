@@ -165,7 +165,8 @@ def _check_images(found: Dataset, collect: Collector, album: Album) -> None:
             over_time.check(one, str(found.root), found.units.seconds_per_unit, collect, album)
             clocks.add(one)
     clocks.check()
-    clocks.check_record(capture_file.read(found.root))
+    with collect():
+        clocks.check_record(capture_file.read(found.root))
 
 
 def _check_masks(found: Dataset, collect: Collector, album: Album) -> None:

@@ -25,7 +25,27 @@ def read(folder: Path) -> dict[str, Any] | None:
     version = content.get("format_version") if isinstance(content, dict) else None
     if version != FORMAT_VERSION:
         raise errors.DatasetError(f"{path}: expected 'format_version' {FORMAT_VERSION}, found {version!r}")
+    cameras = content.get("cameras", [])
+    if not isinstance(cameras, list) or not all(map(_is_camera, cameras)):
+        raise errors.DatasetError(f"{path}: 'cameras' is damaged; copy the file again, or prepare the data set again")
     return content
+
+
+def _is_camera(row: Any) -> bool:
+    """Return True for a row of ``cameras`` with a name, an offset and gaps."""
+    if not isinstance(row, dict) or not isinstance(row.get("name"), str):
+        return False
+    sigma, gaps = row.get("offset_sigma_ms"), row.get("gaps", [])
+    measured = _is_number(row.get("offset_ms")) and (sigma is None or _is_number(sigma))
+    return measured and isinstance(gaps, list) and all(map(_is_gap, gaps))
+
+
+def _is_gap(row: Any) -> bool:
+    return isinstance(row, dict) and _is_number(row.get("after_frame")) and _is_number(row.get("ms"))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float)
 
 
 def write(folder: Path, content: dict[str, Any]) -> None:

@@ -137,10 +137,14 @@ class Clocks:
                 draw = functools.partial(pictures.curves, after, rows, "frame", "ms", f"{one['name']}: gaps")
                 self._collect.add(
                     "D66",
-                    f"{self._place}: the recording of {one['name']} has {len(gaps)} gaps, the first of "
+                    f"{self._place}: the recording of {one['name']} has {_counted(gaps)}, the first of "
                     f"{gaps[0]['ms']:.0f} ms after frame {gaps[0]['after_frame']}",
                     picture=self._album.write(f"D66_recording_{one['name']}", draw),
                 )
+
+
+def _counted(gaps: Sequence[Any]) -> str:
+    return "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
 
 
 def read_by_rows(track: MotionTrack, readout: float) -> MotionTrack:

@@ -84,3 +84,14 @@ def test_the_epipolar_line_of_a_point_holds_its_image():
     assert agreement.distance(*made) < 1e-9
     moved = agreement.Sighting(made[1].view, made[1].center + np.array([0.0, 7.0]), 3.0, True)
     assert 3.0 < agreement.distance(made[0], moved) <= 7.0
+
+
+@pytest.mark.parametrize(
+    "record", ["[]", '{"format_version": 1, "cameras": [{}]}', '{"format_version": 1, "cameras": 3}']
+)
+def test_a_damaged_record_hides_no_other_fault(tmp_path, record):
+    captures.make(tmp_path)
+    next(tmp_path.rglob("*.png")).unlink()
+    (tmp_path / "capture.json").write_text(record)
+    found = {finding.code: finding.problem for finding in check.check(tmp_path)}
+    assert set(found) >= {"D00", "D10"} and ("format_version" in found["D00"] or "cameras" in found["D00"])
