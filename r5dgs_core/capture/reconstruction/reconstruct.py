@@ -37,6 +37,7 @@ def reconstruct(recordings: Sequence[Recording], request: Request, work: Path) -
     unknown = sorted((set(request.moving) | set(request.distance[:2] if request.distance else ())) - set(names))
     if unknown:
         raise errors.ConfigError(f"cameras {', '.join(unknown)}: unknown; the recordings are {', '.join(names)}")
+    _check_up(request)
     boards = None
     if request.board is None:
         calibration = features.reconstruct(recordings, request, work)
@@ -45,6 +46,14 @@ def reconstruct(recordings: Sequence[Recording], request: Request, work: Path) -
     if request.distance is not None:
         calibration = gauge.with_distance(calibration, *request.distance)
     return gauge.upright(calibration, request.up, boards)
+
+
+def _check_up(request: Request) -> None:
+    """Raise ConfigError for an up direction that the reconstruction will not give, before its minutes."""
+    if request.up == gauge.BOARD and request.board is None:
+        raise errors.ConfigError("--up board: expected a board, found none; name it with --board, or use --up cameras")
+    if request.up == gauge.PLANE and request.board is not None:
+        raise errors.ConfigError("--up plane: needs points, which a board does not give; use --up board or cameras")
 
 
 def _from_board(recordings: Sequence[Recording], request: Request) -> tuple[Calibration, list[np.ndarray]]:

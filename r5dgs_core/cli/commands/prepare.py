@@ -324,7 +324,13 @@ def _distance(given: Sequence[str] | None) -> tuple[str, str, float] | None:
     """Convert the arguments of --distance."""
     if given is None:
         return None
+    first, second, text = given
     try:
-        return given[0], given[1], float(given[2])
-    except ValueError as error:
-        raise errors.UsageError(f"--distance: expected metres after two cameras, found {given[2]!r}") from error
+        meters = float(text)
+    except ValueError:
+        meters = math.nan
+    if not (0 < meters < math.inf):
+        raise errors.UsageError(f"--distance: expected metres, more than 0, after two cameras, found {text!r}")
+    if first == second:
+        raise errors.UsageError(f"--distance: expected two cameras, found {first!r} twice")
+    return first, second, meters

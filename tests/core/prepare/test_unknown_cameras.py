@@ -164,7 +164,11 @@ def test_lenses_of_other_cameras_are_refused(recordings, tmp_path):
     [
         (["--board", "paper"], "--board paper: expected charuco:COLUMNSxROWS"),
         (["--moving", "drone"], "cameras drone: unknown"),
-        (["--distance", "cam0", "cam1", "far"], "--distance: expected metres"),
+        (["--distance", "cam0", "cam1", "far"], "--distance: expected metres, more than 0"),
+        (["--distance", "cam0", "cam1", "nan"], "--distance: expected metres, more than 0"),
+        (["--distance", "cam0", "cam0", "2"], "--distance: expected two cameras, found 'cam0' twice"),
+        (["--up", "board"], "--up board: expected a board, found none; name it with --board"),
+        (["--up", "plane", "--board", "charuco:5x4:0.1:0.075:4X4_50"], "--up plane: needs points"),
         (["--up", "north"], "--up north: expected cameras, plane, board, or a vector"),
         (["--words", "mug"], "--words mug: applies to --masks sam3, found --masks none"),
         (
