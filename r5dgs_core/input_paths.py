@@ -101,8 +101,8 @@ def check_calibration(path: Path) -> None:
 
 
 def prepare_command(source: Path) -> str:
-    """Return the command that makes a data set from a folder of videos or distorted images, for messages."""
-    out = source.with_name(f"{source.name}_data")
+    """Return the command that makes a data set from a video, or a folder of videos or images, for messages."""
+    out = source.with_name(f"{source.stem if source.is_file() else source.name}_data")
     return f"r5dgs prepare {shlex.quote(str(source))} --out {shlex.quote(str(out))}"
 
 

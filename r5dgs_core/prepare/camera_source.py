@@ -156,7 +156,7 @@ def _notes(video: VideoFile) -> list[str]:
         how = "tone-mapped to sRGB" if video.color.transfer else "converted to sRGB"
         notes.append(f"{video.path.name}: {video.color.label}, {how}")
     if video.turns:
-        notes.append(f"{video.path.name}: turned by {90 * video.turns} degrees, as its metadata asks")
+        notes.append(f"{video.path.name}: turned by {90 * video.turns} degrees, according to its metadata")
     if video.declared - len(video.pts) > _TRUNCATED:
         notes.append(
             f"{video.path.name}: the file ends early, with {len(video.pts)} of {video.declared} frames; copy it again "

@@ -68,9 +68,11 @@ def find(source: Path) -> list[CameraFiles]:
     if not found and frames:
         found = [CameraFiles(source.resolve().name, FRAMES, frames)]
     if not found:
+        deeper = sorted(path.parent for path in source.glob("*/*/*") if path.suffix.lower() in file_kinds.VIDEOS)
         raise errors.DatasetError(
             f"{source}: expected a video or a folder of frames per camera, found none; supported are "
             f"{', '.join(file_kinds.VIDEOS)} and frames of {', '.join(FRAME_SUFFIXES)}"
+            + (f". Remedy: name the folder {deeper[0]}, which has videos" if deeper else "")
         )
     _check_names(found)
     return sorted(found, key=lambda camera: natural(camera.name))

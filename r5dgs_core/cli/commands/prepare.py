@@ -228,7 +228,8 @@ def _complete(plan: Plan, masks: str, given: dict[str, Any], progress_kind: str)
         if masks != "features":
             raise
         _check_capture(plan, progress_kind)
-        raise errors.DatasetError(f"{error}. The data set without masks is complete") from error
+        reason = str(error).replace("--backend", "--masks")  # the option of this command
+        raise errors.DatasetError(f"{reason}. The data set without masks is complete") from error
     _check_capture(plan, progress_kind)
 
 

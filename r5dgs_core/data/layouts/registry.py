@@ -21,16 +21,22 @@ def find(root: Path) -> ModuleType:
         OSError: The folder cannot be read.
     """
     if not root.is_dir():
+        video = root.is_file() and root.suffix.lower() in file_kinds.VIDEOS
+        remedy = f". Remedy: make a data set of it: {input_paths.prepare_command(root)}" if video else ""
         raise errors.DatasetError(
-            f"{root}: expected a data set folder, found {'a file' if root.exists() else 'nothing'}"
+            f"{root}: expected a data set folder, found {'a file' if root.exists() else 'nothing'}{remedy}"
         )
     for name in MODULES:
         module = importlib.import_module(f".{name}", __package__)
         if module.detect(root):
             return module
     _check_recordings(root)
-    lone = (root / "transforms.json").exists()
-    remedy = f"make a data set of it with '{input_paths.prepare_command(root)}'" if lone else "is it the right folder?"
+    command = input_paths.prepare_command(root)
+    remedy = "is it the right folder?"
+    if (root / "transforms.json").exists():
+        remedy = f"make a data set of it with '{command}'"
+    elif any(path.suffix.lower() in file_kinds.IMAGES for path in root.glob("[!.]*/*")):
+        remedy = f"is it the right folder? '{command}' makes a data set of folders of frames"
     raise errors.DatasetError(f"{root / CAMERAS_FILE}: the file is missing; {remedy}")
 
 

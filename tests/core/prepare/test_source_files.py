@@ -103,3 +103,9 @@ def test_frames_of_one_name_are_refused(tmp_path):
     camera = source_files.find(touch(tmp_path, "cam0/1.heic", "cam0/1.jpg", "cam0/2.jpg"))[0]
     with pytest.raises(DatasetError, match=r"two frames of cam0 have the name 1, the other is .*1\.heic; keep one"):
         camera_source.open_camera(camera)
+
+
+def test_videos_that_are_too_deep_are_named(tmp_path):
+    touch(tmp_path, "session/calibration/extrinsic/cam0.mp4", "session/camera_array.toml")
+    with pytest.raises(DatasetError, match="found none.*name the folder .*session/calibration/extrinsic, which has"):
+        source_files.find(tmp_path / "session")

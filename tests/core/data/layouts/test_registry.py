@@ -49,3 +49,14 @@ def test_a_folder_of_videos_is_refused_with_the_command_that_prepares_it(tmp_pat
     (tmp_path / "my videos" / video).write_bytes(b"")
     with pytest.raises(errors.DatasetError, match="found videos.*r5dgs prepare '.*my videos' --out '.*my videos_data'"):
         registry.check(tmp_path / "my videos")
+
+
+def test_a_video_and_folders_of_frames_are_refused_with_the_command_that_prepares_them(tmp_path):
+    (tmp_path / "walk.mp4").write_bytes(b"")
+    with pytest.raises(errors.DatasetError, match=r"found a file\. Remedy: .*prepare .*walk\.mp4 --out .*walk_data$"):
+        registry.check(tmp_path / "walk.mp4")
+    images.write_png(tmp_path / "frames" / "cam0" / "0.png", np.zeros((8, 12, 3), np.float32))
+    with pytest.raises(
+        errors.DatasetError, match="is it the right folder.*prepare .*frames --out .*frames_data' makes"
+    ):
+        registry.check(tmp_path / "frames")
