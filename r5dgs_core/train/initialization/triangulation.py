@@ -185,6 +185,8 @@ def _path(seen: Sequence[_Sighting], times: np.ndarray) -> tuple[np.ndarray, np.
     at = np.array([x.knot for x in seen])
     origins, rays = np.stack([x.origin for x in seen]), np.stack([x.ray for x in seen])
     weights = np.array([x.weight * (1.0 if x.whole else CUT_OFF) for x in seen])
+    if not weights.any():  # other objects surround it in all masks
+        weights = np.ones(len(seen))
     weights = weights / weights.max()
     projectors = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     guesses = origins + rays * np.linalg.norm(origins, axis=1, keepdims=True)

@@ -218,3 +218,16 @@ def test_specks_do_not_vote():
     seen.append(disc_view(ring(7)[1], 0.0, []).with_arrays(mask=speck))
     places = triangulation.locate(seen, TIMES[:1], 5e-4)
     assert np.linalg.norm(places.centers[0, 0] - center) < 0.003 * 4
+
+
+def test_an_object_that_others_surround_in_all_masks_is_located():
+    """Masks of a mug and of the picture on it, for example."""
+    center = np.array([0.2, 0.1, 0.3])
+    whole, part = ([disc_view(c, 0.0, [(1, center, radius)]) for c in ring()] for radius in (0.4, 0.2))
+    seen = [
+        one.with_arrays(mask=np.where(other.mask == 1, 2, one.mask).astype(np.int32))
+        for one, other in zip(whole, part, strict=True)
+    ]
+    places = triangulation.locate(seen, TIMES[:1], 5e-4)
+    assert places.object_ids.tolist() == [1, 2]
+    assert np.linalg.norm(places.centers[:, 0] - center, axis=1).max() < 0.01 * 4
