@@ -60,7 +60,7 @@ def of(views: Sequence[TrainView] | Sequence[View]) -> Rig:
     pose_of = np.array([place[view.camera.name] for view in views])
     first = [int(np.argmax(pose_of == row)) for row in range(len(names))]
     cameras = tuple(views[index].camera for index in first)
-    given = [name.partition("@")[0] for name in names]
+    given = [_camera_name(name) for name in names]
     one_lens = len({(camera.intrinsics.tobytes(), camera.width, camera.height) for camera in cameras}) == 1
     if one_lens and len(names) == len(views) and all(name == f"cam{row}" for row, name in enumerate(names)):
         given = ["camera"] * len(names)
@@ -73,3 +73,9 @@ def of(views: Sequence[TrainView] | Sequence[View]) -> Rig:
         if len(rows) > 2 and np.ptp(times[rows]) > 0:
             paths.append(rows[np.argsort(times[rows], kind="stable")])
     return Rig(pose_of, lens_of_pose[pose_of], cameras, lens_of_pose, tuple(names), lens_names, tuple(paths))
+
+
+def _camera_name(name: str) -> str:
+    """Return the name of a pose's camera: that of NAME@3 is NAME; a user's name may have an @, too."""
+    base, mark, number = name.rpartition("@")
+    return base if mark and number.isdigit() else name

@@ -97,7 +97,9 @@ def test_a_folder_among_the_recordings_is_refused(capture):
 
 
 def test_a_capture_without_features_is_complete_but_for_its_masks(capture, tmp_path):
-    with pytest.raises(errors.DatasetError, match=r"no rigid body moves.*--masks sam2.*The data set without masks is complete"):
+    with pytest.raises(
+        errors.DatasetError, match=r"no rigid body moves.*--masks sam2.*The data set without masks is complete"
+    ):
         prepared(capture, tmp_path / "data", masks="features")
     assert "checks" in json.loads((tmp_path / "data" / "capture.json").read_text())
     assert all(view.mask_path is None for view in dataset.read(tmp_path / "data").train)

@@ -33,3 +33,9 @@ def test_views_without_names_and_with_a_pose_each_are_one_moving_camera():
     found = rig.of([view(f"cam{k}", 0.1 * k, angle=0.1 * k) for k in range(4)])
     assert found.poses == 4 and found.lenses == 1
     assert [path.tolist() for path in found.paths] == [[0, 1, 2, 3]]
+
+
+def test_fixed_cameras_with_an_at_sign_in_their_names_have_a_lens_each():
+    found = rig.of([view("left@home", 0.0), view("left@work", 0.0), view("left@work@1", 1.0)])
+    assert found.lens_names == ("left@home", "left@work")
+    np.testing.assert_array_equal(found.lens_of_pose, [0, 1, 1])
