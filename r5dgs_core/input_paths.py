@@ -102,7 +102,9 @@ def check_calibration(path: Path) -> None:
 
 def prepare_command(source: Path) -> str:
     """Return the command that makes a data set from a video, or a folder of videos or images, for messages."""
-    out = source.with_name(f"{source.stem if source.is_file() else source.name}_data")
+    named = source if source.name not in ("", "..") else source.resolve()  # "." has no name
+    name = named.stem if source.is_file() else named.name
+    out = named.with_name(f"{name}_data") if name else Path("data")
     return f"r5dgs prepare {shlex.quote(str(source))} --out {shlex.quote(str(out))}"
 
 

@@ -1,5 +1,8 @@
 """The layouts of data sets, and one that the developer's page adds."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -60,3 +63,12 @@ def test_a_video_and_folders_of_frames_are_refused_with_the_command_that_prepare
         errors.DatasetError, match="is it the right folder.*prepare .*frames --out .*frames_data' makes"
     ):
         registry.check(tmp_path / "frames")
+
+
+@pytest.mark.parametrize("source", [".", ".."])
+def test_the_command_for_the_present_folder_names_another_one(tmp_path, monkeypatch, source):
+    (tmp_path / "walk" / "sub").mkdir(parents=True)
+    (tmp_path / "walk" / "cam0.mp4").write_bytes(b"")
+    monkeypatch.chdir(tmp_path / "walk" / ("" if source == "." else "sub"))
+    with pytest.raises(errors.DatasetError, match=rf"r5dgs prepare {re.escape(source)} --out .*walk_data$"):
+        registry.check(Path(source))
