@@ -19,7 +19,8 @@ def select(name: str) -> torch.device:
     """Return the device of a name: ``cpu``, ``cuda``, ``cuda:N``, or ``auto``.
 
     ``auto`` is a CUDA device if torch finds one and gsplat can be loaded, and otherwise the CPU. Of several processes
-    that train together, each takes its own CUDA device for ``cuda`` and ``auto``; others take the first one.
+    that train together, each takes its own CUDA device for ``cuda`` and ``auto``; others take the first one. A CUDA
+    device becomes the current one, on which graphs are captured.
 
     Raises:
         BackendError: The named device cannot be used; the message has the remedy.
@@ -37,6 +38,7 @@ def select(name: str) -> torch.device:
         device = torch.device("cuda", index)
     reason = cuda.why_unavailable(device, torch.float32)
     if reason is None:
+        torch.cuda.set_device(device)
         return device
     if name != AUTO:
         raise BackendError(f"device {name}: {reason}".replace("backend='cpu'", "--device cpu"))

@@ -11,11 +11,14 @@ from r5dgs_core.train import devices
 
 @pytest.fixture
 def two_gpus(monkeypatch):
-    """Pretend that torch finds two GPUs and gsplat loads."""
+    """Pretend that torch finds two GPUs and gsplat loads; returns the devices that become the current one."""
+    current = []
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", current.append)
     monkeypatch.setattr(cuda, "why_unavailable", lambda device, dtype: None)
+    return current
 
 
 def test_without_cuda_auto_is_the_cpu_and_cuda_an_error_with_remedy(monkeypatch):
@@ -32,6 +35,11 @@ def test_auto_needs_gsplat(two_gpus, monkeypatch):
     assert devices.select("auto") == torch.device("cpu")
     with pytest.raises(BackendError, match="gsplat is not installed"):
         devices.select("cuda")
+
+
+def test_the_gpu_of_a_run_is_the_current_device(two_gpus):
+    devices.select("cuda:1")
+    assert two_gpus == [torch.device("cuda:1")]
 
 
 def test_a_gpu_that_does_not_exist_is_named(two_gpus):

@@ -214,6 +214,7 @@ def test_each_process_takes_a_gpu_of_its_own(monkeypatch):
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", lambda device: None)
     monkeypatch.setattr(cuda, "why_unavailable", lambda device, dtype: None)
     assert devices.select("cuda") == devices.select("auto") == torch.device("cuda", 1)
     assert devices.select("cuda:0") == torch.device("cuda", 0)
