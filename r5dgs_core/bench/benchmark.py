@@ -147,7 +147,7 @@ def _measure(
     """Bake a run, write its scene, and measure the lacking modes that the scene supports."""
     progress({"event": "bake", "text": case.title})
     run = run_folder.open_run(case.run)
-    dataset = datasets.read(case.root)
+    dataset = datasets.read(case.root, run.config.data.masks, run.config.data.min_registered)
     if dataset.digest != run.digest:
         raise CheckpointError(f"{case.run}: was trained on other data than {case.root} now holds; restore the data")
     scene = bake.bake(run, dataset)

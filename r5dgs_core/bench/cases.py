@@ -110,8 +110,9 @@ def make(plan: BenchmarkRequest) -> list[Case]:
         raise ConfigError(f"--out {plan.out}: is a file; name a folder")
     roots: dict[str, Path] = {}
     digests: dict[str, str] = {}
+    chosen = configs.load(plan.config_path, plan.overrides, plan.preset).data
     for root in plan.scenes:
-        dataset = datasets.read(root)
+        dataset = datasets.read(root, chosen.masks, chosen.min_registered)
         name = Path(dataset.root).resolve().name
         if name in roots:
             raise ConfigError(f"{roots[name]} and {root}: are both called {name}; give one of them another name")

@@ -106,6 +106,14 @@ def test_a_record_holds_the_results_of_evaluation_and_playback(made, tiny):
 
 
 @pytest.mark.slow
+def test_runs_with_other_masks_than_those_of_the_data_set_are_measured_and_kept(tiny, tmp_path):
+    plan = plan_for(tiny, tmp_path, overrides=(*OVERRIDES, "data.masks=none", "discovery.iterations=0"))
+    for _ in range(2):
+        (found,) = benchmark.run_bench(plan, progress_kind="none")["results"]
+        assert found["splits"]["val"]["images"] == 2
+
+
+@pytest.mark.slow
 def test_finished_runs_are_neither_trained_nor_measured_again(made, monkeypatch):
     plan, case, result = made
     before = contents(case.run)
