@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from .. import atomic_files, strict_json
 from ..bench import process
+from ..data import dataset as datasets
 from ..errors import CheckpointError, ConfigError, R5dgsError, TrainingError
 from ..train import checkpoint, run_folder
 from .captures import Capture
+
+VISIBLE_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "all"
 
 
 @dataclass(frozen=True)
@@ -23,14 +27,20 @@ class CaptureJob:
         capture: The capture.
         out: Output folder.
         threads: Threads of the kernels; None for all cores of the job.
+        gpus: GPUs that its commands see, as `visible_gpus` returns them.
     """
 
     capture: Capture
     out: Path
     threads: int | None = None
+    gpus: str | None = None
 
     def __call__(self) -> dict[str, Any]:
         """Finish the capture; return its ``evaluation``, or the ``failure`` in one line."""
+        if self.gpus == ALL_GPUS:
+            os.environ.pop(VISIBLE_GPUS, None)
+        elif self.gpus is not None:
+            os.environ[VISIBLE_GPUS] = self.gpus
         try:
             return {"evaluation": self._finish()}
         except R5dgsError as error:
@@ -39,7 +49,7 @@ class CaptureJob:
     def _finish(self) -> dict[str, Any]:
         run, scene = self.path(""), self.path(".r5dgs")
         if self.is_trained():
-            self._refuse_other_settings()
+            self._refuse_changes()
         else:
             given = [*self.capture.arguments, "--device", self.capture.config.train.device]
             if (run / run_folder.RUN_FILE).exists():
@@ -75,14 +85,20 @@ class CaptureJob:
         path = self.path(".json")
         return strict_json.read(path, CheckpointError, "remove it to evaluate again") if path.exists() else {}
 
-    def _refuse_other_settings(self) -> None:
-        """Raise `ConfigError` if the capture was trained with other settings; the device may differ."""
-        own = run_folder.open_run(self.path("")).config
-        changed = own.differences(self.capture.config.replace(**{"train.device": own.train.device}))
+    def _refuse_changes(self) -> None:
+        """Raise an error if the capture was trained with other settings, except for the device, or on other data."""
+        run = run_folder.open_run(self.path(""))
+        changed = run.config.differences(self.capture.config.replace(**{"train.device": run.config.train.device}))
         if changed:
             raise ConfigError(
                 f"{self.path('')}: was trained with other values of {', '.join(changed)}; choose another --out for "
                 "other settings"
+            )
+        data = run.config.data
+        if datasets.read(self.capture.data, data.masks, data.min_registered).digest != run.digest:
+            raise CheckpointError(
+                f"{self.path('')}: was trained on other data than {self.capture.data} now holds; restore the data, or "
+                "give the capture another 'name'"
             )
 
     def _stamp(self) -> list[int]:
@@ -98,3 +114,12 @@ class CaptureJob:
             raise SystemExit(process.STOPPED)
         if ended.status != 0:
             raise TrainingError(f"r5dgs {arguments[0]}: {process.reason(ended)}")
+
+
+def visible_gpus(cluster: str, resources: dict[str, Any]) -> str | None:
+    """Return the GPUs of a job as a value of `VISIBLE_GPUS`; None for those that the cluster gives it.
+
+    submitit hides all GPUs from local jobs that request none. They get those of this process, `ALL_GPUS` by default.
+    """
+    requested = {"gpus_per_node", "local_gpus_per_node"} & resources.keys()
+    return None if cluster != "local" or requested else os.environ.get(VISIBLE_GPUS, ALL_GPUS)

@@ -10,8 +10,10 @@ from typing import Any
 
 from ..config import config as configs
 from ..errors import ConfigError
+from . import jobs
 
 _KEYS: dict[str, type] = {"data": str, "name": str, "preset": str, "config": str, "set": list, "device": str}
+_RESERVED = (Path(jobs.RESULT_FILE).stem, jobs.JOBS_FOLDER)  # names of files and folders beside those of captures
 _DEFAULTS = tuple(key for key in _KEYS if key not in ("data", "name"))
 
 
@@ -104,6 +106,8 @@ def _capture(place: str, folder: Path, defaults: dict[str, Any], table: dict[str
     name = table.get("name", data.resolve().name)
     if not re.fullmatch(r"[\w.-]*\w[\w.-]*", name):
         raise ConfigError(f"{place}: name: expected letters, digits, '_', '-' and '.', found {name!r}")
+    if name in _RESERVED:
+        raise ConfigError(f"{place}: name: {name!r} is taken by files of the batch; give the capture another 'name'")
     arguments = ["--preset", given["preset"]] if "preset" in given else []
     arguments += ["--config", str(config.resolve())] if config is not None else []
     arguments += [text for setting in settings for text in ("--set", setting)]

@@ -68,12 +68,13 @@ def run_batch(
 
     planned = captures.read(path)
     from ...batch import jobs, table
-    from ...batch.capture_job import CaptureJob
+    from ...batch.capture_job import CaptureJob, visible_gpus
     from ...progress import make
     from ...train import interrupt
 
     out.mkdir(parents=True, exist_ok=True)
-    work = [CaptureJob(capture, out.resolve(), threads) for capture in planned.captures]
+    gpus = visible_gpus(cluster, planned.resources)
+    work = [CaptureJob(capture, out.resolve(), threads, gpus) for capture in planned.captures]
     start = jobs.executor(cluster, out.resolve() / jobs.JOBS_FOLDER, planned.resources)
     at_once = at_once or (1 if cluster == "local" else 1000)
     with make(progress_kind) as progress, interrupt.at_once("stopped; repeat the same command to continue"):

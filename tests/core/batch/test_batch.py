@@ -1,9 +1,14 @@
 """The command ``r5dgs batch`` trains, bakes and evaluates, and continues what has begun."""
 
 import json
+import os
+import shutil
+from types import SimpleNamespace
 
 import pytest
 
+from r5dgs_core.batch import capture_job
+from r5dgs_core.bench import process
 from r5dgs_core.cli import main
 from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.scene import scene_file
@@ -28,6 +33,29 @@ def test_a_fault_in_the_file_is_one_error(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("resources", "own", "seen"),
+    [({}, None, None), ({}, "1,2", "1,2"), ({}, "", ""), ({"gpus_per_node": 1}, "2", "0")],
+)
+def test_local_jobs_see_the_gpus_of_the_command_unless_they_request_some(tmp_path, monkeypatch, resources, own, seen):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if own is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", own)
+    capture = SimpleNamespace(name="a", data=tmp_path, arguments=(), config=tiny_datasets.settings())
+    job = capture_job.CaptureJob(capture, tmp_path, gpus=capture_job.visible_gpus("local", resources))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0" if resources else "")  # as submitit sets it
+    found = []
+
+    def run(*given):
+        found.append(os.environ.get("CUDA_VISIBLE_DEVICES"))
+        return SimpleNamespace(status=3, complaint="no images")
+
+    monkeypatch.setattr(process, "run", run)
+    assert "no images" in job()["failure"]
+    assert found == [seen]
+    assert capture_job.visible_gpus("slurm", {}) is None
+
+
 @pytest.mark.slow
 def test_a_batch_ends_with_scene_and_figures_and_begins_nothing_twice(tiny, tmp_path, capsys):
     path, out = write(tmp_path / "captures.toml", tiny.root), tmp_path / "out"
@@ -42,6 +70,11 @@ def test_a_batch_ends_with_scene_and_figures_and_begins_nothing_twice(tiny, tmp_
     stamp = (out / f"{name}.r5dgs").stat().st_mtime_ns
     assert main.main(command) == 0
     assert (out / f"{name}.r5dgs").stat().st_mtime_ns == stamp
+    other = shutil.copytree(tiny.root, tmp_path / "other" / name)
+    (other / "train" / "r_000.png").write_bytes((other / "train" / "r_001.png").read_bytes())
+    write(path, other)
+    assert main.main(command) == ExitStatus.ERROR
+    assert "was trained on other data than" in (out / "batch.json").read_text()
     write(path, tiny.root, "train.seed=5")
     assert main.main(command) == ExitStatus.ERROR
     assert "was trained with other values of train.seed" in (out / "batch.json").read_text()

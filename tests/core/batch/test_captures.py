@@ -60,6 +60,8 @@ CAPTURE = '[[capture]]\ndata = "kitchen"\n'
         (CAPTURE + "set = ['train.sed=3']", "capture 1: .*did you mean 'seed'"),
         (CAPTURE + "device = 'tpu'", "capture 1: .*device"),
         (CAPTURE + "name = 'a/b'", "capture 1: name: expected letters"),
+        (CAPTURE + "name = 'batch'", "capture 1: name: 'batch' is taken by files of the batch"),
+        (CAPTURE + "name = 'jobs'", "capture 1: name: 'jobs' is taken"),
         (CAPTURE + CAPTURE, "capture 2: another capture is called kitchen"),
         ("[defaults]\ndata = 'kitchen'\n" + CAPTURE, "defaults: unknown key 'data'"),
     ],
