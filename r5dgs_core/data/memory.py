@@ -34,10 +34,15 @@ def available() -> float | None:
         return None
 
 
-def for_images(limit: float) -> float:
-    """Return the memory that training may use for pixels, bytes: ``limit`` [GB], or half of the available memory."""
+def for_images(limit: float, processes: int = 1) -> float:
+    """Return the memory that a process may use for pixels, bytes.
+
+    Args:
+        limit: Maximum, GB (``data.memory``).
+        processes: Number of processes of this machine that train together; they share half of the available memory.
+    """
     free = available()
-    return limit * GB if free is None else min(limit * GB, free / 2)
+    return limit * GB if free is None else min(limit * GB, free / 2 / processes)
 
 
 def of_images(dataset: Dataset) -> int:
@@ -62,14 +67,14 @@ def check_images(dataset: Dataset) -> None:
         )
 
 
-def note(dataset: Dataset, limit: float) -> str:
+def note(dataset: Dataset, limit: float, processes: int = 1) -> str:
     """Return a remark for the user if images are read again while training, else an empty string.
 
     Args:
         dataset: The data set.
-        limit: Maximum memory for pixels, GB (``data.memory``).
+        limit, processes: As for `for_images`.
     """
-    needed, used = of_images(dataset), for_images(limit)
+    needed, used = of_images(dataset), for_images(limit, processes)
     if needed <= used:
         return ""
     return (

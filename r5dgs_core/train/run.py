@@ -37,7 +37,7 @@ from .identity import packed_masks
 from .refinement import trial
 from .representations.representation import TRACKS
 from .trainer import Trainer
-from .workers import ALONE, Workers, launch_command
+from .workers import ALONE, Workers, launch_command, on_this_machine
 
 log = logging.getLogger(__name__)
 
@@ -163,7 +163,7 @@ def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]
         else:
             progress({"event": "prepare", "text": f"training on {devices.title(device)}"})
         found = _found_masks(dataset, run.config, state, progress)
-        note = memory.note(dataset, run.config.data.memory)
+        note = memory.note(dataset, run.config.data.memory, on_this_machine())
         progress({"event": "prepare", "text": f"images, objects, background{note}"})
         request.workers.broadcast((run.config, found, state))
         trainer = Trainer(dataset, run.config, found, request.workers, state)

@@ -46,7 +46,7 @@ from .representations import fused_posing, registry, still
 from .running_loss import CHECK_EVERY, RunningLoss, require_finite_state, require_finite_step
 from .step_graphs import StepInputs
 from .targets import Targets
-from .workers import ALONE, Workers
+from .workers import ALONE, Workers, on_this_machine
 
 MAX_CAMERAS = 256  # maximum number of cameras in tests of visibility
 FREEZE_EVERY = 100  # steps between updates of the frozen Gaussians
@@ -82,7 +82,7 @@ class Trainer:
         self.config = config = training_needs.resolve(config)
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         self.behind = train_views.behind(dataset, config)
-        self._memory = memory.for_images(config.data.memory)
+        self._memory = memory.for_images(config.data.memory, on_this_machine())
         views = train_views.load(dataset, self.normalization, self.behind, self._memory)
         self.given_views, self.unexplained = unexplained_views.decide(views, config, state)
         self.discovered_masks, shown = None, self.given_views

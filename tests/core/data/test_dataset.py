@@ -342,6 +342,7 @@ def test_many_images_need_no_more_memory_than_allowed(flat, monkeypatch):
     found = dataset.read(flat)
     monkeypatch.setattr(memory, "available", lambda: 10 * memory.GB)
     assert (memory.for_images(2.0), memory.for_images(8.0)) == (2 * memory.GB, 5 * memory.GB)
+    assert (memory.for_images(2.0, 2), memory.for_images(2.0, 5)) == (2 * memory.GB, memory.GB)
     many = dataclasses.replace(found, train=1000 * found.train)
     assert memory.at_once(many) <= 32 * memory.of_images(found)
     assert "images of 0.0 GB are read again while training" in memory.note(many, 1e-4)
