@@ -129,7 +129,9 @@ def _result(submitted: Any) -> dict[str, Any]:
         return submitted.result()
     lines = str(error).splitlines() or [type(error).__name__]
     raised = [line for line in lines if re.match(r"[\w.]+: ", line)]  # of a traceback
-    return {"failure": f"{(raised or lines)[-1 if raised else 0]} (log: {submitted.paths.stderr})"}
+    silent = any("has not produced any output" in line for line in lines)  # of submitit
+    reason = raised[-1] if raised else "the job ended without a result; it may have been killed" if silent else lines[0]
+    return {"failure": f"{reason} (log: {submitted.paths.stderr})"}
 
 
 def _write(out: Path, names: Sequence[str], evaluations: dict[str, Any], failures: dict[str, str]) -> dict[str, Any]:

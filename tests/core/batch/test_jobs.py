@@ -67,6 +67,7 @@ def test_failed_jobs_are_repeated_and_one_table_shows_all(tmp_path, monkeypatch)
     assert any(line.startswith("| bad | ") and "RuntimeError: no luck" in line for line in lines)
     assert any(line.endswith("| no images |") for line in lines)
     assert sum("tried again" in event["text"] for event in events) == 3
+    assert any(event["text"].startswith("killed: the job ended without a result; it may") for event in events)
 
 
 class Running:
