@@ -100,7 +100,7 @@ def _capture(place: str, folder: Path, defaults: dict[str, Any], table: dict[str
     config = folder / given["config"] if "config" in given else None
     try:
         loaded = configs.load(config, tuple(settings), given.get("preset"))
-        loaded = loaded.replace(**{"train.device": given.get("device", "auto")})
+        loaded = loaded.replace(**{"train.device": given.get("device", loaded.train.device)})
     except ConfigError as error:
         raise ConfigError(f"{place}: {error}") from None
     name = table.get("name", data.resolve().name)

@@ -42,6 +42,11 @@ def test_captures_extend_the_defaults(written):
     assert batch.resources == {"slurm_partition": "gpu"}
 
 
+def test_the_device_may_be_a_setting(written):
+    (capture,) = captures.read(written("[[capture]]\ndata = 'kitchen'\nset = ['train.device=cpu']")).captures
+    assert capture.config.train.device == "cpu"
+
+
 CAPTURE = '[[capture]]\ndata = "kitchen"\n'
 
 
