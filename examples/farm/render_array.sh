@@ -3,8 +3,9 @@
 #
 #     sbatch --array=0-9 render_array.sh FILE.blend DIR/###### FIRST LAST
 #
-# Each task renders its part of FIRST..LAST. Existing frames are left, so a task may be requeued, and the same line
-# renders what is missing after failures. The environment variable BLENDER names the program, by default `blender`.
+# Each task renders its part of FIRST..LAST, which replaces the range and the step of the scene. Existing frames are
+# left, so a task may be requeued, and the same line renders what is missing after failures. The environment variable
+# BLENDER names the program, by default `blender`.
 #SBATCH --job-name=r5dgs
 #SBATCH --output=%x-%A-%a.log
 #SBATCH --open-mode=append
@@ -12,8 +13,8 @@
 #SBATCH --cpus-per-task=2
 set -u
 
-if [ $# -ne 4 ]; then
-  echo "usage: sbatch --array=0-9 render_array.sh FILE.blend DIR/###### FIRST LAST" >&2
+if [ $# -ne 4 ] || ! [ "$3" -le "$4" ]; then
+  echo "usage: sbatch --array=0-9 render_array.sh FILE.blend DIR/###### FIRST LAST (FIRST <= LAST)" >&2
   exit 2
 fi
 file=$1 output=$2 first=$3 last=$4
@@ -27,7 +28,7 @@ if [ "$from" -gt "$to" ]; then
   exit 0
 fi
 for _ in 1 2 3; do
-  "${BLENDER:-blender}" -b -y "$file" -o "$output" -s "$from" -e "$to" --command r5dgs_render
+  "${BLENDER:-blender}" -b -y "$file" -o "$output" --command r5dgs_render --frames="$from..$to"
   status=$?
   case $status in
     134 | 137 | 139) echo "Blender was killed or crashed (status $status)" >&2 ;;

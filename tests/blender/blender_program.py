@@ -1,6 +1,6 @@
 """The options of Blender's command line that farms use, for the bpy module: a stand-in for the program `blender`.
 
-    python tests/blender/blender_program.py -b -y FILE.blend -o OUTPUT -s FIRST -e LAST --command NAME ARGUMENTS
+    python tests/blender/blender_program.py -b -y FILE.blend -o OUTPUT --command NAME ARGUMENTS
 
 It registers the extension of this repository.
 """
@@ -25,16 +25,12 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("-y", action="store_true")
     parser.add_argument("file")
     parser.add_argument("-o", dest="output")
-    parser.add_argument("-s", dest="first", type=int)
-    parser.add_argument("-e", dest="last", type=int)
     parser.add_argument("--command", nargs=argparse.REMAINDER)
     options = parser.parse_args(arguments)
     package = check_playback.extension_package()
     command = importlib.import_module(f"{package}.r5dgs_addon.engine.render_command")
     bpy.ops.wm.open_mainfile(filepath=options.file)
-    scene = bpy.context.scene
-    scene.render.filepath = options.output
-    scene.frame_start, scene.frame_end = options.first, options.last
+    bpy.context.scene.render.filepath = options.output
     name, *rest = options.command
     return command.run(rest) if name == command.NAME else 1
 

@@ -53,8 +53,9 @@ def test_the_tasks_of_an_array_share_the_frames(ending, tmp_path, span, tasks):
         subprocess.run(**array("a b.blend", "out/####", *span, task=task, tasks=tasks, **ending), check=True)
     frames = []
     for line in (tmp_path / "said").read_text().splitlines():
-        assert line.startswith("-b -y a b.blend -o out/#### -s ") and line.endswith(" --command r5dgs_render")
-        first, last = line.split(" -s ")[1].split(" --")[0].split(" -e ")
+        start, part = line.split(" --frames=")
+        assert start == "-b -y a b.blend -o out/#### --command r5dgs_render"
+        first, last = part.split("..")
         frames += range(int(first), int(last) + 1)
     assert frames == list(range(span[0], span[1] + 1))
 
@@ -75,8 +76,9 @@ def test_a_killed_blender_is_started_again(ending, tmp_path, demands, status, st
     assert len((tmp_path / "said").read_text().splitlines()) == starts
 
 
-def test_the_array_without_its_arguments_shows_the_usage():
-    done = subprocess.run(**array("a.blend"), capture_output=True, text=True)
+@pytest.mark.parametrize("given", [["a.blend"], ["a.blend", "####", 3, 1], ["a.blend", "####", "x", 1]])
+def test_the_array_with_wrong_arguments_shows_the_usage(given):
+    done = subprocess.run(**array(*given), capture_output=True, text=True)
     assert done.returncode == 2 and "usage: sbatch" in done.stderr
 
 
