@@ -62,10 +62,22 @@ def test_representatives():
     assert torch.equal(rigidity._representatives_in_torch(means, labels, opacities, len(expected)), expected)
 
 
+class OnDevice:
+    """Scalar of a GPU."""
+
+    device = torch.device("cuda")
+
+    def __init__(self, value):
+        self._value = value
+
+    def double(self):
+        return torch.tensor(self._value).double()
+
+
 def test_the_running_loss_of_a_device_is_that_of_the_cpu():
-    numbers, tensors = RunningLoss(), RunningLoss()
+    numbers, there = RunningLoss(), RunningLoss()
     for k in range(20):
-        loss = torch.tensor(0.1 + 0.01 * k)
-        numbers.add(loss)
-        tensors._value = loss.double() if k == 0 else 0.98 * tensors._value + 0.02 * loss.double()
-    assert numbers.value == tensors.value
+        numbers.add(torch.tensor(0.1 + 0.01 * k))
+        there.add(OnDevice(0.1 + 0.01 * k))
+    assert isinstance(there._value, torch.Tensor)  # reading it would wait for the device
+    assert numbers.value == there.value
