@@ -87,7 +87,7 @@ def _of_all(trainer: Any, drawn: Sequence[Drawn], place: str) -> list[Drawn]:
     if trainer.workers.count == 1:
         return list(drawn)
     means = trainer.gaussians.means.detach()
-    state = len(means), float(means.sum(dtype=torch.float64))
+    state = len(means), repr(float(means.sum(dtype=torch.float64)))  # as text, nan equals nan
     found = trainer.workers.gather([(state, one.to("cpu")) for one in drawn])
     if len({state for state, _ in found}) > 1:
         raise TrainingError(

@@ -1,11 +1,16 @@
 """A step with several views moves along the mean of their gradients."""
 
+import pickle
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.train import losses
+from r5dgs_core.errors import TrainingError
+from r5dgs_core.raster import RasterStats
+from r5dgs_core.train import losses, view_batch
 from r5dgs_core.train.trainer import Trainer
 from tests.support import tiny_datasets
 
@@ -68,3 +73,26 @@ def test_a_resumed_run_with_several_views_is_the_uninterrupted_one(tiny):
     while not whole.done:
         assert torch.equal(whole.step(), second.step())
     assert all(torch.equal(tensor, params(second)[name]) for name, tensor in params(whole).items())
+
+
+@pytest.mark.parametrize(("mean", "other", "agree"), [(1.0, 1.0, True), (np.nan, np.nan, True), (1.0, 2.0, False)])
+def test_only_processes_with_different_gaussians_are_refused(mean, other, agree):
+    stats = RasterStats()
+    stats.visible = stats.radii = stats.grad_norm = torch.ones(4)
+    drawn = view_batch.Drawn(0, None, torch.ones(()), stats, None)
+
+    def trainer_of(value, others=()):
+        workers = SimpleNamespace(count=2, gather=lambda items: sent.extend(items) or [*items, *others])
+        return SimpleNamespace(
+            workers=workers, device="cpu", gaussians=SimpleNamespace(means=torch.full((4, 3), value))
+        )
+
+    sent = []
+    view_batch._of_all(trainer_of(other), [drawn], "step 3")
+    theirs = pickle.loads(pickle.dumps(sent))
+    trainer = trainer_of(mean, theirs)
+    if agree:
+        assert len(view_batch._of_all(trainer, [drawn], "step 3")) == 2
+    else:
+        with pytest.raises(TrainingError, match="step 3: the processes of this run have different Gaussians"):
+            view_batch._of_all(trainer, [drawn], "step 3")
