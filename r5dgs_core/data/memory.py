@@ -77,9 +77,12 @@ def note(dataset: Dataset, limit: float, processes: int = 1) -> str:
     needed, used = of_images(dataset), for_images(limit, processes)
     if needed <= used:
         return ""
+    least = math.ceil(needed / GB)
+    possible = needed <= for_images(least, processes)
+    remedy = f"data.memory={least} keeps all of them" if possible else "all of them need more than half of what is free"
     return (
         f" ({len(dataset.train)} images of {needed / GB:.1f} GB are read again while training, because they may use "
-        f"{used / GB:.1f} GB of memory; data.memory={math.ceil(needed / GB)} keeps all of them)"
+        f"{used / GB:.1f} GB of memory; {remedy})"
     )
 
 

@@ -348,6 +348,8 @@ def test_many_images_need_no_more_memory_than_allowed(flat, monkeypatch):
     assert "images of 0.0 GB are read again while training" in memory.note(many, 1e-4)
     assert "data.memory=1 keeps all of them" in memory.note(many, 1e-4)
     assert memory.note(found, 1.0) == ""
+    monkeypatch.setattr(memory, "available", lambda: memory.of_images(many))
+    assert "all of them need more than half of what is free" in memory.note(many, 1e-4)
 
 
 def test_the_digest_changes_with_cameras_and_images_only(flat):
