@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from ..data import dataset as datasets
-from ..errors import Interrupted
+from ..errors import DatasetError, Interrupted
 from ..render import warm_up
 from . import devices, interrupt, run
 from .trainer import Trainer
@@ -21,6 +21,7 @@ def follow(dataset_root: Path, workers: Workers) -> None:
         workers: The processes.
 
     Raises:
+        DatasetError: The data set differs from that of the leading process.
         Interrupted: One of the processes was asked to stop.
         TrainingError: Another process has ended, or has another state than this one.
     """
@@ -28,8 +29,12 @@ def follow(dataset_root: Path, workers: Workers) -> None:
     begin = workers.broadcast(None)
     if begin is None:  # the run is already finished
         return
-    config, found, state = begin
+    config, digest, found, state = begin
     dataset = datasets.read(dataset_root, config.data.masks, config.data.min_registered)
+    if dataset.digest != digest:
+        raise DatasetError(
+            f"{dataset_root}: differs from the data of the first process; give all processes the same files"
+        )
     if devices.select(config.train.device).type == devices.CPU:
         warm_up.warm_up()
     trainer = Trainer(dataset, config, found, workers, state)

@@ -165,7 +165,7 @@ def _train(request: _Request, progress: TimedProgress, claim: Callable[[], None]
         found = _found_masks(dataset, run.config, state, progress)
         note = memory.note(dataset, run.config.data.memory, on_this_machine())
         progress({"event": "prepare", "text": f"images, objects, background{note}"})
-        request.workers.broadcast((run.config, found, state))
+        request.workers.broadcast((run.config, dataset.digest, found, state))
         trainer = Trainer(dataset, run.config, found, request.workers, state)
         held_out = view_psnr.configured(trainer)
     if replaces:

@@ -43,12 +43,13 @@ def arguments(root, out, *settings, more=()):
     return ["train", str(root), "--out", str(out), "--device", "cpu", "--progress", "none", *given, *more]
 
 
-def in_two_processes(*given):
+def in_two_processes(*given, second=None):
+    """Run both processes with the same arguments, or the second one with others."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     with ThreadPoolExecutor() as pool:
-        return list(pool.map(lambda rank: processes.run(PROCESS, rank, port, *given), (0, 1)))
+        return list(pool.map(lambda rank: processes.run(PROCESS, rank, port, *(given, second or given)[rank]), (0, 1)))
 
 
 def losses(folder):
@@ -92,6 +93,16 @@ def test_one_process_reports_a_failure(tmp_path):
     assert ended[0].stderr.startswith("r5dgs: ") and "missing" in ended[0].stderr
     assert "r5dgs:" not in ended[1].stderr and "Traceback" not in ended[1].stderr
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_processes_with_other_data_are_refused(tiny, copied, tmp_path):
+    (copied / "train" / "r_000.png").write_bytes((copied / "train" / "r_001.png").read_bytes())
+    first, second = (arguments(root, tmp_path / "run", *SHORT) for root in (tiny.root, copied))
+    ended = in_two_processes(*first, second=second)
+    assert all(process.returncode == ExitStatus.ERROR for process in ended)
+    assert "differs from the data of the first process" in ended[1].stderr
+    assert "Traceback" not in ended[0].stderr + ended[1].stderr
 
 
 def test_settings_are_repeated_or_left_out_to_resume(tiny, alone, capsys):
