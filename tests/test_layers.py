@@ -85,7 +85,7 @@ ALLOWED = {
     },
     "association": {"scene", "data", "raster", "playback", "render", "masks"},
     "bench": {"terminal", "progress", "scene", "data", "config", "playback", "render", "evaluation", "train", "bake"},
-    "batch": {"config", "train", "bench"},
+    "batch": {"data", "config", "train", "bench"},
     "error_vs_time": {
         "motion",
         "terminal",
