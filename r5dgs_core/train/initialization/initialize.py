@@ -184,7 +184,9 @@ def _warn(views: Sequence[TrainView], motion: type[Representation]) -> None:
             log.warning("no masks: the field moves all Gaussians, and objects are found by their motion. %s", MASKS)
         else:
             log.warning(
-                "no masks: everything is trained as one static scene. %s, or --set train.representation=field", MASKS
+                "no masks and no moving objects found: everything is trained as one static scene. %s, or "
+                "--set train.representation=field",
+                MASKS,
             )
     elif len({view.t for view in views}) == 1:
         log.warning("only one observed time: motion cannot be learned. Remedy: frames at more times")
