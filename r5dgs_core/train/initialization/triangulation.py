@@ -32,6 +32,7 @@ MIN_VISIBLE_AREA = (
     0.5  # minimum visible area of an object whose pose training determines, relative to the median over time
 )
 ROUNDS = 5
+NAMED = 8  # maximum number of objects that a warning names
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,7 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> O
     visibility, evidence = np.zeros((m, count)), np.zeros((m, count))
     from_two = np.zeros((m, count), bool)
     radii = np.zeros(m)
+    guessed = []
     for row, object_id in enumerate(ids):
         seen = found[int(object_id)]
         for x in seen:
@@ -98,15 +100,17 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> O
         used = _votes(seen)
         centers[row], measured[row] = _path(used, times)
         if not measured[row].any():
-            log.warning(
-                "object %d is never fully visible from two sides: its depth is a guess. "
-                "Remedy: more cameras at the same times, or masks that follow it",
-                object_id,
-            )
+            guessed.append(int(object_id))
             measured[row, [x.knot for x in seen]] = True
         sizes = [x.angular_radius * np.linalg.norm(centers[row, x.knot] - x.origin) for x in used]
         radii[row] = np.quantile(sizes, 0.8)
         evidence[row] /= np.median(evidence[row][evidence[row] > 0])
+    if guessed:
+        log.warning(
+            "%s never fully visible from two sides, so its depth is a guess. Remedy: more cameras at the same times, "
+            "or masks that follow it",
+            _named(guessed),
+        )
     peak = visibility.max(axis=1, keepdims=True) if m else visibility
     shown = measured | (from_two & (evidence >= MIN_VISIBLE_AREA))
     visibility = visibility / np.maximum(peak, 1e-12)
@@ -125,14 +129,22 @@ def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) 
                 sighting = _sight(view.camera, mask, box, s, object_id, min_share)
                 if sighting is not None:
                     found.setdefault(object_id, []).append(sighting)
-    for object_id in [i for i, seen in found.items() if len(seen) == 1 and len(masked) > 1]:
-        del found[object_id]
+    single = sorted(i for i, seen in found.items() if len(seen) == 1 and len(masked) > 1)
+    if single:
         log.warning(
-            "object %d is shown by one mask only: treated as background. Remedy: correct the id in that mask, "
-            "or add masks of the object in other views",
-            object_id,
+            "%s shown by one mask only and treated as background. Remedy: correct the id in that mask, or add masks of "
+            "the object in other views",
+            _named(single),
         )
-    return found
+    return {i: seen for i, seen in found.items() if i not in set(single)}
+
+
+def _named(ids: Sequence[int]) -> str:
+    """Return the subject and the verb of a message about some objects."""
+    if len(ids) == 1:
+        return f"object {ids[0]} is"
+    more = f" and {len(ids) - NAMED} more" if len(ids) > NAMED else ""
+    return f"objects {', '.join(map(str, ids[:NAMED]))}{more} are each"
 
 
 def _sight(

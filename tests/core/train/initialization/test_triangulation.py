@@ -114,6 +114,17 @@ def test_an_id_that_one_mask_shows_is_left_out_and_named(caplog):
     assert triangulation.locate(seen[2:3], TIMES[:1], 5e-4).object_ids.tolist() == [1, 9]  # there is no other mask
 
 
+def test_one_warning_names_the_first_of_many_stray_ids(caplog):
+    seen = [disc_view(c, 0.0, [(1, [0, 0, 0.3], 0.3)]) for c in ring()]
+    stray = seen[2].mask.copy()
+    for number in range(10):
+        stray[2:6, 3 + 5 * number : 7 + 5 * number] = 20 + number
+    seen[2] = seen[2].with_arrays(mask=stray)
+    assert triangulation.locate(seen, TIMES[:1], 5e-4).object_ids.tolist() == [1]
+    assert len(caplog.records) == 1
+    assert "objects 20, 21, 22, 23, 24, 25, 26, 27 and 2 more are each shown by one mask only" in caplog.text
+
+
 def throw(t):
     """A thrown ball's path. [..., 3]"""
     t = np.asarray(t, np.float64)
