@@ -10,10 +10,10 @@ from typing import Any
 
 from ..config import config as configs
 from ..errors import ConfigError
-from . import jobs
 
+RESULT_FILE, JOBS_FOLDER = "batch.json", "jobs"  # in the output folder, beside the files of the captures
 _KEYS: dict[str, type] = {"data": str, "name": str, "preset": str, "config": str, "set": list, "device": str}
-_RESERVED = (Path(jobs.RESULT_FILE).stem, jobs.JOBS_FOLDER)  # names of files and folders beside those of captures
+_RESERVED = (Path(RESULT_FILE).stem, JOBS_FOLDER)
 _DEFAULTS = tuple(key for key in _KEYS if key not in ("data", "name"))
 
 

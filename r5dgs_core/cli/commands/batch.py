@@ -75,11 +75,11 @@ def run_batch(
     out.mkdir(parents=True, exist_ok=True)
     gpus = visible_gpus(cluster, planned.resources)
     work = [CaptureJob(capture, out.resolve(), threads, gpus) for capture in planned.captures]
-    start = jobs.executor(cluster, out.resolve() / jobs.JOBS_FOLDER, planned.resources)
+    start = jobs.executor(cluster, out.resolve() / captures.JOBS_FOLDER, planned.resources)
     at_once = at_once or (1 if cluster == "local" else 1000)
     with make(progress_kind) as progress, interrupt.at_once("stopped; repeat the same command to continue"):
         result = jobs.run(work, start, at_once=at_once, retries=retries, progress=progress)
     if progress_kind != "json":
         terminal.console().print(table.to_rich(result))
-        print(f"table:  {out / jobs.TABLE_FILE}\nresult: {out / jobs.RESULT_FILE}")
+        print(f"table:  {out / jobs.TABLE_FILE}\nresult: {out / captures.RESULT_FILE}")
     return result
