@@ -75,7 +75,8 @@ def choose(names: Sequence[str], clocks: Sequence[np.ndarray], window: Window) -
             f"the recordings have no overlap: {names[early]} ends {first - last:.2f} s before {names[late]} begins. "
             "Remedy: remove one of them, or correct their clocks with --offset NAME=MS or timestamps.csv"
         )
-    low = max(first - slack, first + window.start - SAME_S)
+    # Without a start, the first moment counts even if cameras begin up to half an interval apart.
+    low = first - slack if window.start <= 0 else max(first - slack, first + window.start - SAME_S)
     high = last + slack if window.end is None else min(last + slack, first + window.end + SAME_S)
     grid = clocks[slowest]
     grid = _thinned(grid[(grid >= low) & (grid <= high)], window)

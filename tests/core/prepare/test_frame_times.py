@@ -70,6 +70,13 @@ def test_frames_that_are_apart_keep_their_times():
     np.testing.assert_allclose(choice.times[1] - choice.times[0], 0.03)
 
 
+def test_the_first_moment_counts_although_cameras_begin_apart():
+    one, other = np.arange(6) / 10, 0.03 + np.arange(6) / 10
+    choice = frame_choice.choose(NAMES, [one, other], Window())
+    assert choice.indices[0].tolist() == choice.indices[1].tolist() == list(range(6))
+    assert frame_choice.choose(NAMES, [one, other], Window(start=0.1)).indices[0].tolist() == [2, 3, 4, 5]
+
+
 @pytest.mark.parametrize(
     ("window", "expected"),
     [
