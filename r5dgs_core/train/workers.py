@@ -117,6 +117,10 @@ ALONE = Workers()
 @contextlib.contextmanager
 def joined() -> Iterator[Workers]:
     """Join the processes that ``torch.distributed.run`` has started with this one."""
+    # Default arguments of this module would keep a group, whose threads may abort the process at its end, if another
+    # module of torch imported it later.
+    import torch.distributed.nn.functional  # noqa: F401
+
     with _together():
         shared, rank, count = next(rendezvous("env://", timeout=LONGEST))
         store, reports = _meet(shared, rank)

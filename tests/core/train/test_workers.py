@@ -22,6 +22,7 @@ from tests.support import processes, tiny_datasets
 from tests.support.command_line import complaint
 
 pytestmark = pytest.mark.heavy
+needs_proc = pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs /proc")
 
 SHORT = (
     *tiny_datasets.SETTINGS,
@@ -38,18 +39,32 @@ sys.exit(main.main(sys.argv[3:]))
 """
 
 
+# Code that prints the threads of one of two processes after it has left the other one.
+LEAVES = """
+import os, sys
+rank, port = sys.argv[1:3]
+os.environ.update(RANK=rank, WORLD_SIZE="2", MASTER_ADDR="127.0.0.1", MASTER_PORT=port)
+from r5dgs_core.train import workers
+with workers.joined() as group:
+    import torch._dynamo
+    assert group.broadcast("state") == "state"
+for task in os.listdir("/proc/self/task"):
+    print(open(f"/proc/self/task/{task}/comm").read().strip())
+"""
+
+
 def arguments(root, out, *settings, more=()):
     given = [text for setting in settings for text in ("--set", setting)]
     return ["train", str(root), "--out", str(out), "--device", "cpu", "--progress", "none", *given, *more]
 
 
-def in_two_processes(*given, second=None):
+def in_two_processes(*given, second=None, code=PROCESS):
     """Run both processes with the same arguments, or the second one with others."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     with ThreadPoolExecutor() as pool:
-        return list(pool.map(lambda rank: processes.run(PROCESS, rank, port, *(given, second or given)[rank]), (0, 1)))
+        return list(pool.map(lambda rank: processes.run(code, rank, port, *(given, second or given)[rank]), (0, 1)))
 
 
 def losses(folder):
@@ -93,6 +108,13 @@ def test_one_process_reports_a_failure(tmp_path):
     assert ended[0].stderr.startswith("r5dgs: ") and "missing" in ended[0].stderr
     assert "r5dgs:" not in ended[1].stderr and "Traceback" not in ended[1].stderr
     assert not (tmp_path / "run").exists()
+
+
+@needs_proc
+def test_no_thread_of_the_group_is_left():
+    for ended in in_two_processes(code=LEAVES):
+        assert ended.returncode == 0, ended.stderr
+        assert "gloo" not in ended.stdout
 
 
 @pytest.mark.slow
@@ -162,7 +184,6 @@ LONG = (
     *tiny_datasets.SETTINGS,
     *("train.iterations=300", "train.checkpoint_every=40", "identity.iterations=2", "train.probe_every=0"),
 )
-needs_proc = pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs /proc")
 
 
 @pytest.mark.slow
