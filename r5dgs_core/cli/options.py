@@ -121,6 +121,11 @@ def positive(text: str) -> float:
     return _number(text, lambda value: value > 0, "more than 0")
 
 
+def frame_rate(text: str) -> float:
+    """Convert an argument to a number of frames per second that cameras may have."""
+    return _number(text, lambda value: 1e-6 <= value <= 1e6, "from 1e-6 to 1e6")
+
+
 def not_negative(text: str) -> float:
     """Convert an argument to a finite number of at least 0."""
     return _number(text, lambda value: value >= 0, "0 or more")

@@ -49,7 +49,7 @@ def prepare(request: Request, progress: Progress) -> Plan:
         CheckpointError: Another process writes to the folder.
     """
     source, out = Path(request.source).resolve(), Path(request.out).resolve()
-    if out == source or source in out.parents and source.is_dir() and (out.parent == source):
+    if source in (out, *out.parents):
         raise errors.ConfigError(
             f"--out {request.out}: is among the recordings; name a folder outside {request.source}"
         )

@@ -38,12 +38,12 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--start", type=options.not_negative, default=0.0, metavar="S", help=start)
     p.add_argument("--end", type=options.positive, metavar="S", help="last time in seconds (default: the last frame)")
     p.add_argument("--every", type=options.at_least(1), default=1, metavar="N", help="use every N-th frame")
-    p.add_argument("--fps", type=options.positive, metavar="HZ", help="use at most this number of frames per second")
+    p.add_argument("--fps", type=options.frame_rate, metavar="HZ", help="use at most this number of frames per second")
     size = "height of the images in pixels (default: up to 960, if training then fits half of the memory)"
     p.add_argument("--size", type=options.at_least(16), metavar="LINES", help=size)
     p.add_argument("--lossless", action="store_true", help="write PNG instead of JPEG of quality 95")
     rate = "recorded frames per second, for folders of frames and for videos with wrong times"
-    p.add_argument("--rate", type=options.positive, metavar="HZ", help=rate)
+    p.add_argument("--rate", type=options.frame_rate, metavar="HZ", help=rate)
     sync = "source of the offsets between clocks: audio, motion, none or auto (default)"
     p.add_argument("--sync", choices=SYNC, default="auto", help=sync)
     offset = "known offset of a camera's clock in milliseconds, which is added to its times; may be repeated"
@@ -221,7 +221,7 @@ def _check_masks(masks: str, model: Path | None, words: str | None) -> None:
 
 
 def _complete(plan: Plan, masks: str, given: dict[str, Any], progress_kind: str) -> None:
-    """Write the masks, and check the capture, also if image features show no object."""
+    """Write the masks, check the capture, also if image features show no object, and print the next command."""
     try:
         _make_masks(plan, masks, given, progress_kind)
     except errors.DatasetError as error:
@@ -231,6 +231,9 @@ def _complete(plan: Plan, masks: str, given: dict[str, Any], progress_kind: str)
         reason = str(error).replace("--backend", "--masks")  # the option of this command
         raise errors.DatasetError(f"{reason}. The data set without masks is complete") from error
     _check_capture(plan, progress_kind)
+    if progress_kind == "auto":
+        next_command = f"r5dgs train {shlex.quote(str(plan.request.out))} --out RUN --scene SCENE.r5dgs"
+        terminal.print_lines([f"written: {plan.request.out}. Next: {next_command}"])
 
 
 def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: str) -> None:
@@ -255,7 +258,7 @@ def _make_masks(plan: Plan, masks: str, given: dict[str, Any], progress_kind: st
 
 
 def _check_capture(plan: Plan, progress_kind: str) -> None:
-    """Check the data set, add the findings to its record, and print them before the next command.
+    """Check the data set, add the findings to its record, and print them.
 
     Raises:
         DatasetError: The data set has errors.
@@ -275,9 +278,6 @@ def _check_capture(plan: Plan, progress_kind: str) -> None:
         terminal.print_lines(map(str, found))
     if wrong := [one for one in found if one.severity == findings.ERROR]:
         raise errors.DatasetError(f"{out}: the data set cannot be trained: {wrong[0]}")
-    if progress_kind == "auto":
-        next_command = f"r5dgs train {shlex.quote(str(plan.request.out))} --out RUN --scene SCENE.r5dgs"
-        terminal.print_lines([f"written: {plan.request.out}. Next: {next_command}"])
 
 
 def summary(plan: Plan) -> list[str]:
@@ -309,9 +309,11 @@ def summary(plan: Plan) -> list[str]:
 
 def _offsets(given: Sequence[str]) -> dict[str, float]:
     """Convert arguments CAMERA=MS to seconds by camera."""
-    found = {}
+    found: dict[str, float] = {}
     for text in given:
         name, mark, value = text.rpartition("=")
+        if name in found:
+            raise errors.UsageError(f"--offset {text}: expected one offset of {name}, found another one")
         try:
             found[name] = float(value) / 1e3
         except ValueError:

@@ -478,6 +478,8 @@ NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, fo
     ["check", "nowhere"],
     ["prepare", ".", "--out", "data", "--calibration", "nowhere"],
     ["prepare", ".", "--out", "data", "--offset", "cam0"],
+    ["prepare", ".", "--out", "data", "--offset", "cam0=1", "--offset", "cam0=2"],
+    ["prepare", ".", "--out", "data", "--rate", "1e-300"],
     ["prepare", ".", "--out", "data", "--start", "3", "--end", "2"],
     ["export", "nowhere", "--to", "ply", "--out", "out.ply"],
     ["extrapolate", "nowhere", "--out", "x.r5dgs"],

@@ -91,16 +91,17 @@ def test_the_next_command_follows_the_findings(capture, tmp_path, capsys):
 
 
 def test_a_folder_among_the_recordings_is_refused(capture):
-    for out in (capture, capture / "data"):
+    for out in (capture, capture / "data", capture / "cam0" / "data"):
         with pytest.raises(errors.ConfigError, match="is among the recordings"):
             prepared(capture, out)
 
 
-def test_a_capture_without_features_is_complete_but_for_its_masks(capture, tmp_path):
+def test_a_capture_without_features_is_complete_but_for_its_masks(capture, tmp_path, capsys):
     with pytest.raises(
         errors.DatasetError, match=r"no rigid body moves.*--masks sam2.*The data set without masks is complete"
     ):
-        prepared(capture, tmp_path / "data", masks="features")
+        prepared(capture, tmp_path / "data", masks="features", progress_kind="auto")
+    assert "Next:" not in capsys.readouterr().out
     assert "checks" in json.loads((tmp_path / "data" / "capture.json").read_text())
     assert all(view.mask_path is None for view in dataset.read(tmp_path / "data").train)
 
