@@ -44,6 +44,8 @@ def _check_folder(path: Path, pictures: Path | None) -> list[Finding]:
 
     if pictures is None and (path / capture_file.FILE).exists():
         pictures = path / "check"
+        for earlier in pictures.glob("D[67][0-9]*.png"):  # their faults may be corrected
+            earlier.unlink()
     return data.check(path, pictures=pictures)
 
 

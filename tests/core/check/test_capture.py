@@ -64,6 +64,16 @@ def test_pictures_of_a_prepared_data_set_are_in_its_folder_and_others_are_not_dr
         assert bool(finding.picture) == (name == "prepared") == (tmp_path / name / "check").is_dir()
 
 
+def test_pictures_of_corrected_faults_are_removed(tmp_path):
+    CASES["D72"](tmp_path)
+    old, own = tmp_path / "check" / "D66_cam0.png", tmp_path / "check" / "notes.png"
+    for path in (old, own):
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    check.check(tmp_path)
+    assert not old.exists() and own.exists()
+
+
 def test_common_view_and_angles_follow_the_geometry():
     cameras = list(recordings.make_rig(3, 64, 48, angles=(0.0, np.pi / 2, np.pi)).cameras)
     middle = arrangement.focus(cameras)
