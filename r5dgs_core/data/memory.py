@@ -56,14 +56,21 @@ def at_once(dataset: Dataset) -> int:
     return _BYTES_PER_PIXEL * sum(sizes[:_AT_ONCE])
 
 
-def check_images(dataset: Dataset) -> None:
-    """Raise `DatasetError` if the images that training needs at the same time do not fit into the available memory."""
-    needed, free = at_once(dataset), available()
+def check_images(dataset: Dataset, processes: int = 1) -> None:
+    """Raise `DatasetError` if the images that training needs at the same time do not fit into the available memory.
+
+    Args:
+        dataset: The data set.
+        processes: Number of processes of this machine that train together; each holds such images.
+    """
+    needed, free = processes * at_once(dataset), available()
     if free is not None and needed > free:
+        several = processes > 1
+        together, fewer = f" in each of {processes} processes" * several, "start fewer processes, " * several
         raise errors.DatasetError(
             f"{dataset.root}: training needs {needed / GB:.1f} GB of memory for {min(_AT_ONCE, len(dataset.train))} "
-            f"images at the same time, {free / GB:.1f} GB are available. Remedy: prepare the data with a smaller "
-            "--size, scale the images down, or stop other programs"
+            f"images at the same time{together}, {free / GB:.1f} GB are available. Remedy: {fewer}prepare the data "
+            "with a smaller --size, scale the images down, or stop other programs"
         )
 
 

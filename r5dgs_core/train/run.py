@@ -195,7 +195,7 @@ def _prepare(request: _Request, claim: Callable[[], None]) -> tuple[_Request, da
     settled = run_folder.open_run(folder).config if request.resume else request.config
     dataset = datasets.read(request.dataset_root, settled.data.masks, settled.data.min_registered)
     dataset.require_one_numbering()
-    memory.check_images(dataset)
+    memory.check_images(dataset, on_this_machine())
     if is_new:  # created only now, so that an unreadable data set leaves no folder
         run_folder.plan_run(folder, dataset, request.config)
         claim()

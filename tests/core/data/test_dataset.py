@@ -332,9 +332,11 @@ def test_a_machine_without_memory_for_a_few_images_is_refused_with_the_remedy(fl
     monkeypatch.setattr(memory, "available", lambda: needed - 1)
     with pytest.raises(errors.DatasetError, match="GB of memory for . images at the same time.*smaller --size"):
         memory.check_images(found)
-    for free in (needed, None):
+    for free in (None, needed):
         monkeypatch.setattr(memory, "available", lambda free=free: free)
         memory.check_images(found)
+    with pytest.raises(errors.DatasetError, match="at the same time in each of 2 processes.*start fewer processes"):
+        memory.check_images(found, processes=2)
     assert 1e6 < memory.total() < 1e15
 
 

@@ -15,6 +15,7 @@ import torch
 
 from r5dgs_core.cli import main
 from r5dgs_core.cli.exit_status import ExitStatus
+from r5dgs_core.data import dataset, memory
 from r5dgs_core.errors import ConfigError
 from r5dgs_core.raster import cuda
 from r5dgs_core.train import checkpoint, devices, workers
@@ -115,6 +116,14 @@ def test_no_thread_of_the_group_is_left():
     for ended in in_two_processes(code=LEAVES):
         assert ended.returncode == 0, ended.stderr
         assert "gloo" not in ended.stdout
+
+
+def test_the_images_of_all_processes_must_fit_into_the_memory_of_the_machine(tiny, tmp_path, monkeypatch, capsys):
+    needed = memory.at_once(dataset.read(tiny.root))
+    monkeypatch.setattr(memory, "available", lambda: 1.5 * needed)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    assert "in each of 2 processes" in complaint(capsys, *arguments(tiny.root, tmp_path / "run", *SHORT))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow
