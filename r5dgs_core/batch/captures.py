@@ -11,9 +11,9 @@ from typing import Any
 from ..config import config as configs
 from ..errors import ConfigError
 
-RESULT_FILE, JOBS_FOLDER = "batch.json", "jobs"  # in the output folder, beside the files of the captures
+RESULT_FILE, TABLE_FILE, JOBS_FOLDER = "batch.json", "table.md", "jobs"  # in the output folder
+SUFFIXES = ("", ".r5dgs", ".json", ".evaluation.json", ".log")  # of the files of a capture, beside them
 _KEYS: dict[str, type] = {"data": str, "name": str, "preset": str, "config": str, "set": list, "device": str}
-_RESERVED = (Path(RESULT_FILE).stem, JOBS_FOLDER)
 _DEFAULTS = tuple(key for key in _KEYS if key not in ("data", "name"))
 
 
@@ -39,7 +39,7 @@ class Batch:
     """Content of a file.
 
     Attributes:
-        captures: The captures, with different names.
+        captures: The captures; no two of them have a file of the same name.
         resources: Parameters of submitit, such as ``slurm_partition``.
     """
 
@@ -64,17 +64,22 @@ def read(path: Path) -> Batch:
     tables = found.get("capture", [])
     if not tables:
         raise ConfigError(f"{path}: expected a table [[capture]] with 'data' for each capture, found none")
-    captures: dict[str, Capture] = {}
+    captures: list[Capture] = []
+    owners: dict[str, str] = dict.fromkeys((RESULT_FILE, TABLE_FILE, JOBS_FOLDER), "the batch itself")
     for number, table in enumerate(tables, 1):
         place = f"{path}: capture {number}"
         if not isinstance(table, dict):
             raise ConfigError(f"{place}: expected a table [[capture]], found {table!r}")
         _check_keys(place, table, _KEYS)
         one = _capture(place, path.parent, found.get("defaults", {}), table)
-        if one.name in captures:
-            raise ConfigError(f"{place}: another capture is called {one.name}, too; give one of them another 'name'")
-        captures[one.name] = one
-    return Batch(tuple(captures.values()), found.get("cluster", {}))
+        files = [one.name + suffix for suffix in SUFFIXES]
+        for file in files:
+            if file in owners:
+                taken = f"{file} in the output folder belongs to {owners[file]}"
+                raise ConfigError(f"{place}: name: {one.name!r}: {taken}; give the capture another 'name'")
+        owners.update(dict.fromkeys(files, f"capture {number}, {one.name!r}"))
+        captures.append(one)
+    return Batch(tuple(captures), found.get("cluster", {}))
 
 
 def _check_keys(place: str, table: dict[str, Any], kinds: dict[str, type]) -> None:
@@ -106,8 +111,6 @@ def _capture(place: str, folder: Path, defaults: dict[str, Any], table: dict[str
     name = table.get("name", data.resolve().name)
     if not re.fullmatch(r"[\w.-]*\w[\w.-]*", name):
         raise ConfigError(f"{place}: name: expected letters, digits, '_', '-' and '.', found {name!r}")
-    if name in _RESERVED:
-        raise ConfigError(f"{place}: name: {name!r} is taken by files of the batch; give the capture another 'name'")
     arguments = ["--preset", given["preset"]] if "preset" in given else []
     arguments += ["--config", str(config.resolve())] if config is not None else []
     arguments += [text for setting in settings for text in ("--set", setting)]

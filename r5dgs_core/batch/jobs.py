@@ -12,9 +12,8 @@ from typing import Any, Protocol
 from .. import atomic_files, extras
 from ..errors import BackendError, ConfigError, TrainingError
 from . import table
-from .captures import RESULT_FILE
+from .captures import RESULT_FILE, TABLE_FILE
 
-TABLE_FILE = "table.md"
 LIMIT_MIN = 7 * 24 * 60  # maximum duration of a local job by default, minutes; Slurm has limits of its own
 POLL_S = 1.0
 

@@ -81,5 +81,5 @@ def run_batch(
         result = jobs.run(work, start, at_once=at_once, retries=retries, progress=progress)
     if progress_kind != "json":
         terminal.console().print(table.to_rich(result))
-        print(f"table:  {out / jobs.TABLE_FILE}\nresult: {out / captures.RESULT_FILE}")
+        print(f"table:  {out / captures.TABLE_FILE}\nresult: {out / captures.RESULT_FILE}")
     return result

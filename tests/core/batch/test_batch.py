@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from r5dgs_core.batch import capture_job
+from r5dgs_core.batch import capture_job, captures
 from r5dgs_core.bench import process
 from r5dgs_core.cli import main
 from r5dgs_core.cli.exit_status import ExitStatus
@@ -67,6 +67,8 @@ def test_a_batch_ends_with_scene_and_figures_and_begins_nothing_twice(tiny, tmp_
     result = json.loads((out / "batch.json").read_text())
     assert result["captures"][name]["splits"]["val"]["rigid"]["psnr"] > 10 and result["failures"] == {}
     assert name in capsys.readouterr().out
+    own = {name + suffix for suffix in captures.SUFFIXES}
+    assert {path.name for path in out.iterdir()} == own | {"batch.json", "table.md", "jobs"}
     stamp = (out / f"{name}.r5dgs").stat().st_mtime_ns
     assert main.main(command) == 0
     assert (out / f"{name}.r5dgs").stat().st_mtime_ns == stamp
