@@ -19,6 +19,10 @@ from .captures import Capture
 VISIBLE_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "all"
 
 
+class CrashedError(TrainingError):
+    """A command was killed or has crashed, so that a repetition may succeed."""
+
+
 @dataclass(frozen=True)
 class CaptureJob:
     """Callable that a job executes. Its files are ``NAME`` (run folder), ``NAME.r5dgs``, ``NAME.json``, ``NAME.log``.
@@ -36,7 +40,7 @@ class CaptureJob:
     gpus: str | None = None
 
     def __call__(self) -> dict[str, Any]:
-        """Finish the capture; return its ``evaluation``, or the ``failure`` in one line."""
+        """Finish the capture; return its ``evaluation``, or the ``failure`` and if a ``repeat`` may help."""
         if self.gpus == ALL_GPUS:
             os.environ.pop(VISIBLE_GPUS, None)
         elif self.gpus is not None:
@@ -44,7 +48,7 @@ class CaptureJob:
         try:
             return {"evaluation": self._finish()}
         except R5dgsError as error:
-            return {"failure": str(error)}
+            return {"failure": str(error), "repeat": isinstance(error, CrashedError)}
 
     def _finish(self) -> dict[str, Any]:
         run, scene = self.path(""), self.path(".r5dgs")
@@ -113,7 +117,8 @@ class CaptureJob:
         if ended.status == process.STOPPED:  # stopped from outside: without a result, the job is repeated
             raise SystemExit(process.STOPPED)
         if ended.status != 0:
-            raise TrainingError(f"r5dgs {arguments[0]}: {process.reason(ended)}")
+            kind = TrainingError if ended.status in process.REFUSED else CrashedError
+            raise kind(f"r5dgs {arguments[0]}: {process.reason(ended)}")
 
 
 def visible_gpus(cluster: str, resources: dict[str, Any]) -> str | None:

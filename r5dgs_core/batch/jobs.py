@@ -1,4 +1,4 @@
-"""Jobs of a batch: submission, repetition of failed ones, and the result of all."""
+"""Jobs of a batch: submission, repetition of crashed ones, and the result of all."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Job(Protocol):
         ...
 
     def __call__(self) -> dict[str, Any]:
-        """Execute the job; return its ``evaluation`` or ``failure``."""
+        """Execute the job; return its ``evaluation``, or the ``failure`` and if a ``repeat`` may help."""
         ...
 
 
@@ -72,11 +72,11 @@ def run(jobs: Sequence[Job], start: Any, *, at_once: int, retries: int, progress
         jobs: Jobs of the same output folder.
         start: Executor, from `executor`.
         at_once: Maximum number of jobs that are submitted at the same time.
-        retries: Number of repetitions of a failed job.
+        retries: Number of repetitions of a job that was killed or has crashed.
         progress: Called with a dictionary per event.
 
     Raises:
-        TrainingError: A capture failed in all repetitions; the others are finished and written.
+        TrainingError: A capture failed; the others are finished and written.
         KeyboardInterrupt: The user stopped; the jobs are cancelled, and the same call continues.
     """
     waiting, tries = list(jobs), {job.capture.name: 0 for job in jobs}
@@ -101,7 +101,7 @@ def run(jobs: Sequence[Job], start: Any, *, at_once: int, retries: int, progress
                 if reason is None:
                     evaluations[name] = found["evaluation"]
                     progress({"event": "case", "text": f"{name}: finished"})
-                elif tries[name] < retries:
+                elif found["repeat"] and tries[name] < retries:
                     tries[name] += 1
                     waiting.append(job)
                     progress({"event": "failed", "text": f"{name}: {reason}; it is tried again"})
@@ -131,7 +131,7 @@ def _result(submitted: Any) -> dict[str, Any]:
     raised = [line for line in lines if re.match(r"[\w.]+: ", line)]  # of a traceback
     silent = any("has not produced any output" in line for line in lines)  # of submitit
     reason = raised[-1] if raised else "the job ended without a result; it may have been killed" if silent else lines[0]
-    return {"failure": f"{reason} (log: {submitted.paths.stderr})"}
+    return {"failure": f"{reason} (log: {submitted.paths.stderr})", "repeat": True}
 
 
 def _write(out: Path, names: Sequence[str], evaluations: dict[str, Any], failures: dict[str, str]) -> dict[str, Any]:

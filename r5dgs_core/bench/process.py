@@ -25,6 +25,7 @@ finally:
 sys.exit(status)
 """
 STOPPED = 130
+REFUSED = (2, 3)  # statuses of errors that the user can resolve (docs/reference/command_line.md)
 
 
 @dataclass(frozen=True)

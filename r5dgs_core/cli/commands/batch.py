@@ -29,7 +29,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--cluster", choices=("local", "slurm"), default="local", help=shown)
     count = "maximum number of jobs at the same time (default: 1 for local, 1000 for slurm)"
     p.add_argument("--jobs", type=options.at_least(1), metavar="N", help=count)
-    again = "repetitions of a failed job, from its last checkpoint (default: 1)"
+    again = "repetitions of a job that is killed or crashes, from its last checkpoint (default: 1)"
     p.add_argument("--retries", type=options.at_least(0), default=1, metavar="N", help=again)
     options.add_threads(p)
     options.add_progress(p)

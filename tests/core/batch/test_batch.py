@@ -56,6 +56,16 @@ def test_local_jobs_see_the_gpus_of_the_command_unless_they_request_some(tmp_pat
     assert capture_job.visible_gpus("slurm", {}) is None
 
 
+@pytest.mark.parametrize(
+    ("status", "repeated"),
+    [(-9, True), (1, True), (ExitStatus.DEFECT, True), (ExitStatus.USAGE, False), (ExitStatus.ERROR, False)],
+)
+def test_only_commands_that_are_killed_or_crash_are_repeated(tmp_path, monkeypatch, status, repeated):
+    capture = SimpleNamespace(name="a", data=tmp_path, arguments=(), config=tiny_datasets.settings())
+    monkeypatch.setattr(process, "run", lambda *given: process.EndedProcess(status, "no luck", None, 1.0, None, None))
+    assert capture_job.CaptureJob(capture, tmp_path)()["repeat"] is repeated
+
+
 @pytest.mark.slow
 def test_a_batch_ends_with_scene_and_figures_and_begins_nothing_twice(tiny, tmp_path, capsys):
     path, out = write(tmp_path / "captures.toml", tiny.root), tmp_path / "out"
