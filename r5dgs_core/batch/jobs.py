@@ -81,6 +81,7 @@ def run(jobs: Sequence[Job], start: Any, *, at_once: int, retries: int, progress
     """
     waiting, tries = list(jobs), {job.capture.name: 0 for job in jobs}
     running: dict[str, tuple[Job, Any]] = {}
+    queued: set[str] = set()
     evaluations: dict[str, Any] = {}
     failures: dict[str, str] = {}
     out = jobs[0].out
@@ -90,9 +91,13 @@ def run(jobs: Sequence[Job], start: Any, *, at_once: int, retries: int, progress
             while waiting and len(running) < at_once:
                 job = waiting.pop(0)
                 running[job.capture.name] = job, start.submit(job)
+                queued.add(job.capture.name)
                 progress({"event": "case", "text": f"{job.capture.name}: submitted"})
             time.sleep(POLL_S)
             for name, (job, submitted) in list(running.items()):
+                if name in queued and submitted.paths.stdout.exists():  # created when the job starts
+                    queued.remove(name)
+                    progress({"event": "case", "text": f"{name}: running"})
                 if not submitted.done():
                     continue
                 del running[name]
@@ -114,12 +119,17 @@ def run(jobs: Sequence[Job], start: Any, *, at_once: int, retries: int, progress
             submitted.cancel()
         raise
     if failures:
-        name, reason = next(iter(failures.items()))
-        raise TrainingError(
-            f"{len(failures)} of {len(jobs)} captures failed, the first one {name}: {reason}; see {out / TABLE_FILE}, "
-            "and repeat the same command to try them again"
-        )
+        raise _failed(failures, len(jobs), out)
     return result
+
+
+def _failed(failures: dict[str, str], count: int, out: Path) -> TrainingError:
+    """Return the error of a batch with failures."""
+    name, reason = next(iter(failures.items()))
+    return TrainingError(
+        f"{len(failures)} of {count} captures failed, the first one {name}: {reason}; see {out / TABLE_FILE}, "
+        "and repeat the same command to try them again"
+    )
 
 
 def _result(submitted: Any) -> dict[str, Any]:

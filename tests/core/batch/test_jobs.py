@@ -68,14 +68,18 @@ def test_crashed_jobs_are_repeated_and_one_table_shows_all(tmp_path, monkeypatch
     assert lines[2] == "| killed | 900 | 12 | 30.13 | - | 0.9123 | 0.500 |  |"
     assert any(line.startswith("| bad | ") and "RuntimeError: no luck" in line for line in lines)
     assert any(line.endswith("| no images |") for line in lines)
-    assert sum("tried again" in event["text"] for event in events) == 2
-    assert any(event["text"].startswith("killed: the job ended without a result; it may") for event in events)
+    texts = [event["text"] for event in events]
+    assert [texts.count(f"{job.capture.name}: running") for job in planned] == [2, 2, 1]
+    assert texts.index("killed: submitted") < texts.index("killed: running") < texts.index("killed: finished")
+    assert sum("tried again" in text for text in texts) == 2
+    assert any(text.startswith("killed: the job ended without a result; it may") for text in texts)
 
 
-class Running:
-    """Submitted job that never ends."""
+class Waiting:
+    """Submitted job that never starts."""
 
     cancelled = 0
+    paths = SimpleNamespace(stdout=Path("missing"))
 
     def done(self):
         return False
@@ -88,7 +92,7 @@ def test_a_user_who_stops_cancels_the_jobs(tmp_path, monkeypatch):
     submitted = []
 
     def submit(job):
-        submitted.append(Running())
+        submitted.append(Waiting())
         return submitted[-1]
 
     def stop(seconds):
