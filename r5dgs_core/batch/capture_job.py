@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,12 +34,14 @@ class CaptureJob:
         out: Output folder.
         threads: Threads of the kernels; None for all cores of the job.
         gpus: GPUs that its commands see, as `visible_gpus` returns them.
+        choice: GPUs from `separate_gpus`, of which `beside` chooses one.
     """
 
     capture: Capture
     out: Path
     threads: int | None = None
     gpus: str | None = None
+    choice: tuple[str, ...] = ()
 
     def __call__(self) -> dict[str, Any]:
         """Finish the capture; return its ``evaluation``, or the ``failure`` and if a ``repeat`` may help."""
@@ -74,6 +78,12 @@ class CaptureJob:
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(dataclasses.replace(self))
+
+    def beside(self, others: Sequence[CaptureJob]) -> CaptureJob:
+        """Return this job with the GPU that the fewest other jobs have, if there are several to choose from."""
+        if len(self.choice) < 2 or ":" in self.capture.config.train.device:  # such as cuda:1, the user's choice
+            return self
+        return dataclasses.replace(self, gpus=min(self.choice, key=[job.gpus for job in others].count))
 
     def path(self, suffix: str) -> Path:
         """Return the path of a file of the capture."""
@@ -128,3 +138,18 @@ def visible_gpus(cluster: str, resources: dict[str, Any]) -> str | None:
     """
     requested = {"gpus_per_node", "local_gpus_per_node"} & resources.keys()
     return None if cluster != "local" or requested else os.environ.get(VISIBLE_GPUS, ALL_GPUS)
+
+
+def separate_gpus(cluster: str, resources: dict[str, Any]) -> tuple[str, ...]:
+    """Return the GPUs of this machine that jobs may use one by one; empty for those that the cluster gives them."""
+    requested = resources.get("local_gpus_per_node", resources.get("gpus_per_node", 1))
+    if cluster != "local" or requested != 1:
+        return ()
+    visible = os.environ.get(VISIBLE_GPUS)
+    if visible is not None:
+        return tuple(filter(None, visible.split(",")))
+    try:
+        listed = subprocess.run(["nvidia-smi", "--list-gpus"], capture_output=True, text=True, timeout=60).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return ()
+    return tuple(map(str, range(sum(line.startswith("GPU ") for line in listed.splitlines()))))

@@ -35,6 +35,10 @@ class Job(Protocol):
         """Execute the job; return its ``evaluation``, or the ``failure`` and if a ``repeat`` may help."""
         ...
 
+    def beside(self, others: Sequence[Any]) -> Job:
+        """Return the job with the resources that running jobs leave."""
+        ...
+
 
 Progress = Callable[[dict[str, Any]], None]
 
@@ -89,7 +93,7 @@ def run(jobs: Sequence[Job], start: Any, *, at_once: int, retries: int, progress
     try:
         while waiting or running:
             while waiting and len(running) < at_once:
-                job = waiting.pop(0)
+                job = waiting.pop(0).beside([other for other, _ in running.values()])
                 running[job.capture.name] = job, start.submit(job)
                 queued.add(job.capture.name)
                 progress({"event": "case", "text": f"{job.capture.name}: submitted"})

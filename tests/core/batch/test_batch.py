@@ -7,10 +7,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from r5dgs_core.batch import capture_job, captures
+from r5dgs_core.batch import capture_job, captures, jobs
 from r5dgs_core.bench import process
 from r5dgs_core.cli import main
 from r5dgs_core.cli.exit_status import ExitStatus
+from r5dgs_core.errors import TrainingError
 from r5dgs_core.scene import scene_file
 from r5dgs_core.train import checkpoint
 from tests.support import tiny_datasets
@@ -54,6 +55,52 @@ def test_local_jobs_see_the_gpus_of_the_command_unless_they_request_some(tmp_pat
     assert "no images" in job()["failure"]
     assert found == [seen]
     assert capture_job.visible_gpus("slurm", {}) is None
+
+
+def test_local_jobs_at_the_same_time_use_different_gpus(tmp_path, monkeypatch):
+    monkeypatch.setattr(jobs, "POLL_S", 0.0)
+    used, ended = [], {"a": 2, "b": 1, "c": 1, "d": 1}  # polls until the end
+
+    def submit(job):
+        used.append(job.gpus)
+        polls = iter([False] * ended[job.capture.name] + [True])
+        given = {"exception": lambda: None, "result": lambda: {"failure": "no images", "repeat": False}}
+        return SimpleNamespace(paths=SimpleNamespace(stdout=tmp_path), done=lambda: next(polls), **given)
+
+    def job(name, device):
+        config = tiny_datasets.settings(f"train.device={device}")
+        capture = SimpleNamespace(name=name, data=tmp_path, arguments=(), config=config)
+        return capture_job.CaptureJob(capture, tmp_path, gpus="all", choice=("2", "5"))
+
+    planned = [job("a", "auto"), job("b", "cuda"), job("c", "auto"), job("d", "cuda:1")]
+    with pytest.raises(TrainingError, match="4 of 4"):
+        jobs.run(planned, SimpleNamespace(submit=submit), at_once=2, retries=0, progress=lambda event: None)
+    assert used == ["2", "5", "5", "all"]
+
+
+@pytest.mark.parametrize(
+    ("resources", "own", "listed", "found"),
+    [
+        ({}, None, 2, ("0", "1")),
+        ({"gpus_per_node": 1}, None, 2, ("0", "1")),
+        ({}, "3,GPU-5", 4, ("3", "GPU-5")),
+        ({}, "", 2, ()),
+        ({"gpus_per_node": 2}, None, 2, ()),
+        ({"gpus_per_node": 1, "local_gpus_per_node": 0}, None, 2, ()),
+        ({}, None, None, ()),
+    ],
+)
+def test_jobs_may_use_the_gpus_of_the_command_one_by_one(tmp_path, monkeypatch, resources, own, listed, found):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if own is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", own)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    if listed is not None:
+        lines = "".join(f"echo 'GPU {k}: NVIDIA (UUID: GPU-{k})'\necho '  MIG 1g'\n" for k in range(listed))
+        (tmp_path / "nvidia-smi").write_text(f"#!/bin/sh\n{lines}")
+        (tmp_path / "nvidia-smi").chmod(0o755)
+    assert capture_job.separate_gpus("local", resources) == found
+    assert capture_job.separate_gpus("slurm", resources) == ()
 
 
 @pytest.mark.parametrize(

@@ -41,6 +41,9 @@ class Pretended:
             return {"failure": "no images", "repeat": False}
         return {"evaluation": EVALUATION}
 
+    def beside(self, others):
+        return self
+
 
 @pytest.fixture(scope="module", autouse=True)
 def sent_to_jobs():
