@@ -6,6 +6,7 @@ The content of the cache never affects results: an array that was dropped is rea
 from __future__ import annotations
 
 import contextlib
+import mmap
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
@@ -15,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 AHEAD = 2  # arrays that are read at the same time, and views that are read ahead
+LARGE = 2**20  # least size of arrays in memory of their own, bytes
 
 Read = Callable[[], np.ndarray]
 
@@ -47,7 +49,7 @@ class ArrayCache:
                 self._held.move_to_end(key)
                 return found
             pending = self._pending.pop(key, None)
-        return self._hold(key, read() if pending is None else pending.result())
+        return self._hold(key, _separate(read()) if pending is None else pending.result())
 
     def peek(self, key: Hashable) -> np.ndarray | None:
         """Return an array if it is held."""
@@ -63,7 +65,7 @@ class ArrayCache:
             if len(self._pending) < 2 * AHEAD:
                 if self._pool is None:
                     self._pool = ThreadPoolExecutor(AHEAD, "r5dgs-images")
-                self._pending[key] = self._pool.submit(read)
+                self._pending[key] = self._pool.submit(lambda: _separate(read()))
 
     @contextlib.contextmanager
     def lent(self, nbytes: float) -> Iterator[None]:
@@ -105,6 +107,19 @@ class ArrayCache:
         """Drop arrays until the limit holds, except for the newest one."""
         while self._bytes > self._limit and len(self._held) > 1:
             self._bytes -= self._held.popitem(last=False)[1].nbytes
+
+
+def _separate(array: np.ndarray) -> np.ndarray:
+    """Return a large array in pages of its own, which the system gets back when the array is dropped.
+
+    The allocator of Linux keeps freed blocks of this size if small ones lie between them.
+    """
+    if array.nbytes < LARGE or not hasattr(mmap, "MAP_PRIVATE"):
+        return array
+    pages = mmap.mmap(-1, array.nbytes, flags=mmap.MAP_PRIVATE)
+    copy = np.frombuffer(pages, array.dtype).reshape(array.shape)
+    copy[...] = array
+    return copy
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,33 @@
 """The cache of arrays stays within its limit, and gives what the reader gives."""
 
+import os
 import threading
 
 import numpy as np
 import pytest
 
 from r5dgs_core.data.array_cache import AHEAD, ArrayCache, CachedArray
-from tests.support import patience
+from tests.support import patience, processes
+
+# Code that prints the MB which 200 MB of arrays leave, between which small blocks of memory lie.
+DROPS = """
+import numpy as np
+from r5dgs_core.data.array_cache import ArrayCache
+
+def resident():
+    line = next(line for line in open("/proc/self/status") if line.startswith("VmRSS"))
+    return int(line.split()[1]) // 1024
+
+cache, small = ArrayCache(1e9), []
+cache.get(-1, lambda: np.ones(4 * 2**20, np.uint8))
+cache.clear()
+before = resident()
+for key in range(100):
+    cache.get(key, lambda: np.ones(2 * 2**20, np.uint8))
+    small.append(np.ones(100_000, np.uint8))
+cache.clear()
+print(resident() - before - len(small) // 10)
+"""
 
 
 class Reader:
@@ -45,6 +66,13 @@ def test_an_array_larger_than_the_limit_is_kept_until_the_next_one():
         cache.get(0, reader.of(0))
     cache.get(1, reader.of(1))
     assert (reader.counts[0], cache.nbytes) == (1, 100)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs /proc")
+def test_dropped_arrays_leave_no_memory_behind():
+    ended = processes.run(DROPS)
+    assert ended.returncode == 0, ended.stderr
+    assert int(ended.stdout) < 20
 
 
 def test_expected_arrays_are_read_in_the_background_and_once():
