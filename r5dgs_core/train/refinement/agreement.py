@@ -6,9 +6,9 @@ pictures then need different corrections, and so do the upper and the lower half
 alone. The product of both fits, averaged over the cameras, estimates the squared size of the true corrections; errors
 of the two sides that are independent do not bias it.
 
-Poses are examined alone, because sides of pictures hardly tell them from focal lengths. The other parts are fitted
-together with poses, and must also reduce the error of the opposite side. Poses need not: one side determines some of
-their axes so weakly that they do not fit the other side.
+Poses are examined alone, because sides of pictures hardly tell them from focal lengths. Both fits of all poses must be
+more alike than independent ones. The other parts are fitted together with poses, and must also reduce the error of the
+opposite side. Poses need not: one side determines some of their axes so weakly that they do not fit the other side.
 
 Notation: R poses, K tiles along each axis of an image.
 """
@@ -29,6 +29,7 @@ from . import gauge
 from .refinement import PARTS, POSES
 
 RIDGE = 1e-3  # relative increase of the diagonal of the normal equations
+ALIKE = 2.0  # least correlation of two fits of the poses, in standard deviations of that of independent fits
 GREY = 0.5  # colour for which the size of a correction of colours is stated
 _COLUMNS: dict[str, str] = dict(zip(PARTS, ("pose", "focal", "time", "color"), strict=True))
 
@@ -127,9 +128,14 @@ def _error(sides: Sequence[Sides], which: np.ndarray) -> float:
 def agreed(
     part: str, poses: Sequence[Camera], first: np.ndarray, second: np.ndarray, points: np.ndarray, spacing: float
 ) -> float:
-    """Return the size of a part in which two fits [R, COUNT] agree, rms over the poses."""
+    """Return the size of a part in which two fits [R, COUNT] agree, rms over the poses; 0 if they do not agree."""
     a, b = (_in_units(part, poses, change, points, spacing) for change in (first, second))
-    return math.sqrt(max(float((a * b).sum(1).mean()), 0.0))
+    shared = float((a * b).sum())
+    if part == POSES:
+        determined = max(a.size - gauge.FREEDOM, 1)
+        if shared < ALIKE / math.sqrt(determined) * np.linalg.norm(a) * np.linalg.norm(b):
+            return 0.0
+    return math.sqrt(max(shared, 0.0) / len(a))
 
 
 def _in_units(

@@ -16,6 +16,7 @@ from ...scene.cameras import Camera
 
 FLOOR = 0.02  # smallest eigenvalue of the flow of a pose's parameters, relative to the mean
 POINTS = 3000  # points whose motion in the image sets the units of a pose
+FREEDOM = 7  # parameters of a similarity of the world
 
 
 def similarity_slopes(camera: Camera) -> np.ndarray:

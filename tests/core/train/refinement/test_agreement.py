@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from r5dgs_core.render.camera_fit import Normal, Units
-from r5dgs_core.scene.camera_correction import COUNT
-from r5dgs_core.train.refinement import agreement
+from r5dgs_core.scene.camera_correction import COUNT, POSE
+from r5dgs_core.train.refinement import agreement, gauge
 from r5dgs_core.train.refinement.agreement import Examined
-from r5dgs_core.train.refinement.refinement import PARTS
+from r5dgs_core.train.refinement.refinement import PARTS, POSES
 from tests.support import tiny_datasets
 
 SIDE, PIXELS, NOISE, SPACING = 6, 80, 0.05, 0.1
@@ -63,6 +63,17 @@ def test_noise_alone_is_no_evidence():
     found = evidence([lambda row, column: np.zeros(COUNT)] * 6)
     assert found["camera_poses"].size < 0.05
     assert max(one.size for one in found.values()) < 0.05
+
+
+def test_independent_fits_of_few_poses_rarely_agree():
+    cameras = [tiny_datasets.orbit_camera(0.7 * k, 96, 72) for k in range(4)]
+    units = np.stack([gauge.pixel_units(camera, POINTS) for camera in cameras])
+    rng, sizes = np.random.default_rng(3), []
+    for _ in range(200):
+        fits = np.zeros((2, 4, COUNT))
+        fits[..., POSE] = np.einsum("rij,frj->fri", units, rng.normal(size=(2, 4, 6)))
+        sizes.append(agreement.agreed(POSES, cameras, *fits, POINTS, SPACING))
+    assert np.mean(np.array(sizes) > 0.2) < 0.06
 
 
 def test_both_sides_see_what_moves():
