@@ -39,7 +39,7 @@ class Batch:
     """Content of a file.
 
     Attributes:
-        captures: The captures; no two of them have a file of the same name.
+        captures: The captures; no two of them have a file of the same name, even without regard to case.
         resources: Parameters of submitit, such as ``slurm_partition``.
     """
 
@@ -74,10 +74,10 @@ def read(path: Path) -> Batch:
         one = _capture(place, path.parent, found.get("defaults", {}), table)
         files = [one.name + suffix for suffix in SUFFIXES]
         for file in files:
-            if file in owners:
-                taken = f"{file} in the output folder belongs to {owners[file]}"
+            if owner := owners.get(file.casefold()):  # some file systems ignore case
+                taken = f"{file} in the output folder belongs to {owner}"
                 raise ConfigError(f"{place}: name: {one.name!r}: {taken}; give the capture another 'name'")
-        owners.update(dict.fromkeys(files, f"capture {number}, {one.name!r}"))
+        owners.update(dict.fromkeys(map(str.casefold, files), f"capture {number}, {one.name!r}"))
         captures.append(one)
     return Batch(tuple(captures), found.get("cluster", {}))
 

@@ -71,6 +71,7 @@ CAPTURE = '[[capture]]\ndata = "kitchen"\n'
         (CAPTURE + CAPTURE, "capture 2: name: 'kitchen': kitchen in .* belongs to capture 1, 'kitchen'; give"),
         (CAPTURE + CAPTURE + "name = 'kitchen.evaluation'", "kitchen.evaluation.json in .* belongs to capture 1"),
         (CAPTURE + "name = 'kitchen.r5dgs'\n" + CAPTURE, "kitchen.r5dgs in .* belongs to capture 1"),
+        (CAPTURE + CAPTURE + "name = 'Kitchen'", "Kitchen in .* belongs to capture 1, 'kitchen'"),
         ("[defaults]\ndata = 'kitchen'\n" + CAPTURE, "defaults: unknown key 'data'"),
     ],
 )
