@@ -112,11 +112,15 @@ class ArrayCache:
 def _separate(array: np.ndarray) -> np.ndarray:
     """Return a large array in pages of its own, which the system gets back when the array is dropped.
 
-    The allocator of Linux keeps freed blocks of this size if small ones lie between them.
+    The allocator of Linux keeps freed blocks of this size if small ones lie between them. If the system gives no
+    pages, the array itself is returned.
     """
     if array.nbytes < LARGE or not hasattr(mmap, "MAP_PRIVATE"):
         return array
-    pages = mmap.mmap(-1, array.nbytes, flags=mmap.MAP_PRIVATE)
+    try:
+        pages = mmap.mmap(-1, array.nbytes, flags=mmap.MAP_PRIVATE)
+    except OSError:  # such as a limit on memory or on the number of mappings
+        return array
     copy = np.frombuffer(pages, array.dtype).reshape(array.shape)
     copy[...] = array
     return copy

@@ -1,12 +1,15 @@
 """The cache of arrays stays within its limit, and gives what the reader gives."""
 
+import errno
+import mmap
 import os
+import pickle
 import threading
 
 import numpy as np
 import pytest
 
-from r5dgs_core.data.array_cache import AHEAD, ArrayCache, CachedArray
+from r5dgs_core.data.array_cache import AHEAD, LARGE, ArrayCache, CachedArray
 from tests.support import patience, processes
 
 # Code that prints the MB which 200 MB of arrays leave, between which small blocks of memory lie.
@@ -73,6 +76,25 @@ def test_dropped_arrays_leave_no_memory_behind():
     ended = processes.run(DROPS)
     assert ended.returncode == 0, ended.stderr
     assert int(ended.stdout) < 20
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_large_arrays_may_be_written_and_pickled(order):
+    array = np.asarray(np.arange(LARGE).reshape(2, -1), order=order)
+    found = ArrayCache(1e9).get(0, lambda: array)
+    np.testing.assert_array_equal(found, array)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(found)), array)
+    found[0, 0] = 7
+    assert found[0, 0] == 7
+
+
+def test_a_system_without_pages_for_an_array_is_no_error(monkeypatch):
+    def refuse(*given, **named):
+        raise OSError(errno.ENOMEM, "no pages")
+
+    monkeypatch.setattr(mmap, "mmap", refuse)
+    array = np.ones(LARGE, np.uint8)
+    assert ArrayCache(1e9).get(0, lambda: array) is array
 
 
 def test_expected_arrays_are_read_in_the_background_and_once():
