@@ -44,7 +44,7 @@ class CaptureJob:
     choice: tuple[str, ...] = ()
 
     def __call__(self) -> dict[str, Any]:
-        """Finish the capture; return its ``evaluation``, or the ``failure`` and if a ``repeat`` may help."""
+        """Finish the capture; return its ``evaluation``, or ``failure`` and ``repeat`` (True after a crash)."""
         if self.gpus == ALL_GPUS:
             os.environ.pop(VISIBLE_GPUS, None)
         elif self.gpus is not None:
@@ -80,7 +80,7 @@ class CaptureJob:
         return DelayedSubmission(dataclasses.replace(self))
 
     def beside(self, others: Sequence[CaptureJob]) -> CaptureJob:
-        """Return this job with the GPU that the fewest other jobs have, if there are several to choose from."""
+        """Return this job with the GPU that the fewest other jobs have; unchanged if there is no choice."""
         if len(self.choice) < 2 or ":" in self.capture.config.train.device:  # such as cuda:1, the user's choice
             return self
         return dataclasses.replace(self, gpus=min(self.choice, key=[job.gpus for job in others].count))
@@ -141,7 +141,7 @@ def visible_gpus(cluster: str, resources: dict[str, Any]) -> str | None:
 
 
 def separate_gpus(cluster: str, resources: dict[str, Any]) -> tuple[str, ...]:
-    """Return the GPUs of this machine that jobs may use one by one; empty for those that the cluster gives them."""
+    """Return the GPUs of this machine if each job may get one of them; empty if the jobs or the cluster decide."""
     requested = resources.get("local_gpus_per_node", resources.get("gpus_per_node", 1))
     if cluster != "local" or requested != 1:
         return ()

@@ -32,11 +32,11 @@ class Job(Protocol):
         ...
 
     def __call__(self) -> dict[str, Any]:
-        """Execute the job; return its ``evaluation``, or the ``failure`` and if a ``repeat`` may help."""
+        """Execute the job; return its ``evaluation``, or ``failure`` and ``repeat`` (True after a crash)."""
         ...
 
     def beside(self, others: Sequence[Any]) -> Job:
-        """Return the job with the resources that running jobs leave."""
+        """Return the job with resources that the other jobs use least."""
         ...
 
 

@@ -117,8 +117,8 @@ ALONE = Workers()
 @contextlib.contextmanager
 def joined() -> Iterator[Workers]:
     """Join the processes that ``torch.distributed.run`` has started with this one."""
-    # Default arguments of this module would keep a group, whose threads may abort the process at its end, if another
-    # module of torch imported it later.
+    # Imported before the group exists: default arguments of this module would keep a later one, whose threads may
+    # abort the process at its end.
     import torch.distributed.nn.functional  # noqa: F401
 
     with _together():

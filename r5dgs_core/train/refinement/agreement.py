@@ -6,9 +6,10 @@ pictures then need different corrections, and so do the upper and the lower half
 alone. The product of both fits, averaged over the cameras, estimates the squared size of the true corrections; errors
 of the two sides that are independent do not bias it.
 
-Poses are examined alone, because sides of pictures hardly tell them from focal lengths. Both fits of all poses must be
-more alike than independent ones. The other parts are fitted together with poses, and must also reduce the error of the
-opposite side. Poses need not: one side determines some of their axes so weakly that they do not fit the other side.
+Poses are examined alone, because sides of pictures hardly tell them from focal lengths. The two fits of all poses must
+also be more alike than independent ones usually are. The other parts are fitted together with poses, and must also
+reduce the error of the opposite side. Poses need not: one side determines some of their axes so weakly that they do not
+fit the other side.
 
 Notation: R poses, K tiles along each axis of an image.
 """
@@ -132,7 +133,7 @@ def agreed(
     a, b = (_in_units(part, poses, change, points, spacing) for change in (first, second))
     shared = float((a * b).sum())
     if part == POSES:
-        determined = max(a.size - gauge.FREEDOM, 1)
+        determined = max(a.size - gauge.FREEDOM, 1)  # the variance of the correlation is 1 / determined
         if shared < ALIKE / math.sqrt(determined) * np.linalg.norm(a) * np.linalg.norm(b):
             return 0.0
     return math.sqrt(max(shared, 0.0) / len(a))
