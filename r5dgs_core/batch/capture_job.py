@@ -51,7 +51,7 @@ class CaptureJob:
             os.environ[VISIBLE_GPUS] = self.gpus
         try:
             return {"evaluation": self._finish()}
-        except R5dgsError as error:
+        except (R5dgsError, OSError) as error:
             return {"failure": str(error), "repeat": isinstance(error, CrashedError)}
 
     def _finish(self) -> dict[str, Any]:
@@ -81,7 +81,8 @@ class CaptureJob:
 
     def beside(self, others: Sequence[CaptureJob]) -> CaptureJob:
         """Return this job with the GPU that the fewest other jobs have; unchanged if there is no choice."""
-        if len(self.choice) < 2 or ":" in self.capture.config.train.device:  # such as cuda:1, the user's choice
+        device = self.capture.config.train.device
+        if len(self.choice) < 2 or device == "cpu" or ":" in device:  # such as cuda:1, the user's choice
             return self
         return dataclasses.replace(self, gpus=min(self.choice, key=[job.gpus for job in others].count))
 

@@ -45,7 +45,7 @@ def _check_folder(path: Path, pictures: Path | None) -> list[Finding]:
     if pictures is None and (path / capture_file.FILE).exists():
         pictures = path / "check"
         for earlier in pictures.glob("D[67][0-9]*.png"):  # their faults may be corrected
-            earlier.unlink()
+            earlier.unlink(missing_ok=True)
     return data.check(path, pictures=pictures)
 
 

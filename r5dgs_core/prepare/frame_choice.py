@@ -103,7 +103,7 @@ def choose(names: Sequence[str], clocks: Sequence[np.ndarray], window: Window) -
 def _thinned(grid: np.ndarray, window: Window) -> np.ndarray:
     """Return every n-th moment, and of these the nearest to the requested rate. [G] -> [G']"""
     grid = grid[:: window.every]
-    if window.fps is None or len(grid) < 2:
+    if window.fps is None or len(grid) < 2 or window.fps * np.diff(grid).min() >= 1:
         return grid
     wanted = np.arange(grid[0], grid[-1] + 0.5 / window.fps, 1.0 / window.fps)
     return grid[np.unique(nearest_of(grid, wanted))]

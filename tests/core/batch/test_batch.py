@@ -59,7 +59,7 @@ def test_local_jobs_see_the_gpus_of_the_command_unless_they_request_some(tmp_pat
 
 def test_local_jobs_at_the_same_time_use_different_gpus(tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "POLL_S", 0.0)
-    used, ended = [], {"a": 2, "b": 1, "c": 1, "d": 1}  # polls until the end
+    used, ended = [], {"a": 2, "b": 1, "c": 1, "d": 1, "e": 1}  # polls until the end
 
     def submit(job):
         used.append(job.gpus)
@@ -72,10 +72,10 @@ def test_local_jobs_at_the_same_time_use_different_gpus(tmp_path, monkeypatch):
         capture = SimpleNamespace(name=name, data=tmp_path, arguments=(), config=config)
         return capture_job.CaptureJob(capture, tmp_path, gpus="all", choice=("2", "5"))
 
-    planned = [job("a", "auto"), job("b", "cuda"), job("c", "auto"), job("d", "cuda:1")]
-    with pytest.raises(TrainingError, match="4 of 4"):
+    planned = [job("a", "auto"), job("b", "cuda"), job("c", "auto"), job("d", "cuda:1"), job("e", "cpu")]
+    with pytest.raises(TrainingError, match="5 of 5"):
         jobs.run(planned, SimpleNamespace(submit=submit), at_once=2, retries=0, progress=lambda event: None)
-    assert used == ["2", "5", "5", "all"]
+    assert used == ["2", "5", "5", "all", "all"]
 
 
 @pytest.mark.parametrize(

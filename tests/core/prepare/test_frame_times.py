@@ -83,6 +83,7 @@ def test_the_first_moment_counts_although_cameras_begin_apart():
         (Window(every=3), [0, 3, 6, 9]),
         (Window(start=0.25, end=0.5), [3, 4, 5]),
         (Window(fps=5.0), [0, 2, 4, 6, 8]),
+        (Window(fps=1e15), list(range(10))),  # more moments than memory
         (Window(start=0.2, every=2, end=0.7), [2, 4, 6]),
     ],
 )
