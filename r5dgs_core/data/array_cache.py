@@ -49,7 +49,7 @@ class ArrayCache:
                 self._held.move_to_end(key)
                 return found
             pending = self._pending.pop(key, None)
-        return self._hold(key, _separate(read()) if pending is None else pending.result())
+        return self._hold(key, _in_own_pages(read()) if pending is None else pending.result())
 
     def peek(self, key: Hashable) -> np.ndarray | None:
         """Return an array if it is held."""
@@ -65,7 +65,7 @@ class ArrayCache:
             if len(self._pending) < 2 * AHEAD:
                 if self._pool is None:
                     self._pool = ThreadPoolExecutor(AHEAD, "r5dgs-images")
-                self._pending[key] = self._pool.submit(lambda: _separate(read()))
+                self._pending[key] = self._pool.submit(lambda: _in_own_pages(read()))
 
     @contextlib.contextmanager
     def lent(self, nbytes: float) -> Iterator[None]:
@@ -109,7 +109,7 @@ class ArrayCache:
             self._bytes -= self._held.popitem(last=False)[1].nbytes
 
 
-def _separate(array: np.ndarray) -> np.ndarray:
+def _in_own_pages(array: np.ndarray) -> np.ndarray:
     """Return a large array in pages of its own, which the system gets back when the array is dropped.
 
     The allocator of Linux keeps freed blocks of this size if small ones lie between them. If the system gives no
