@@ -59,15 +59,14 @@ def update(trainer: Any, batch: Sequence[StepInputs], place: str) -> Tensor:
     """
     trainer.optimizer.zero_grad(set_to_none=True)
     drawn = _of_all(trainer, [_draw(trainer, inputs, place) for inputs in batch], place)
-    if trainer.workers.leads:  # alone, because sums on GPUs are rounded differently each time
-        penalties = [term for term in trainer.penalties() if term is not None]
-        if penalties:
-            (len(drawn) * torch.stack(penalties).sum()).backward()
     parameters = [p for group in trainer.optimizer.param_groups for p in group["params"]]
     trainer.workers.add_gradients(parameters)
     for parameter in parameters:
         if parameter.grad is not None:
             parameter.grad /= len(drawn)
+    penalties = [term for term in trainer.penalties() if term is not None]
+    if penalties:
+        torch.stack(penalties).sum().backward()
     loss = torch.stack([one.loss for one in drawn]).mean()
     if trainer.device.type == devices.CPU:
         running_loss.require_finite_step(loss, trainer.optimizer, trainer.params, place)

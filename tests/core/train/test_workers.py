@@ -40,10 +40,6 @@ sys.exit(main.main(sys.argv[3:]))
 """
 
 
-# The same with penalties in the leading process only.
-LEADER_PENALTIES = PROCESS.replace(
-    "sys.exit", "from r5dgs_core.train import trainer\nif rank == '1':\n    del trainer.Trainer.penalties\nsys.exit"
-)
 # Code that prints the threads of one of two processes after it has left the other one.
 LEAVES = """
 import os, sys
@@ -105,13 +101,6 @@ def test_two_processes_train_as_one_with_two_views_per_step(alone, together):
     assert second.stdout + second.stderr == ""
     assert_same_run(out, alone)
     assert len(checkpoint.load(out).tensors["gaussians.means"]) > 900  # of 1010 at most before densification
-
-
-@pytest.mark.slow
-def test_the_leading_process_adds_the_penalties(tiny, alone, tmp_path):
-    ended = in_two_processes(*arguments(tiny.root, tmp_path / "run", *SHORT), code=LEADER_PENALTIES)
-    assert [process.returncode for process in ended] == [0, 0], ended[1].stderr
-    assert_same_run(tmp_path / "run", alone)
 
 
 def test_one_process_reports_a_failure(tmp_path):
