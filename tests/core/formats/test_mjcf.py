@@ -118,7 +118,7 @@ def falling_box():
     [
         (falling_box, 0.45),  # a tumbling box amplifies rounding errors at each impact
         (bouncing_ball, 1.0),
-        (sliding_pair, 0.45),  # the sliding box rattles, which amplifies them, too
+        (sliding_pair, 0.35),  # the sliding box rattles, which amplifies them, too
         (lambda: above_a_table(falling_box()), 0.35),
         (lambda: above_a_table(bouncing_ball()), 1.0),
     ],
