@@ -117,8 +117,8 @@ ALONE = Workers()
 @contextlib.contextmanager
 def joined() -> Iterator[Workers]:
     """Join the processes that ``torch.distributed.run`` has started with this one."""
-    # Imported before the group exists: default arguments of this module would keep a later one, whose threads may
-    # abort the process at its end.
+    # Import this before the group exists. Its default arguments would otherwise keep the group, whose threads can abort
+    # the process at exit.
     import torch.distributed.nn.functional  # noqa: F401
 
     with _together():

@@ -221,7 +221,10 @@ def _check_masks(masks: str, model: Path | None, words: str | None) -> None:
 
 
 def _complete(plan: Plan, masks: str, given: dict[str, Any], progress_kind: str) -> None:
-    """Write the masks, check the capture, also if image features show no object, and print the next command."""
+    """Write the masks, check the capture, and print the next command.
+
+    The capture is also checked if image features show no object.
+    """
     try:
         _make_masks(plan, masks, given, progress_kind)
     except errors.DatasetError as error:
