@@ -64,9 +64,7 @@ def update(trainer: Any, batch: Sequence[StepInputs], place: str) -> Tensor:
     for parameter in parameters:
         if parameter.grad is not None:
             parameter.grad /= len(drawn)
-    penalties = [term for term in trainer.penalties() if term is not None]
-    if penalties:
-        torch.stack(penalties).sum().backward()
+    _add_penalties(trainer, parameters)
     loss = torch.stack([one.loss for one in drawn]).mean()
     if trainer.device.type == devices.CPU:
         running_loss.require_finite_step(loss, trainer.optimizer, trainer.params, place)
@@ -76,6 +74,18 @@ def update(trainer: Any, batch: Sequence[StepInputs], place: str) -> Tensor:
     for one in drawn:
         trainer.densifier.observe(one.stats, one.camera)
     return loss
+
+
+def _add_penalties(trainer: Any, parameters: Sequence[Tensor]) -> None:
+    """Add the gradients of the penalties in the leading process, as a GPU rounds their sums differently each time."""
+    gradients: Sequence[Tensor | None] = [None] * len(parameters)
+    if trainer.workers.leads:
+        penalties = [term for term in trainer.penalties() if term is not None]
+        if penalties:
+            gradients = torch.autograd.grad(torch.stack(penalties).sum(), parameters, allow_unused=True)
+    for parameter, gradient in zip(parameters, trainer.workers.of_leader(parameters, gradients), strict=True):
+        if gradient is not None:
+            parameter.grad = gradient.clone() if parameter.grad is None else parameter.grad.add_(gradient)
 
 
 def _of_all(trainer: Any, drawn: Sequence[Drawn], place: str) -> list[Drawn]:

@@ -1,7 +1,8 @@
 """Processes that train one run together (`torch.distributed`): each draws a part of the views of a step.
 
 All processes have the same state and draw the same random numbers, so they make the same decisions. Gradients are
-summed over the processes, and other results of the views are gathered. The first process leads: only it writes files.
+summed over the processes, and other results of the views are gathered. The first process leads: only it writes files,
+and it computes the gradients that no view determines.
 """
 
 from __future__ import annotations
@@ -79,6 +80,26 @@ class Workers:
             dist.all_reduce(total)
         for parameter, part in zip(trained, total.split([p.numel() for p in trained]), strict=True):
             parameter.grad = part.view_as(parameter).clone()
+
+    def of_leader(
+        self, parameters: Sequence[torch.Tensor], gradients: Sequence[torch.Tensor | None]
+    ) -> list[torch.Tensor | None]:
+        """Return the gradients of parameters in the leading process, None for those without; others may give any."""
+        if self.count == 1:
+            return list(gradients)
+        given = torch.tensor([gradient is not None for gradient in gradients], dtype=torch.int32)
+        with _together():
+            dist.broadcast(given, 0)
+            changed = [p for p, number in zip(parameters, given.tolist(), strict=True) if number]
+            if not changed:
+                return [None] * len(gradients)
+            sizes = [p.numel() for p in changed]
+            flat = changed[0].new_empty(sum(sizes))
+            if self.leads:
+                flat = torch.cat([gradient.reshape(-1) for gradient in gradients if gradient is not None])
+            dist.broadcast(flat, 0)
+        parts = iter(flat.split(sizes))
+        return [next(parts).view_as(p) if n else None for p, n in zip(parameters, given.tolist(), strict=True)]
 
     def any(self, flag: bool) -> bool:
         """Return True if the flag is set in any process."""

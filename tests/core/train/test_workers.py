@@ -39,7 +39,29 @@ from r5dgs_core.cli import main
 sys.exit(main.main(sys.argv[3:]))
 """
 
-
+# The same with other penalties in the second process, as after rounding, but larger.
+OTHER_PENALTIES = PROCESS.replace(
+    "sys.exit",
+    """from r5dgs_core.train import trainer
+penalties = trainer.Trainer.penalties
+if rank == "1":
+    trainer.Trainer.penalties = lambda run: [term if term is None else 1.01 * term for term in penalties(run)]
+sys.exit""",
+)
+# Code that prints gradients in one of two processes which have computed different ones.
+GRADIENTS = """
+import os, sys
+rank, port = sys.argv[1:3]
+os.environ.update(RANK=rank, WORLD_SIZE="2", MASTER_ADDR="127.0.0.1", MASTER_PORT=port)
+import torch
+from r5dgs_core.train import workers
+parameters = [torch.zeros(size, requires_grad=True) for size in ((2, 2), (3,), (1,))]
+own = [torch.full((2, 2), 1.5), None, torch.ones(1).expand(1)] if rank == "0" else [None, torch.ones(3), None]
+with workers.joined() as group:
+    found = group.of_leader(parameters, own)
+    print([gradient if gradient is None else gradient.tolist() for gradient in found])
+    print(group.of_leader(parameters, [None] * 3 if rank == "0" else own))
+"""
 # Code that prints the threads of one of two processes after it has left the other one.
 LEAVES = """
 import os, sys
@@ -101,6 +123,19 @@ def test_two_processes_train_as_one_with_two_views_per_step(alone, together):
     assert second.stdout + second.stderr == ""
     assert_same_run(out, alone)
     assert len(checkpoint.load(out).tensors["gaussians.means"]) > 900  # of 1010 at most before densification
+
+
+def test_all_processes_get_the_gradients_of_the_leading_one():
+    for ended in in_two_processes(code=GRADIENTS):
+        assert ended.returncode == 0, ended.stderr
+        assert ended.stdout == "[[[1.5, 1.5], [1.5, 1.5]], None, [1.0]]\n[None, None, None]\n"
+
+
+@pytest.mark.slow
+def test_the_penalties_of_the_leading_process_count(tiny, alone, tmp_path):
+    ended = in_two_processes(*arguments(tiny.root, tmp_path / "run", *SHORT), code=OTHER_PENALTIES)
+    assert [process.returncode for process in ended] == [0, 0], ended[0].stderr + ended[1].stderr
+    assert_same_run(tmp_path / "run", alone)
 
 
 def test_one_process_reports_a_failure(tmp_path):
