@@ -80,7 +80,7 @@ def _add_penalties(trainer: Any, parameters: Sequence[Tensor]) -> None:
     """Add the gradients of the penalties in the leading process, as a GPU rounds their sums differently each time."""
     gradients: Sequence[Tensor | None] = [None] * len(parameters)
     if trainer.workers.leads:
-        penalties = [term for term in trainer.penalties() if term is not None]
+        penalties = [term for term in trainer.penalties() if term is not None and term.requires_grad]
         if penalties:
             gradients = torch.autograd.grad(torch.stack(penalties).sum(), parameters, allow_unused=True)
     for parameter, gradient in zip(parameters, trainer.workers.of_leader(parameters, gradients), strict=True):

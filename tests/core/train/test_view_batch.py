@@ -56,6 +56,13 @@ def test_the_loss_is_the_mean_over_the_views(tiny):
     assert step_with(trainer, 4, 9, 11) == pytest.approx(np.mean(single), rel=1e-5)
 
 
+def test_penalties_that_depend_on_no_parameter_have_no_gradient(tiny):
+    # One time alone has no roughness, and opacities have no weight.
+    settings = tiny_datasets.settings("train.iterations=40", "train.batch=2", "densify.opacity=0")
+    trainer = Trainer(datasets.read(tiny.root), settings)
+    assert np.isfinite(float(trainer.step()))
+
+
 def test_the_statistics_of_densification_count_each_view(tiny):
     trainer = make(tiny, "train.batch=2", "densify.start=1000")
     step_with(trainer, 0, 1)
