@@ -222,14 +222,21 @@ class Trainer:
 
     def penalties(self) -> list[Tensor | None]:
         """Return the terms of a step's loss that do not depend on a view; None if they do not count."""
-        motion = self.motion.penalty(self.gaussians, self.iteration, self.labels)
+        motion = None if self.motion.penalizes_views else self._motion_penalty()
         return [motion, self.densifier.penalty(self.gaussians)]
+
+    def view_penalty(self) -> Tensor | None:
+        """Return the term of the loss that depends on the motion of the view drawn last; None if it does not count."""
+        return self._motion_penalty() if self.motion.penalizes_views else None
+
+    def _motion_penalty(self) -> Tensor | None:
+        return self.motion.penalty(self.gaussians, self.iteration, self.labels)
 
     def update(self, inputs: StepInputs, stats: RasterStats, place: str = "") -> Tensor:
         """Draw a view, update all parameters by the gradients, and return the loss; ``place`` is for messages."""
         loss, identity, splats = self.compare(inputs, stats, place)
         total = loss
-        for term in (*self.penalties(), identity):
+        for term in (self.view_penalty(), *self.penalties(), identity):
             total = total if term is None else total + term
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()

@@ -111,6 +111,9 @@ def _draw(trainer: Any, inputs: StepInputs, place: str) -> Drawn:
     """Draw a view and add its gradients to those of the parameters."""
     stats, view = RasterStats(), inputs.view
     loss, identity, splats = trainer.compare(inputs, stats, place)
-    (loss if identity is None else loss + identity).backward()
+    total = loss
+    for term in (trainer.view_penalty(), identity):
+        total = total if term is None else total + term
+    total.backward()
     correction = trainer.refinement.measure(inputs.index, view, splats, lambda t: trainer.splats(view.camera, t))
     return Drawn(inputs.index, view.camera, loss.detach(), stats, correction)

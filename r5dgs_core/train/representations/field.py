@@ -97,7 +97,7 @@ class FieldRepresentation(Representation):
         config: The run's configuration.
     """
 
-    name, sorts_by_motion = FIELD, True
+    name, sorts_by_motion, penalizes_views = FIELD, True, True
 
     def __init__(self, tracks: Tracks, first: int, config: Config):
         self.times = tracks.times

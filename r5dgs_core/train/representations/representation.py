@@ -34,6 +34,7 @@ class Representation:
         moves: False if nothing ever moves.
         takes_residuals: True if bodies may have `residuals`, which are tried during training.
         sorts_by_motion: True if Gaussians move one by one, so that objects can be found by their motion.
+        penalizes_views: True if `penalty` depends on the view of the last call of `splats`.
         residuals: Residual motion of non-rigid bodies, or None.
     """
 
@@ -41,6 +42,7 @@ class Representation:
     moves: ClassVar[bool] = True
     takes_residuals: ClassVar[bool] = False
     sorts_by_motion: ClassVar[bool] = False
+    penalizes_views: ClassVar[bool] = False
     residuals: ResidualField | None = None
 
     def to(self, device: torch.device) -> Representation:
@@ -90,7 +92,7 @@ class Representation:
         raise NotImplementedError
 
     def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
-        """Return a term for the loss of the current step (the last call of `splats`), or None.
+        """Return a term for the loss of the current step, or of its last view (see `penalizes_views`), or None.
 
         Args:
             gaussians: The canonical Gaussians.

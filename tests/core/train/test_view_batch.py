@@ -32,10 +32,20 @@ def params(trainer):
     return {name: tensor.detach().clone() for name, tensor in trainer.params.items()}
 
 
-@pytest.mark.parametrize("identity", ["off", "joint"])
-def test_a_view_twice_is_the_view_once(tiny, identity):
+# Without random paths through the TRD.
+FIELD = (
+    "train.representation=field",
+    "field.width=32",
+    "field.place_steps=3",
+    "field.trd_steps=0",
+    "field.trd_share=0",
+)
+
+
+@pytest.mark.parametrize("motion", [("identity.training=off",), ("identity.training=joint",), FIELD])
+def test_a_view_twice_is_the_view_once(tiny, motion):
     # Neighbouring Gaussians are drawn at random once for each view, and are left out here.
-    common = (f"identity.training={identity}", "identity.spatial=0", "identity.majority=0")
+    common = (*motion, "identity.spatial=0", "identity.majority=0")
     one, two = make(tiny, *common), make(tiny, *common, "train.batch=2")
     for view in (3, 7, 5):
         assert step_with(two, view, view) == pytest.approx(step_with(one, view), rel=1e-5)
