@@ -14,6 +14,7 @@ from ..errors import ConfigError
 RESULT_FILE, TABLE_FILE, JOBS_FOLDER = "batch.json", "table.md", "jobs"  # in the output folder
 SUFFIXES = ("", ".r5dgs", ".json", ".evaluation.json", ".log")  # of the files of a capture, beside them
 _KEYS: dict[str, type] = {"data": str, "name": str, "preset": str, "config": str, "set": list, "device": str}
+_ONE_PER_JOB = ("gpus_per_node", "gpus_per_task", "num_gpus", "tasks_per_node", "nodes")  # resources, of submitit
 _DEFAULTS = tuple(key for key in _KEYS if key not in ("data", "name"))
 
 
@@ -80,6 +81,25 @@ def read(path: Path) -> Batch:
         owners.update(dict.fromkeys(map(str.casefold, files), f"capture {number}, {one.name!r}"))
         captures.append(one)
     return Batch(tuple(captures), found.get("cluster", {}))
+
+
+def check_resources(path: Path, resources: dict[str, Any], cluster: str) -> None:
+    """Raise `ConfigError` if jobs of a file request several GPUs, processes or machines, of which they use only one.
+
+    Args:
+        path: The file.
+        resources: Its parameters of submitit.
+        cluster: "local" or "slurm"; parameters that begin with it apply to it alone, instead of the general ones.
+    """
+    for name in _ONE_PER_JOB:
+        own = f"{cluster}_{name}"
+        key = own if own in resources else name
+        number = resources.get(key)
+        if isinstance(number, int) and number > 1:
+            raise ConfigError(
+                f"{path}: cluster: {key} = {number}: expected at most 1, as a job is one process, which trains on one "
+                f"GPU. Remedy: {key} = 1, or train the capture on several GPUs with torchrun (docs/user/training.md)"
+            )
 
 
 def _check_keys(place: str, table: dict[str, Any], kinds: dict[str, type]) -> None:

@@ -67,6 +67,7 @@ def run_batch(
     from ...batch import captures
 
     planned = captures.read(path)
+    captures.check_resources(path, planned.resources, cluster)
     from ...batch import jobs, table
     from ...batch.capture_job import CaptureJob, separate_gpus, visible_gpus
     from ...progress import make

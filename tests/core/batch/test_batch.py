@@ -35,6 +35,27 @@ def test_a_fault_in_the_file_is_one_error(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("cluster", "resources", "named"),
+    [
+        ("local", "gpus_per_node = 2", "gpus_per_node = 2"),
+        ("local", "local_gpus_per_node = 4\ngpus_per_node = 1", "local_gpus_per_node = 4"),
+        ("slurm", "slurm_gpus_per_task = 2", "slurm_gpus_per_task = 2"),
+        ("slurm", "tasks_per_node = 2", "tasks_per_node = 2"),
+    ],
+)
+def test_several_gpus_or_processes_of_a_job_are_refused(tiny, tmp_path, capsys, cluster, resources, named):
+    path = write(tmp_path / "captures.toml", tiny.root)
+    path.write_text(f"{path.read_text()}\n[cluster]\n{resources}\n")
+    said = complaint(capsys, "batch", str(path), "--out", str(tmp_path / "out"), "--cluster", cluster)
+    assert f"{path}: cluster: {named}: expected at most 1" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_resources_of_other_clusters_are_not_checked(tmp_path):
+    captures.check_resources(tmp_path, {"gpus_per_node": 4, "local_gpus_per_node": 1, "slurm_nodes": 2}, "local")
+
+
+@pytest.mark.parametrize(
     ("resources", "own", "seen"),
     [({}, None, None), ({}, "1,2", "1,2"), ({}, "", ""), ({"gpus_per_node": 1}, "2", "0")],
 )
