@@ -37,12 +37,13 @@ _FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 @dataclass(frozen=True)
 class _Look:
-    """A view of the body: the crop of its picture, and the posed Gaussians of other groups that reach it."""
+    """A view of the body: the crop of its picture, the sky in it, and the posed Gaussians of other groups there."""
 
     camera: Camera
     truth: np.ndarray
     region: np.ndarray
     others: PosedSplats
+    behind: torch.Tensor
 
 
 class BodyRegistration:
@@ -156,8 +157,7 @@ class BodyRegistration:
             means, quats, scales, opacities, colors = (
                 torch.cat([getattr(part, name) for part in (mine, look.others)]) for name in _FIELDS
             )
-            behind = self._trainer.background.image(look.camera)
-            drawn = rasterize_splats(means, quats, scales, opacities, colors, look.camera, behind).image
+            drawn = rasterize_splats(means, quats, scales, opacities, colors, look.camera, look.behind).image
             image = to_host(drawn)
             if blur > 0:
                 image = lit_alike(image, look.truth, look.region)
@@ -173,7 +173,8 @@ class BodyRegistration:
         splats = self._trainer.splats(camera, view.t)
         near = self._others_near(camera, splats)
         others = PosedSplats(**{name: getattr(splats, name)[near] for name in _FIELDS})
-        return _Look(camera, view.image[rows, columns].astype(np.float32) / 255, region[rows, columns], others)
+        truth, behind = view.image[rows, columns].astype(np.float32) / 255, self._trainer.background.image(camera)
+        return _Look(camera, truth, region[rows, columns], others, behind)
 
     def _others_near(self, camera: Camera, splats: PosedSplats) -> torch.Tensor:
         """Rows of the Gaussians of other groups that reach a camera's picture."""

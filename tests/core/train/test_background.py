@@ -38,3 +38,17 @@ def test_harmonics_are_computed_in_parts_that_fit_into_a_cache(monkeypatch):
     found = background.learned(np.zeros((1, 3)), degree=3).basis(camera)
     assert torch.equal(found, spherical_harmonics.basis(torch.from_numpy(rays), 3).reshape(-1, 16))
     assert sum(computed) == 75 and max(computed) == background.ROWS
+
+
+def test_the_first_cameras_that_fit_stay_in_the_cache(monkeypatch):
+    cameras_seen = [scenes.orbit_camera(angle, 8, 6) for angle in (0.1, 0.2, 0.3, 0.4, 0.5)]
+    computed, harmonics = [], background._harmonics
+    monkeypatch.setattr(background, "_harmonics", lambda *given: computed.append(given[0]) or harmonics(*given))
+    monkeypatch.setattr(background, "BASES_BYTES", 3 * 8 * 6 * 9 * 4 + 1)  # three cameras of degree 2
+    sky = background.learned(np.zeros((1, 3)), degree=2)
+    for order, missing in (((0, 1, 2, 3, 4), [0, 1, 2, 3, 4]), ((4, 2, 0, 3, 1), [4, 3]), ((3, 1, 4, 0, 2), [3, 4])):
+        computed.clear()
+        found = [sky.basis(cameras_seen[k]) for k in order]
+        assert computed == [cameras_seen[k] for k in missing]
+        assert sum(basis.nbytes for basis in sky._bases.values()) <= background.BASES_BYTES
+        assert all(torch.equal(b, harmonics(cameras_seen[k], 9)) for k, b in zip(order, found, strict=True))
