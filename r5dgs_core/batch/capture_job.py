@@ -34,14 +34,14 @@ class CaptureJob:
         out: Output folder.
         threads: Threads of the kernels; None for all cores of the job.
         gpus: GPUs that its commands see, as `visible_gpus` returns them.
-        choice: GPUs from `separate_gpus`, of which `beside` chooses one.
+        selectable_gpus: GPUs from `separate_gpus`, of which `with_least_used_gpu` selects one.
     """
 
     capture: Capture
     out: Path
     threads: int | None = None
     gpus: str | None = None
-    choice: tuple[str, ...] = ()
+    selectable_gpus: tuple[str, ...] = ()
 
     def __call__(self) -> dict[str, Any]:
         """Finish the capture; return its ``evaluation``, or ``failure`` and ``repeat`` (True after a crash)."""
@@ -79,12 +79,12 @@ class CaptureJob:
 
         return DelayedSubmission(dataclasses.replace(self))
 
-    def beside(self, others: Sequence[CaptureJob]) -> CaptureJob:
+    def with_least_used_gpu(self, others: Sequence[CaptureJob]) -> CaptureJob:
         """Return this job with the GPU that the fewest other jobs have; unchanged if there is no choice."""
         device = self.capture.config.train.device
-        if len(self.choice) < 2 or device == "cpu" or ":" in device:  # such as cuda:1, the user's choice
+        if len(self.selectable_gpus) < 2 or device == "cpu" or ":" in device:  # such as cuda:1, the user's choice
             return self
-        return dataclasses.replace(self, gpus=min(self.choice, key=[job.gpus for job in others].count))
+        return dataclasses.replace(self, gpus=min(self.selectable_gpus, key=[job.gpus for job in others].count))
 
     def path(self, suffix: str) -> Path:
         """Return the path of a file of the capture."""

@@ -35,8 +35,8 @@ class Job(Protocol):
         """Execute the job; return its ``evaluation``, or ``failure`` and ``repeat`` (True after a crash)."""
         ...
 
-    def beside(self, others: Sequence[Any]) -> Job:
-        """Return the job with resources that the other jobs use least."""
+    def with_least_used_gpu(self, others: Sequence[Any]) -> Job:
+        """Return the job with the GPU that the fewest other jobs have, if it may use several of them."""
         ...
 
 
@@ -93,7 +93,7 @@ def run(jobs: Sequence[Job], start: Any, *, at_once: int, retries: int, progress
     try:
         while waiting or running:
             while waiting and len(running) < at_once:
-                job = waiting.pop(0).beside([other for other, _ in running.values()])
+                job = waiting.pop(0).with_least_used_gpu([other for other, _ in running.values()])
                 running[job.capture.name] = job, start.submit(job)
                 queued.add(job.capture.name)
                 progress({"event": "case", "text": f"{job.capture.name}: submitted"})

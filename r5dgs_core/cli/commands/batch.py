@@ -76,8 +76,8 @@ def run_batch(
     out.mkdir(parents=True, exist_ok=True)
     at_once = at_once or (1 if cluster == "local" else 1000)
     gpus = visible_gpus(cluster, planned.resources)
-    choice = separate_gpus(cluster, planned.resources) if at_once > 1 else ()
-    work = [CaptureJob(capture, out.resolve(), threads, gpus, choice) for capture in planned.captures]
+    selectable = separate_gpus(cluster, planned.resources) if at_once > 1 else ()
+    work = [CaptureJob(capture, out.resolve(), threads, gpus, selectable) for capture in planned.captures]
     start = jobs.executor(cluster, out.resolve() / captures.JOBS_FOLDER, planned.resources)
     with make(progress_kind) as progress, interrupt.at_once("stopped; repeat the same command to continue"):
         result = jobs.run(work, start, at_once=at_once, retries=retries, progress=progress)

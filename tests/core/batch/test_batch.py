@@ -91,7 +91,7 @@ def test_local_jobs_at_the_same_time_use_different_gpus(tmp_path, monkeypatch):
     def job(name, device):
         config = tiny_datasets.settings(f"train.device={device}")
         capture = SimpleNamespace(name=name, data=tmp_path, arguments=(), config=config)
-        return capture_job.CaptureJob(capture, tmp_path, gpus="all", choice=("2", "5"))
+        return capture_job.CaptureJob(capture, tmp_path, gpus="all", selectable_gpus=("2", "5"))
 
     planned = [job("a", "auto"), job("b", "cuda"), job("c", "auto"), job("d", "cuda:1"), job("e", "cpu")]
     with pytest.raises(TrainingError, match="5 of 5"):

@@ -41,7 +41,7 @@ class Pretended:
             return {"failure": "no images", "repeat": False}
         return {"evaluation": EVALUATION}
 
-    def beside(self, others):
+    def with_least_used_gpu(self, others):
         return self
 
 
