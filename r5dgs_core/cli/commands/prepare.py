@@ -268,6 +268,7 @@ def _check_capture(plan: Plan, progress_kind: str) -> None:
     """
     from ...check import check
     from ...prepare import capture_file
+    from ...progress import make
 
     out = Path(plan.request.out)
     found = [one for one in check(out) if one.code not in NOT_RECORDED]
@@ -279,6 +280,9 @@ def _check_capture(plan: Plan, progress_kind: str) -> None:
     capture_file.write(out, {**capture, "checks": rows})
     if progress_kind == "auto":
         terminal.print_lines(map(str, found))
+    if progress_kind == "json":
+        with make(progress_kind) as progress:
+            progress({"event": "checked", "findings": rows})
     if wrong := [one for one in found if one.severity == findings.ERROR]:
         raise errors.DatasetError(f"{out}: the data set cannot be trained: {wrong[0]}")
 

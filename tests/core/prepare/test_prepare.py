@@ -90,6 +90,13 @@ def test_the_next_command_follows_the_findings(capture, tmp_path, capsys):
     assert len([line for line in before if line.startswith(f"images {3 * COUNT} of")]) == 1
 
 
+def test_json_progress_has_the_findings(capture, tmp_path, capsys):
+    command.run_prepare(capture, tmp_path / "data", sync="none", lines=36, progress_kind="json")
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert events[-1]["event"] == "checked"
+    assert events[-1]["findings"] == json.loads((tmp_path / "data" / "capture.json").read_text())["checks"] != []
+
+
 def test_a_folder_among_the_recordings_is_refused(capture):
     for out in (capture, capture / "data", capture / "cam0" / "data"):
         with pytest.raises(errors.ConfigError, match="is among the recordings"):
