@@ -106,7 +106,7 @@ def reconstruct(
     )
     text = "cameras from the board" if request.board else "cameras from image features; this can take minutes"
     progress({"event": "read", "text": text})
-    found = reconstruction.reconstruct(sources, request, out / WORK)
+    found = reconstruction.reconstruct(sources, request, out / WORK, progress)
     r5dgs_json.write(path, found, recordings)
     shutil.rmtree(out / WORK, ignore_errors=True)
     return path

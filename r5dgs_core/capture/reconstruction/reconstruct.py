@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,12 @@ from .recording import Recording
 from .request import Request
 
 
-def reconstruct(recordings: Sequence[Recording], request: Request, work: Path) -> Calibration:
+def reconstruct(
+    recordings: Sequence[Recording],
+    request: Request,
+    work: Path,
+    progress: Callable[[dict[str, Any]], None] = lambda event: None,
+) -> Calibration:
     """Reconstruct lens and pose of every camera: from the board if there is one, otherwise from image features.
 
     The recordings must share a clock, at least roughly, if a board is carried around.
@@ -24,6 +30,7 @@ def reconstruct(recordings: Sequence[Recording], request: Request, work: Path) -
         recordings: The cameras.
         request: Known facts about them.
         work: Folder for intermediate files of features; it is emptied.
+        progress: Called with events while the board is searched.
 
     Returns:
         The cameras, in a world with z up.
@@ -42,7 +49,7 @@ def reconstruct(recordings: Sequence[Recording], request: Request, work: Path) -
     if request.board is None:
         calibration = features.reconstruct(recordings, request, work)
     else:
-        calibration, boards = _from_board(recordings, request)
+        calibration, boards = _from_board(recordings, request, progress)
     if request.distance is not None:
         calibration = gauge.with_distance(calibration, *request.distance)
     return gauge.upright(calibration, request.up, boards)
@@ -56,7 +63,9 @@ def _check_up(request: Request) -> None:
         raise errors.ConfigError("--up plane: needs points, which a board does not give; use --up board or cameras")
 
 
-def _from_board(recordings: Sequence[Recording], request: Request) -> tuple[Calibration, list[np.ndarray]]:
+def _from_board(
+    recordings: Sequence[Recording], request: Request, progress: Callable[[dict[str, Any]], None]
+) -> tuple[Calibration, list[np.ndarray]]:
     """Reconstruct fixed cameras from sightings of the board; also returns the board's poses, board to world."""
     assert request.board is not None
     if request.moving:
@@ -65,7 +74,7 @@ def _from_board(recordings: Sequence[Recording], request: Request) -> tuple[Cali
             "out --board, so that image features are used, or prepare the moving cameras alone"
         )
     detector = Detector(request.board)
-    seen = sightings.find(recordings, detector)
+    seen = sightings.find(recordings, detector, progress)
     unseen = [r.name for k, r in enumerate(recordings) if not any(s.camera == k for s in seen)]
     if unseen:
         raise errors.DatasetError(

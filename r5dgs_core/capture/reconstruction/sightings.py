@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -37,8 +38,16 @@ class Sighting:
     pixels: np.ndarray
 
 
-def find(recordings: Sequence[Recording], detector: Detector) -> list[Sighting]:
-    """Look for a board in frames of all cameras that are nearest to common times."""
+def find(
+    recordings: Sequence[Recording], detector: Detector, progress: Callable[[dict[str, Any]], None]
+) -> list[Sighting]:
+    """Look for a board in frames of all cameras that are nearest to common times.
+
+    Args:
+        recordings: The cameras.
+        detector: Detector of the board.
+        progress: Called with an event after each frame.
+    """
     first = max(float(recording.times[0]) for recording in recordings)
     last = min(float(recording.times[-1]) for recording in recordings)
     if first > last:
@@ -47,12 +56,16 @@ def find(recordings: Sequence[Recording], detector: Detector) -> list[Sighting]:
         )
     count = min(MOST_TIMES, max(len(recording.times) for recording in recordings))
     times = np.linspace(first, last, count)
-    sightings = []
-    for camera, recording in enumerate(recordings):
+    frames = []  # time by frame of each camera
+    for recording in recordings:
         nearest = np.abs(recording.times[None] - times[:, None]).argmin(1)
-        by_frame = {int(frame): time for time, frame in reversed(list(enumerate(nearest)))}
+        frames.append({int(frame): time for time, frame in reversed(list(enumerate(nearest)))})
+    sightings, done, total = [], 0, sum(map(len, frames))
+    for camera, (recording, by_frame) in enumerate(zip(recordings, frames, strict=True)):
         for index, pixels in recording.read(sorted(by_frame)):
             rows, corners = detector.detect(pixels)
+            done += 1
+            progress({"event": "board", "done": done, "total": total, "unit": "frames", "text": recording.name})
             if len(rows) >= FEWEST_CORNERS:
                 sightings.append(Sighting(camera, by_frame[index], rows, corners))
     return sightings

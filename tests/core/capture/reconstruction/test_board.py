@@ -49,9 +49,13 @@ def test_cameras_that_never_see_the_board_together_are_named(tmp_path):
 
 
 def test_cameras_that_do_not_see_the_board_are_named(tmp_path):
-    recordings = films(CHARUCO, times=3, unseen={1: {0, 1, 2}})
+    recordings, events = films(CHARUCO, times=3, unseen={1: {0, 1, 2}}), []
     with pytest.raises(errors.DatasetError, match="cameras cam1: the board was not found"):
-        reconstruct.reconstruct(recordings, Request(board=board.parse(CHARUCO)), tmp_path)
+        reconstruct.reconstruct(recordings, Request(board=board.parse(CHARUCO)), tmp_path, events.append)
+    assert [(event["event"], event["done"], event["total"]) for event in events] == [
+        ("board", k, 9) for k in range(1, 10)
+    ]
+    assert [event["text"] for event in events[::3]] == ["cam0", "cam1", "cam2"]
 
 
 def test_a_lens_needs_several_views(tmp_path):
