@@ -10,7 +10,8 @@ four corners were found are unknown there. The true poses of the board are those
 offset between the trained group and the board is fitted over the clip, and nothing else. With ``--masks features`` and
 ``--masks none``, the groups that are found are compared with the masks from the corners. The corners in the world were
 triangulated from those in the images; where they do not agree, the cameras did not record at the same moment, and the
-true poses are wrong. Results: docs/results/captures.md.
+true poses are wrong. ``true_mm_each`` and ``true_degrees_each`` are the changes of the true poses if the corners of one
+camera are left out. Results: docs/results/captures.md.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 from r5dgs_core.bake import bake
@@ -78,7 +80,7 @@ class Board:
             ids = sorted(world[moment])
             if len(ids) >= LEAST:
                 self.poses[row], self.posed[row] = _rigid([own[k] for k in ids], [world[moment][k] for k in ids]), True
-        self._world = world
+        self._own, self._world = own, world
         every = np.array(list(own.values()))
         side = every[:, 0].min()
         width, height = every[:, :2].max(0) + side
@@ -113,13 +115,45 @@ class Board:
         """Return how far the corners found in a moment are from those in the world: rms of the worst camera, px."""
         moment, worst = int(self.moments[row]), 0.0
         for number, camera in enumerate(plan.cameras):
-            found = self._found[moment, int(camera.name.rpartition("_")[2])]
+            found = self._corners(moment, camera.name)
             keys = [key for key in found if key in self._world[moment]]
             if len(keys) >= LEAST:
                 pixels = _pixels(plan, number, np.array([self._world[moment][key] for key in keys])) - 0.5
                 apart = pixels - [found[key] for key in keys]
                 worst = max(worst, float(np.sqrt((apart**2).sum(1).mean())))
         return worst
+
+    def uncertainty(self, row: int, plan: Plan) -> tuple[float, float]:
+        """Return the largest change of the board's pose if the corners of one camera are left out, mm and degrees.
+
+        nan if fewer than three cameras show the board.
+        """
+        moment, true = int(self.moments[row]), self.poses[row]
+        seen = [n for n, c in enumerate(plan.cameras) if len(self._corners(moment, c.name)) >= LEAST]
+        if len(seen) < 3:
+            return np.nan, np.nan
+        start = np.concatenate([Rotation.from_matrix(true[:3, :3]).as_rotvec(), true[:3, 3]])
+        center, moves, turns = self.outline.mean(0), [], []
+        for left_out in seen:
+            cameras = [n for n in seen if n != left_out]
+            found = optimize.least_squares(self._misses, start, loss="soft_l1", args=(moment, plan, cameras)).x
+            turn = Rotation.from_rotvec(found[:3])
+            moves.append(np.linalg.norm(turn.apply(center) + found[3:] - (true[:3, :3] @ center + true[:3, 3])))
+            turns.append((turn.inv() * Rotation.from_matrix(true[:3, :3])).magnitude())
+        return 1e3 * float(max(moves)), float(np.degrees(max(turns)))
+
+    def _corners(self, moment: int, name: str) -> dict[int, list[float]]:
+        """Return the pixels of the corners that a camera shows at a moment, by id."""
+        return self._found[moment, int(name.rpartition("_")[2])]
+
+    def _misses(self, pose: np.ndarray, moment: int, plan: Plan, numbers: list[int]) -> np.ndarray:
+        """Return the distances along each axis of the corners from those of a posed board, px."""
+        misses = []
+        for number in numbers:
+            corners = self._corners(moment, plan.cameras[number].name)
+            points = Rotation.from_rotvec(pose[:3]).apply([self._own[key] for key in corners]) + pose[3:]
+            misses.append((_pixels(plan, number, points) - 0.5 - list(corners.values())).ravel())
+        return np.concatenate(misses)
 
 
 def _pixels(plan: Plan, number: int, points: np.ndarray) -> np.ndarray:
@@ -220,6 +254,8 @@ def main() -> None:
         dataset = datasets.read(truth)
         result = evaluate.evaluate(scene, dataset, splits=("val",), align=True)
     board = Board(args.folder)
+    posed = np.flatnonzero(board.posed).tolist()
+    uncertain = [board.uncertainty(k, plan) for k in posed]
     val, record = result["splits"]["val"]["rigid"], scene.provenance.get("cameras", {})
     row = {
         "val": val["psnr"],
@@ -233,7 +269,9 @@ def main() -> None:
         "sizes": record.get("sizes"),
         "unexplained": next(row["value"] for row in scene.needs if row["name"] == unexplained.NEED),
         **pose_errors(scene, dataset),
-        "corners_px_each": [round(board.disagreement(int(k), plan), 1) for k in np.flatnonzero(board.posed)],
+        "corners_px_each": [round(board.disagreement(int(k), plan), 1) for k in posed],
+        "true_mm_each": [round(mm, 2) for mm, _ in uncertain],
+        "true_degrees_each": [round(degrees, 2) for _, degrees in uncertain],
     }
     print("\n".join(f"{name:>14} {value}" for name, value in row.items()))
     if args.json:
