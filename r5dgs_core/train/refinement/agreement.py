@@ -4,12 +4,12 @@ A wrong pose, focal length, clock or colour changes the whole picture in the sam
 also leaves differences that corrections explain in part, but these are local: the left and the right half of the
 pictures then need different corrections, and so do the upper and the lower half. So corrections are fitted to each side
 alone. The product of both fits, averaged over the cameras, estimates the squared size of the true corrections; errors
-of the two sides that are independent do not bias it.
+of the two sides that are independent do not bias it. Both fits must also be more alike than independent ones usually
+are, because few cameras agree on small corrections by chance.
 
-Poses are examined alone, because sides of pictures hardly tell them from focal lengths. The two fits of all poses must
-also be more alike than independent ones usually are. The other parts are fitted together with poses, and must also
-reduce the error of the opposite side. Poses need not: one side determines some of their axes so weakly that they do not
-fit the other side.
+Poses are examined alone, because sides of pictures hardly tell them from focal lengths. The other parts are fitted
+together with poses, and must also reduce the error of the opposite side. Poses need not: one side determines some of
+their axes so weakly that they do not fit the other side.
 
 Notation: R poses, K tiles along each axis of an image.
 """
@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from ...render import camera_fit
 from ...render.camera_fit import Normal, Units
@@ -30,7 +31,7 @@ from . import gauge
 from .refinement import PARTS, POSES
 
 RIDGE = 1e-3  # relative increase of the diagonal of the normal equations
-ALIKE = 2.0  # least correlation of two fits of the poses, in standard deviations of that of independent fits
+CHANCE = 0.025  # probability with which independent fits are as much alike as two fits that agree
 GREY = 0.5  # colour for which the size of a correction of colours is stated
 _COLUMNS: dict[str, str] = dict(zip(PARTS, ("pose", "focal", "time", "color"), strict=True))
 
@@ -132,11 +133,18 @@ def agreed(
     """Return the size of a part in which two fits [R, COUNT] agree, rms over the poses; 0 if they do not agree."""
     a, b = (_in_units(part, poses, change, points, spacing) for change in (first, second))
     shared = float((a * b).sum())
-    if part == POSES:
-        determined = max(a.size - gauge.FREEDOM, 1)  # the variance of the correlation is 1 / determined
-        if shared < ALIKE / math.sqrt(determined) * np.linalg.norm(a) * np.linalg.norm(b):
-            return 0.0
+    fixed = gauge.FREEDOM if part == POSES else a.size // len(a)
+    if shared < _least_correlation(a.size - fixed) * np.linalg.norm(a) * np.linalg.norm(b):
+        return 0.0
     return math.sqrt(max(shared, 0.0) / len(a))
+
+
+def _least_correlation(values: int) -> float:
+    """Return the correlation that independent fits exceed with probability `CHANCE`; inf if they have one value."""
+    if values < 2:
+        return math.inf
+    t = float(stats.t.isf(CHANCE, values - 1))
+    return t / math.hypot(t, math.sqrt(values - 1))
 
 
 def _in_units(

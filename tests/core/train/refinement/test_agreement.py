@@ -65,15 +65,25 @@ def test_noise_alone_is_no_evidence():
     assert max(one.size for one in found.values()) < 0.05
 
 
-def test_independent_fits_of_few_poses_rarely_agree():
-    cameras = [tiny_datasets.orbit_camera(0.7 * k, 96, 72) for k in range(4)]
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("count", [3, 4, 10])
+def test_independent_fits_of_few_cameras_rarely_agree(part, count):
+    cameras = [tiny_datasets.orbit_camera(0.6 * k, 96, 72) for k in range(count)]
     units = np.stack([gauge.pixel_units(camera, POINTS) for camera in cameras])
     rng, sizes = np.random.default_rng(3), []
-    for _ in range(200):
-        fits = np.zeros((2, 4, COUNT))
-        fits[..., POSE] = np.einsum("rij,frj->fri", units, rng.normal(size=(2, 4, 6)))
-        sizes.append(agreement.agreed(POSES, cameras, *fits, POINTS, SPACING))
-    assert np.mean(np.array(sizes) > 0.2) < 0.06
+    for _ in range(400):
+        fits = rng.normal(size=(2, count, COUNT))
+        fits[..., POSE] = np.einsum("rij,frj->fri", units, rng.normal(size=(2, count, 6)))
+        sizes.append(agreement.agreed(part, cameras, *fits, POINTS, SPACING))
+    assert np.mean(np.array(sizes) > 0) < 0.05
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_two_cameras_have_a_single_difference_of_focal_lengths_and_clocks(part):
+    cameras = [tiny_datasets.orbit_camera(0.6 * k, 96, 72) for k in range(2)]
+    change = np.random.default_rng(4).normal(size=(2, COUNT))
+    size = agreement.agreed(part, cameras, change, 1.1 * change, POINTS, SPACING)
+    assert (size > 0) == (part in (POSES, "camera_colours"))
 
 
 def test_both_sides_see_what_moves():
