@@ -140,9 +140,13 @@ def agreed(
 
 
 def _least_correlation(values: int) -> float:
-    """Return the correlation that independent fits exceed with probability `CHANCE`; inf if they have one value."""
+    """Return the correlation that independent fits exceed with probability `CHANCE`; 2 if a single value has any sign.
+
+    Args:
+        values: Number of independent values of a fit, those left after what no image determines is removed.
+    """
     if values < 2:
-        return math.inf
+        return 2.0  # which no correlation reaches
     t = float(stats.t.isf(CHANCE, values - 1))
     return t / math.hypot(t, math.sqrt(values - 1))
 

@@ -86,6 +86,13 @@ def test_two_cameras_have_a_single_difference_of_focal_lengths_and_clocks(part):
     assert (size > 0) == (part in (POSES, "camera_colours"))
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("part", PARTS)
+def test_one_camera_is_no_evidence(part):
+    change = np.ones((1, COUNT))
+    assert agreement.agreed(part, [tiny_datasets.orbit_camera(0, 96, 72)], change, change, POINTS, SPACING) == 0.0
+
+
 def test_both_sides_see_what_moves():
     pose = examined(lambda row, column: np.zeros(COUNT), 0)
     still = np.eye(COUNT)
