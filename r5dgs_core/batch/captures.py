@@ -14,7 +14,8 @@ from ..errors import ConfigError
 RESULT_FILE, TABLE_FILE, JOBS_FOLDER = "batch.json", "table.md", "jobs"  # in the output folder
 SUFFIXES = ("", ".r5dgs", ".json", ".evaluation.json", ".log")  # of the files of a capture, beside them
 _KEYS: dict[str, type] = {"data": str, "name": str, "preset": str, "config": str, "set": list, "device": str}
-_ONE_PER_JOB = ("gpus_per_node", "gpus_per_task", "num_gpus", "tasks_per_node", "nodes")  # resources, of submitit
+# Parameters of submitit that are at most 1.
+_ONE_PER_JOB = ("gpus_per_node", "gpus_per_task", "num_gpus", "tasks_per_node", "ntasks_per_node", "nodes")
 _DEFAULTS = tuple(key for key in _KEYS if key not in ("data", "name"))
 
 

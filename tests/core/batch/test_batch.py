@@ -41,6 +41,7 @@ def test_a_fault_in_the_file_is_one_error(tmp_path, capsys):
         ("local", "local_gpus_per_node = 4\ngpus_per_node = 1", "local_gpus_per_node = 4"),
         ("slurm", "slurm_gpus_per_task = 2", "slurm_gpus_per_task = 2"),
         ("slurm", "tasks_per_node = 2", "tasks_per_node = 2"),
+        ("slurm", "slurm_ntasks_per_node = 2", "slurm_ntasks_per_node = 2"),
     ],
 )
 def test_several_gpus_or_processes_of_a_job_are_refused(tiny, tmp_path, capsys, cluster, resources, named):
