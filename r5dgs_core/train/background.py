@@ -51,7 +51,7 @@ class Background:
     def basis(self, camera: Camera) -> Tensor:
         """Return the harmonics of a camera's pixels, cached up to `BASES_BYTES`. [H W, Kb]
 
-        The first cameras stay in the cache: views are drawn in random order, for which no exchange has more hits.
+        The first cameras stay in the cache: as views are drawn in random order, replacing them would save no work.
         """
         coefficients, shape = self.params["background"], (camera.height, camera.width, 3)
         key = (*shape, camera.T_cam_world[:3, :3].tobytes(), camera.intrinsics.tobytes(), len(coefficients))

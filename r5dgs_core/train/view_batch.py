@@ -77,7 +77,10 @@ def update(trainer: Any, batch: Sequence[StepInputs], place: str) -> Tensor:
 
 
 def _add_penalties(trainer: Any, parameters: Sequence[Tensor]) -> None:
-    """Add the gradients of the penalties in the leading process, as a GPU rounds their sums differently each time."""
+    """Add the gradients of the penalties, which the leading process computes for all processes.
+
+    A GPU rounds their sums differently each time, so the parameters of the processes would drift apart.
+    """
     gradients: Sequence[Tensor | None] = [None] * len(parameters)
     if trainer.workers.leads:
         penalties = [term for term in trainer.penalties() if term is not None and term.requires_grad]
