@@ -39,13 +39,13 @@ from r5dgs_core.cli import main
 sys.exit(main.main(sys.argv[3:]))
 """
 
-# The same with other penalties in the second process, as after rounding, but larger.
+# The same with twice the penalties in the second process.
 OTHER_PENALTIES = PROCESS.replace(
     "sys.exit",
     """from r5dgs_core.train import trainer
 penalties = trainer.Trainer.penalties
 if rank == "1":
-    trainer.Trainer.penalties = lambda run: [term if term is None else 1.01 * term for term in penalties(run)]
+    trainer.Trainer.penalties = lambda run: [term if term is None else 2 * term for term in penalties(run)]
 sys.exit""",
 )
 # Code that prints gradients in one of two processes which have computed different ones.
@@ -123,6 +123,15 @@ def test_two_processes_train_as_one_with_two_views_per_step(alone, together):
     assert second.stdout + second.stderr == ""
     assert_same_run(out, alone)
     assert len(checkpoint.load(out).tensors["gaussians.means"]) > 900  # of 1010 at most before densification
+
+
+@pytest.mark.slow
+def test_two_processes_train_a_field_as_one(tiny, tmp_path):
+    field = ("train.representation=field", "field.width=32", "field.place_steps=3", "field.trd_steps=2", *SHORT)
+    assert main.main(arguments(tiny.root, tmp_path / "one", *field, "train.batch=2")) == 0
+    first, second = in_two_processes(*arguments(tiny.root, tmp_path / "two", *field))
+    assert (first.returncode, second.returncode) == (0, 0), first.stderr + second.stderr
+    assert_same_run(tmp_path / "two", tmp_path / "one")
 
 
 def test_all_processes_get_the_gradients_of_the_leading_one():
