@@ -123,24 +123,24 @@ class Board:
                 worst = max(worst, float(np.sqrt((apart**2).sum(1).mean())))
         return worst
 
-    def uncertainty(self, row: int, plan: Plan) -> tuple[float, float]:
-        """Return the largest change of the board's pose if the corners of one camera are left out, mm and degrees.
+    def uncertainty(self, row: int, plan: Plan) -> tuple[float, float] | None:
+        """Return the largest change of the fitted pose if the corners of one camera are left out, mm and degrees.
 
-        nan if fewer than three cameras show the board.
+        None if fewer than three cameras show the board.
         """
         moment, true = int(self.moments[row]), self.poses[row]
         seen = [n for n, c in enumerate(plan.cameras) if len(self._corners(moment, c.name)) >= LEAST]
         if len(seen) < 3:
-            return np.nan, np.nan
+            return None
         start = np.concatenate([Rotation.from_matrix(true[:3, :3]).as_rotvec(), true[:3, 3]])
-        center, moves, turns = self.outline.mean(0), [], []
-        for left_out in seen:
+        center, places, turns = self.outline.mean(0), [], []
+        for left_out in (None, *seen):
             cameras = [n for n in seen if n != left_out]
             found = optimize.least_squares(self._misses, start, loss="soft_l1", args=(moment, plan, cameras)).x
-            turn = Rotation.from_rotvec(found[:3])
-            moves.append(np.linalg.norm(turn.apply(center) + found[3:] - (true[:3, :3] @ center + true[:3, 3])))
-            turns.append((turn.inv() * Rotation.from_matrix(true[:3, :3])).magnitude())
-        return 1e3 * float(max(moves)), float(np.degrees(max(turns)))
+            turns.append(Rotation.from_rotvec(found[:3]))
+            places.append(turns[-1].apply(center) + found[3:])
+        moved = max(float(np.linalg.norm(place - places[0])) for place in places)
+        return 1e3 * moved, max(float(np.degrees((turn.inv() * turns[0]).magnitude())) for turn in turns)
 
     def _corners(self, moment: int, name: str) -> dict[int, list[float]]:
         """Return the pixels of the corners that a camera shows at a moment, by id."""
@@ -270,8 +270,8 @@ def main() -> None:
         "unexplained": next(row["value"] for row in scene.needs if row["name"] == unexplained.NEED),
         **pose_errors(scene, dataset),
         "corners_px_each": [round(board.disagreement(int(k), plan), 1) for k in posed],
-        "true_mm_each": [round(mm, 2) for mm, _ in uncertain],
-        "true_degrees_each": [round(degrees, 2) for _, degrees in uncertain],
+        "true_mm_each": [None if moved is None else round(moved[0], 2) for moved in uncertain],
+        "true_degrees_each": [None if moved is None else round(moved[1], 2) for moved in uncertain],
     }
     print("\n".join(f"{name:>14} {value}" for name, value in row.items()))
     if args.json:
