@@ -9,13 +9,15 @@ keeps its own unless the error becomes much smaller: a body that bends would oth
 at some knots and to another part at others. After a repair, the neighbours become suspicious, so that a
 series of slipped knots is repaired from its ends. Other knots keep their poses bit for bit.
 
-A knot is checked when it enters training, because a fast body is easily lost then, and in some rounds over all knots.
+A knot is checked when it enters training, because a fast body is easily lost then, and in some rounds over all knots. A
+body that enters with constant spin keeps the rotation of the neighbouring knot instead if it fits the pictures better.
 Balls are aligned as a whole, by their texture (`ball_repair`), once all times have entered and near the end of the run.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -66,6 +68,7 @@ def after_step(trainer: Trainer, entered: tuple[int, int]) -> None:
     first, last = trainer.curriculum.entered
     new = [s for s in (*range(entered[0] - 1, first - 1, -1), *range(entered[1] + 1, last + 1))]
     if new:
+        hold_rotations(trainer, new, entered)
         usual = registration.errors(trainer, trainer.first_time, VIEWS)
         for s in new:
             for row in np.flatnonzero(registration.errors(trainer, s, VIEWS) > UNUSUAL * usual):
@@ -81,6 +84,29 @@ def after_step(trainer: Trainer, entered: tuple[int, int]) -> None:
         ball_repair.repair(trainer, ball_repair.FAR)
     if trainer.iteration == int(BALLS * total):
         ball_repair.repair(trainer)
+
+
+def hold_rotations(trainer: Trainer, new: Sequence[int], entered: tuple[int, int]) -> None:
+    """Give bodies at new knots the rotation of the neighbour if it fits the pictures clearly better than constant spin.
+
+    Otherwise, a wrong spin would be extrapolated to each further knot, with an error that grows from knot to knot.
+
+    Args:
+        trainer: The run.
+        new: Knots that enter training, from the inside outwards.
+        entered: First and last knot that took part before.
+    """
+    motion = _tracks(trainer)
+    for s in new:
+        near = s + 1 if s < entered[0] else s - 1
+        for body in range(1, motion.tracks.bodies):
+            quats = _quats(trainer, body)
+            if rotations.angle_between(quats[s], quats[near]) <= APART:
+                continue
+            look = BodyRegistration(trainer, motion, body, s, VIEWS)
+            held = quats[near], look.pose[1]
+            if len(look) and look.error(held) < CLEARLY * look.error(look.pose):
+                look.write_pose(held)
 
 
 def repair(trainer: Trainer) -> int:

@@ -77,6 +77,29 @@ def test_a_sound_track_keeps_its_bits(trainer, monkeypatch):
     assert all(torch.equal(after[name], before[name]) for name in before)
 
 
+@pytest.mark.parametrize("end", ["first", "last"])
+def test_a_false_spin_is_not_extrapolated(trainer, end):
+    last = len(trainer.times) - 1
+    s, near, entered = (0, 1, (1, last)) if end == "first" else (last, last - 1, (0, last - 1))
+    slip(trainer, BRICK, (s,), (1, 0, 0), 40)
+    ball, shifts = quats(trainer, BALL), trainer.motion.tracks.params["translations"].detach().clone()
+    pose_repair.hold_rotations(trainer, [s], entered)
+    found = quats(trainer, BRICK)
+    assert found[s] == pytest.approx(found[near], abs=1e-6)
+    assert np.array_equal(quats(trainer, BALL), ball)
+    assert torch.equal(trainer.motion.tracks.params["translations"], shifts)
+
+
+def test_a_true_spin_is_extrapolated(trainer, monkeypatch):
+    last = len(trainer.times) - 1
+    monkeypatch.setattr(pose_repair, "APART", 0.0)  # the rotations of all bodies are compared
+    before = trainer.state().tensors
+    pose_repair.hold_rotations(trainer, [last], (0, last - 1))
+    after = trainer.state().tensors
+    assert off(trainer, BRICK, quats(trainer, BRICK)[last - 1])[last] > 1
+    assert all(torch.equal(after[name], before[name]) for name in before)
+
+
 def steady(count=10, rate=1.5):
     times = np.linspace(0, 1, count)
     return times, rotations.rotvecs_to_quats(rate * times[:, None] * np.array([0, 0, 1.0]))
