@@ -118,18 +118,6 @@ class Calibration:
         """Names of the cameras."""
         return tuple(camera.name for camera in self.cameras)
 
-    def by_frame(self) -> Calibration:
-        """Return one fixed camera for each image, named like its file without suffix.
-
-        It is meant for a reconstruction of one image per camera, which otherwise looks like one moving camera.
-        """
-        cameras = tuple(
-            CalibratedCamera(frame.path.stem, camera.width, camera.height, frame.lens, frame.camera_to_world, (frame,))
-            for camera in self.cameras
-            for frame in camera.frames
-        )
-        return dataclasses.replace(self, cameras=cameras or self.cameras)
-
     def moved(self, rotation: np.ndarray, shift: np.ndarray, scale: float) -> Calibration:
         """Return the calibration in another world: p' = scale rotation p + shift.
 

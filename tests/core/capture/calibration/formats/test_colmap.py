@@ -76,17 +76,13 @@ def test_panoramas_are_refused_by_name(tmp_path, text):
         reading.read_calibration(tmp_path)
 
 
-def test_images_of_one_folder_are_a_moving_camera_or_fixed_ones(tmp_path):
+def test_images_of_one_folder_are_a_moving_camera(tmp_path):
     camera = pycolmap.Camera(model="PINHOLE", width=SIZE[0], height=SIZE[1], params=PARAMETERS["PINHOLE"], camera_id=1)
     write(tmp_path / "sparse" / "0", camera, ["left.png", "right.png", "top.png"])
     (tmp_path / "images").mkdir()
     moving = reading.read_calibration(tmp_path)
     assert moving.names == ("images",) and moving.cameras[0].moves
     assert [frame.path for frame in moving.cameras[0].frames][0] == tmp_path / "images" / "left.png"
-    fixed = moving.by_frame()
-    assert fixed.names == ("left", "right", "top")
-    for camera, frame in zip(fixed.cameras, moving.cameras[0].frames, strict=True):
-        assert np.array_equal(camera.camera_to_world, frame.camera_to_world)
 
 
 def test_times_json_gives_the_times_of_the_images(tmp_path):
