@@ -17,9 +17,9 @@ Balls are aligned as a whole, by their texture (`ball_repair`), once all times h
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 
 import numpy as np
+import torch
 
 from ..motion import rotations
 from ..motion.se3 import Pose
@@ -68,7 +68,8 @@ def after_step(trainer: Trainer, entered: tuple[int, int]) -> None:
     first, last = trainer.curriculum.entered
     new = [s for s in (*range(entered[0] - 1, first - 1, -1), *range(entered[1] + 1, last + 1))]
     if new:
-        hold_rotations(trainer, new, entered)
+        for s in new:
+            hold_rotations(trainer, s, s + 1 if s < entered[0] else s - 1)
         usual = registration.errors(trainer, trainer.first_time, VIEWS)
         for s in new:
             for row in np.flatnonzero(registration.errors(trainer, s, VIEWS) > UNUSUAL * usual):
@@ -86,27 +87,27 @@ def after_step(trainer: Trainer, entered: tuple[int, int]) -> None:
         ball_repair.repair(trainer)
 
 
-def hold_rotations(trainer: Trainer, new: Sequence[int], entered: tuple[int, int]) -> None:
-    """Give bodies at new knots the rotation of the neighbour if it fits the pictures clearly better than constant spin.
+@torch.no_grad()
+def hold_rotations(trainer: Trainer, knot: int, near: int) -> None:
+    """Give bodies at a new knot the rotation of a neighbour if it fits the pictures clearly better than their own.
 
-    Otherwise, a wrong spin would be extrapolated to each further knot, with an error that grows from knot to knot.
-
-    Args:
-        trainer: The run.
-        new: Knots that enter training, from the inside outwards.
-        entered: First and last knot that took part before.
+    Bodies enter with constant spin. A wrong spin would be extrapolated to each further knot, with a growing error.
     """
-    motion = _tracks(trainer)
-    for s in new:
-        near = s + 1 if s < entered[0] else s - 1
-        for body in range(1, motion.tracks.bodies):
-            quats = _quats(trainer, body)
-            if rotations.angle_between(quats[s], quats[near]) <= APART:
-                continue
-            look = BodyRegistration(trainer, motion, body, s, VIEWS)
-            held = quats[near], look.pose[1]
-            if len(look) and look.error(held) < CLEARLY * look.error(look.pose):
-                look.write_pose(held)
+    tracks = _tracks(trainer).tracks
+    parts = tracks.base_quats, tracks.params["rotvecs"]
+    own = [values[:, knot].clone() for values in parts]
+    quats = rotations.normalize(to_host(tracks.knot_quats()[:, [knot, near]]).astype(np.float64))
+    turned = np.flatnonzero(rotations.angle_between(quats[:, 0], quats[:, 1]) > APART)
+    owners = to_host(tracks.owners)[turned] - 1
+    turned, owners = turned[owners >= 0], owners[owners >= 0]
+    if len(turned):
+        before = registration.errors(trainer, knot, VIEWS)[owners]
+        for values in parts:
+            values[turned, knot] = values[turned, near]
+        after = registration.errors(trainer, knot, VIEWS)[owners]
+        worse = turned[~(after < CLEARLY * before)]
+        for values, old in zip(parts, own, strict=True):
+            values[worse, knot] = old[worse]
 
 
 def repair(trainer: Trainer) -> int:

@@ -80,10 +80,10 @@ def test_a_sound_track_keeps_its_bits(trainer, monkeypatch):
 @pytest.mark.parametrize("end", ["first", "last"])
 def test_a_false_spin_is_not_extrapolated(trainer, end):
     last = len(trainer.times) - 1
-    s, near, entered = (0, 1, (1, last)) if end == "first" else (last, last - 1, (0, last - 1))
+    s, near = (0, 1) if end == "first" else (last, last - 1)
     slip(trainer, BRICK, (s,), (1, 0, 0), 40)
     ball, shifts = quats(trainer, BALL), trainer.motion.tracks.params["translations"].detach().clone()
-    pose_repair.hold_rotations(trainer, [s], entered)
+    pose_repair.hold_rotations(trainer, s, near)
     found = quats(trainer, BRICK)
     assert found[s] == pytest.approx(found[near], abs=1e-6)
     assert np.array_equal(quats(trainer, BALL), ball)
@@ -94,7 +94,7 @@ def test_a_true_spin_is_extrapolated(trainer, monkeypatch):
     last = len(trainer.times) - 1
     monkeypatch.setattr(pose_repair, "APART", 0.0)  # the rotations of all bodies are compared
     before = trainer.state().tensors
-    pose_repair.hold_rotations(trainer, [last], (0, last - 1))
+    pose_repair.hold_rotations(trainer, last, last - 1)
     after = trainer.state().tensors
     assert off(trainer, BRICK, quats(trainer, BRICK)[last - 1])[last] > 1
     assert all(torch.equal(after[name], before[name]) for name in before)
