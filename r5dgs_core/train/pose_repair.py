@@ -93,21 +93,27 @@ def hold_rotations(trainer: Trainer, knot: int, near: int) -> None:
 
     Bodies enter with constant spin. A wrong spin would be extrapolated to each further knot, with a growing error.
     """
-    tracks = _tracks(trainer).tracks
-    parts = tracks.base_quats, tracks.params["rotvecs"]
+    motion = _tracks(trainer)
+    tracks, parts = motion.tracks, (motion.tracks.base_quats, motion.tracks.params["rotvecs"])
     own = [values[:, knot].clone() for values in parts]
     quats = rotations.normalize(to_host(tracks.knot_quats()[:, [knot, near]]).astype(np.float64))
     turned = np.flatnonzero(rotations.angle_between(quats[:, 0], quats[:, 1]) > APART)
-    owners = to_host(tracks.owners)[turned] - 1
-    turned, owners = turned[owners >= 0], owners[owners >= 0]
-    if len(turned):
-        before = registration.errors(trainer, knot, VIEWS)[owners]
-        for values in parts:
-            values[turned, knot] = values[turned, near]
-        after = registration.errors(trainer, knot, VIEWS)[owners]
-        worse = turned[~(after < CLEARLY * before)]
-        for values, old in zip(parts, own, strict=True):
-            values[worse, knot] = old[worse]
+    owners = to_host(tracks.owners)[turned]
+    turned, owners = turned[owners > 0], owners[owners > 0]
+    if not len(turned):
+        return
+    # All bodies together first: registering each would take long with many bodies that turn.
+    before = registration.errors(trainer, knot, VIEWS)[owners - 1]
+    for values in parts:
+        values[turned, knot] = values[turned, near]
+    after = registration.errors(trainer, knot, VIEWS)[owners - 1]
+    for values, old in zip(parts, own, strict=True):
+        values[:, knot] = old
+    for body in turned[after < before]:
+        look = BodyRegistration(trainer, motion, int(body), knot, VIEWS)
+        held = quats[body, 1], look.pose[1]
+        if len(look) and look.error(held) < CLEARLY * look.error(look.pose):
+            look.write_pose(held)
 
 
 def repair(trainer: Trainer) -> int:
