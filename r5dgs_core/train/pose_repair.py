@@ -92,6 +92,11 @@ def hold_rotations(trainer: Trainer, knot: int, near: int) -> None:
     """Give bodies at a new knot the rotation of a neighbour if it fits the pictures clearly better than their own.
 
     Bodies enter with constant spin. A wrong spin would be extrapolated to each further knot, with a growing error.
+
+    Args:
+        trainer: The run.
+        knot: The new knot.
+        near: The neighbour, which already takes part in training.
     """
     motion = _tracks(trainer)
     tracks, parts = motion.tracks, (motion.tracks.base_quats, motion.tracks.params["rotvecs"])
