@@ -28,6 +28,13 @@ C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 _NOTHING = np.zeros((0, 0), bool)  # no pixel is left out
 
 
+def total(loss: Tensor, *terms: Tensor | None) -> Tensor:
+    """Return the sum of a loss and further terms, in this order; None does not count."""
+    for term in terms:
+        loss = loss if term is None else loss + term
+    return loss
+
+
 def photometric(image: Tensor, target: Tensor, ssim_weight: float, left_out: np.ndarray | None = None) -> Tensor:
     """Return the loss (1 - w) L1 + w (1 - SSIM) between two images.
 

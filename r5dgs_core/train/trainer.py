@@ -235,9 +235,7 @@ class Trainer:
     def update(self, inputs: StepInputs, stats: RasterStats, place: str = "") -> Tensor:
         """Draw a view, update all parameters by the gradients, and return the loss; ``place`` is for messages."""
         loss, identity, splats = self.compare(inputs, stats, place)
-        total = loss
-        for term in (self.view_penalty(), *self.penalties(), identity):
-            total = total if term is None else total + term
+        total = losses.total(loss, self.view_penalty(), *self.penalties(), identity)
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         loss = loss.detach()

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..errors import TrainingError
 from ..raster import RasterStats
 from ..scene.cameras import Camera
-from . import devices, running_loss
+from . import devices, losses, running_loss
 from .step_graphs import StepInputs
 
 
@@ -114,9 +114,6 @@ def _draw(trainer: Any, inputs: StepInputs, place: str) -> Drawn:
     """Draw a view and add its gradients to those of the parameters."""
     stats, view = RasterStats(), inputs.view
     loss, identity, splats = trainer.compare(inputs, stats, place)
-    total = loss
-    for term in (trainer.view_penalty(), identity):
-        total = total if term is None else total + term
-    total.backward()
+    losses.total(loss, trainer.view_penalty(), identity).backward()
     correction = trainer.refinement.measure(inputs.index, view, splats, lambda t: trainer.splats(view.camera, t))
     return Drawn(inputs.index, view.camera, loss.detach(), stats, correction)
