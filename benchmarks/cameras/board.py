@@ -10,8 +10,8 @@ four corners were found are unknown there. The true poses of the board are those
 offset between the trained group and the board is fitted over the clip, and nothing else. With ``--masks features`` and
 ``--masks none``, the groups that are found are compared with the masks from the corners. The corners in the world were
 triangulated from those in the images; where they do not agree, the cameras did not record at the same moment, and the
-true poses are wrong. ``true_mm_each`` and ``true_degrees_each`` are the changes of the true poses if the corners of one
-camera are left out. Results: docs/results/captures.md.
+true poses are wrong. ``true_mm_each`` and ``true_degrees_each`` are the largest changes of a pose that is fitted to the
+corners in the images, if one camera is left out. Results: docs/results/captures.md.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Processes that train one run together (`torch.distributed`): each draws a part of the views of a step.
 
 All processes have the same state and draw the same random numbers, so they make the same decisions. Gradients are
-summed over the processes, and other results of the views are gathered. The first process leads: only it writes files,
-and it computes the gradients that no view determines.
+summed over the processes, and other results of the views are gathered. The first process leads: only it writes files
+and computes the gradients of penalties, which do not depend on a view.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Workers:
     def of_leader(
         self, parameters: Sequence[torch.Tensor], gradients: Sequence[torch.Tensor | None]
     ) -> list[torch.Tensor | None]:
-        """Return the gradients of parameters in the leading process, None for those without; others may give any."""
+        """Return the gradients that the leading process passes, None for parameters without; others are ignored."""
         if self.count == 1:
             return list(gradients)
         given = torch.tensor([gradient is not None for gradient in gradients], dtype=torch.int32)

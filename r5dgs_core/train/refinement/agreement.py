@@ -31,7 +31,7 @@ from . import gauge
 from .refinement import PARTS, POSES
 
 RIDGE = 1e-3  # relative increase of the diagonal of the normal equations
-CHANCE = 0.025  # probability with which independent fits are as much alike as two fits that agree
+CHANCE = 0.025  # probability that independent fits correlate enough to count as agreement
 GREY = 0.5  # colour for which the size of a correction of colours is stated
 _COLUMNS: dict[str, str] = dict(zip(PARTS, ("pose", "focal", "time", "color"), strict=True))
 
@@ -133,20 +133,22 @@ def agreed(
     """Return the size of a part in which two fits [R, COUNT] agree, rms over the poses; 0 if they do not agree."""
     a, b = (_in_units(part, poses, change, points, spacing) for change in (first, second))
     shared = float((a * b).sum())
-    fixed = gauge.FREEDOM if part == POSES else a.size // len(a)
+    fixed = gauge.FREEDOM if part == POSES else a.size // len(a)  # a similarity, or the means over the cameras
     if shared < _least_correlation(a.size - fixed) * np.linalg.norm(a) * np.linalg.norm(b):
         return 0.0
     return math.sqrt(max(shared, 0.0) / len(a))
 
 
 def _least_correlation(values: int) -> float:
-    """Return the correlation that independent fits exceed with probability `CHANCE`; 2 if a single value has any sign.
+    """Return the correlation that independent fits exceed with probability `CHANCE`.
+
+    It is 2, which no fits reach, for fewer than two values: two numbers alone have a correlation of 1 or -1.
 
     Args:
-        values: Number of independent values of a fit, those left after what no image determines is removed.
+        values: Number of values of a fit, less those that no image determines.
     """
     if values < 2:
-        return 2.0  # which no correlation reaches
+        return 2.0
     t = float(stats.t.isf(CHANCE, values - 1))
     return t / math.hypot(t, math.sqrt(values - 1))
 
